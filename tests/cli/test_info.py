@@ -3,7 +3,6 @@
 import json
 
 import cv2
-from landmark_world import simulate, swapped
 
 
 def test_info(fgloc, short_log):
@@ -14,12 +13,6 @@ def test_info(fgloc, short_log):
     content = json.loads(fgloc("info", short_log, "--json").stdout)
     assert content["streams"]["odometry"]["rows"] > 100
     assert content["suspects"] == []
-
-
-def test_info_names_landmarks_that_are_swapped(fgloc, written):
-    log = written(swapped(simulate(), "b", "e"))
-    content = json.loads(fgloc("info", log, "--json").stdout)
-    assert {(s["landmark"], s["swapped_with"]) for s in content["suspects"]} == {("b", "e"), ("e", "b")}
 
 
 def test_info_draws_a_log(fgloc, refused, short_log, tmp_path):

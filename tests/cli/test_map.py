@@ -5,59 +5,36 @@ from functools import partial
 
 import numpy as np
 import pytest
+from landmark_world import WORLD, simulate, swapped
 from PIL import Image
 
 from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.model.log import Log, StartPose
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
 
-SPEED, TURN, SECONDS = 0.4, 0.25, 60.0
-NAMES = ["1", "2", "3", "4", "5", "6", "7"]
-PLACES = np.array([(4.0, -1.0), (5.0, 3.0), (1.0, 5.5), (-3.0, 4.5), (-4.0, 0.5), (0.5, -2.5), (0.5, 1.8)])
-
-
-def world(places):
-    return World(landmarks={n: Landmark(x=x, y=y) for n, (x, y) in zip(NAMES, places.tolist(), strict=True)})
+PLACES = WORLD.positions()
 
 
 @pytest.fixture(scope="session")
-def circling():
-    """A robot that drives in circles from (0, 0, 0), among seven landmarks."""
-    rng = np.random.default_rng(7)
-    t = np.arange(0.0, SECONDS, 0.1)
-    poses = se2.exp(np.column_stack((SPEED * t, 0.0 * t, TURN * t)))
-    rows = np.repeat(np.arange(0, len(t), 5), len(NAMES))
-    local = se2.transform_to(poses[rows], np.tile(PLACES, (len(rows) // len(NAMES), 1)))
-    ranges = np.hypot(*local.T) + 0.05 * rng.standard_normal(len(rows))
-    bearings = np.arctan2(local[:, 1], local[:, 0]) + 0.02 * rng.standard_normal(len(rows))
-    streams = {
-        "odometry": VelocityStream(t, np.full(len(t), SPEED), np.full(len(t), TURN)),
-        "bearing_range": BearingRangeStream(t[rows], NAMES * (len(rows) // len(NAMES)), ranges, se2.wrap(bearings)),
-    }
-    rig = Rig(bearing_range=BearingRangeSettings(range_sigma=0.05, bearing_sigma=0.02))
-    return Log("circling", rig, world(PLACES), streams, Trajectory(t, poses))
+def loop():
+    """A robot that drives a loop from (0, 0, 0), among eight landmarks."""
+    return simulate()
 
 
 @pytest.fixture
-def on_disk(circling, written):
+def on_disk(loop, written):
     """``on_disk(**changes)``: the path of the log with other fields."""
-    return partial(written, circling)
+    return partial(written, loop)
 
 
-def test_a_map_with_swapped_landmarks_is_corrected_and_can_be_used(fgloc, on_disk, tmp_path):
-    wrong = PLACES.copy()
-    wrong[[1, 4]] = wrong[[4, 1]]
-    folder, out = on_disk(world=world(wrong)), tmp_path / "new.world.toml"
+def test_a_map_with_swapped_landmarks_is_corrected_and_can_be_used(fgloc, loop, on_disk, tmp_path):
+    folder, out = on_disk(world=swapped(loop, "b", "e").world), tmp_path / "new.world.toml"
     result = fgloc("map", folder, "-o", out)
     assert result.exit_code == 0, result.output
     lines = result.stdout.splitlines()
-    assert any(line.startswith("2 ") and line.endswith("swapped with 5") for line in map(str.rstrip, lines))
-    assert any("2 wrong in the given map (2, 5)" in line for line in lines)
+    assert any(line.startswith("b ") and line.endswith("swapped with e") for line in map(str.rstrip, lines))
+    assert any("2 wrong in the given map (b, e)" in line for line in lines)
     made = read_world(out)
     np.testing.assert_allclose(made.positions(), PLACES, atol=0.15)
     assert all(landmark.covariance for landmark in made.landmarks.values())
@@ -80,14 +57,14 @@ def test_without_a_map_the_frame_is_the_start(fgloc, on_disk, tmp_path):
 
 
 def test_a_map_is_extended(fgloc, on_disk, tmp_path):
-    part = World(landmarks=dict(list(world(PLACES).landmarks.items())[:4]))
+    part = World(landmarks=dict(list(WORLD.landmarks.items())[:4]))
     start = StartPose(0.0, np.zeros(3), np.full(3, 0.05))
     folder = on_disk(world=part, reference=None, start=start)
     result = fgloc("map", folder, "-e", "ekf", "--extend", "-o", tmp_path / "a.world.toml")
     assert result.exit_code == 0, result.output
-    assert "7 landmarks are in the new map: 4 as given, 3 new" in result.stdout
+    assert "8 landmarks are in the new map: 4 as given, 4 new" in result.stdout
     made = read_world(tmp_path / "a.world.toml")
-    assert made.landmarks["1"] == part.landmarks["1"]
+    assert made.landmarks["a"] == part.landmarks["a"]
     np.testing.assert_allclose(made.positions(), PLACES, atol=0.15)
 
 

@@ -1,7 +1,6 @@
 """What `fgloc run` and `fgloc compare` say of the errors: how often they are scored, after an alignment, and in doubt."""
 
 import json
-import shutil
 
 import pytest
 
@@ -38,24 +37,3 @@ def test_relative_errors_and_an_alignment_are_shown_where_they_are_asked_for(fgl
     page = (tmp_path / "out/report.html").read_text()
     assert "final aligned position RMSE" in page
     assert "m per s" in page
-
-
-@pytest.fixture
-def doubtful_log(short_log, tmp_path):
-    """The log with a reference that ends after a quarter of it."""
-    shutil.copytree(short_log, tmp_path / "doubtful")
-    lines = (short_log / "reference.tum").read_text().splitlines(keepends=True)
-    (tmp_path / "doubtful/reference.tum").write_text("".join(lines[: len(lines) // 4]))
-    return tmp_path / "doubtful"
-
-
-DOUBT = "warning: short: scored over "
-
-
-def test_run_says_what_is_doubtful_and_stores_it(fgloc, doubtful_log, tmp_path):
-    result = fgloc("run", doubtful_log, "-e", "ekf", "-o", tmp_path / "out")
-    assert result.exit_code == 0, result.output
-    (told,) = [line for line in result.stderr.splitlines() if DOUBT in line]
-    stored = json.loads((tmp_path / "out/metrics.json").read_text())["warnings"]
-    assert f"warning: {stored[0]}" == told
-    assert len(stored) == 1

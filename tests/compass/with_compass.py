@@ -12,6 +12,7 @@ from bag_maker import BagMaker
 from compass.settings import CompassSettings
 from compass.stream import Heading, HeadingStream
 from in_short import blank_pictures, in_short, runs_here  # noqa: F401 - fixtures
+from mapped_hall import VELOCITIES, write_mapped
 from typer.testing import CliRunner
 
 import factorgraph_loc as fgloc
@@ -70,15 +71,12 @@ def test_a_log_comes_back_from_its_folder(tmp_path, format):
 
 
 def test_a_table_of_another_program_by_a_mapping(tmp_path):
-    (tmp_path / "wheels.csv").write_text("time,v,w\n0.0,1,0\n1.0,1,0\n")
-    (tmp_path / "kvh.csv").write_text("time;yaw\n0.0;90\n0.5;-45\n")
-    (tmp_path / "arc.toml").write_text(
-        'title = "arc"\nreader = "mapped"\nlicence = "none"\norigin = "made"\npath = "."\n'
-        '[options.odometry]\nfile = "wheels.csv"\ncolumns = { t = "time", v = "v", w = "w" }\nunits = { t = "s" }\n'
+    options = (
         '[options.compass]\nfile = "kvh.csv"\nseparator = ";"\ncolumns = { t = "time", heading = "yaw" }\n'
         'units = { t = "s", heading = "deg" }\nclock_offset = 0.25\n'
     )
-    stream = fgloc.read_log(tmp_path / "arc.toml").streams["compass"]
+    tables = {"wheels": "t,v,w\n0.0,1,0\n1.0,1,0\n", "kvh": "time;yaw\n0.0;90\n0.5;-45\n"}
+    stream = fgloc.read_log(write_mapped(tmp_path, VELOCITIES + options, **tables)).streams["compass"]
     np.testing.assert_allclose(stream.t, (0.25, 0.75))
     np.testing.assert_allclose(stream.heading, (math.pi / 2.0, -math.pi / 4.0))
 

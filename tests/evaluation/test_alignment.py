@@ -18,8 +18,8 @@ FRAME = np.array((4.0, -3.0, 2.5))  # of the world in the estimate's frame
 SIGMA = np.array(((0.04, 0.015), (0.015, 0.01)))
 
 
-def arc(n=50):
-    t = np.arange(n) * 0.1
+def arc():
+    t = np.arange(50) * 0.1
     return Trajectory(t, np.stack((np.cos(t), 2.0 * np.sin(t), se2.wrap(t)), axis=1))
 
 
@@ -28,12 +28,12 @@ def align(estimate, truth):
     return align_points(pair.poses[:, :2], pair.truth[:, :2])
 
 
-def free_map(n, rng, sigma=SIGMA):
-    """A log with ``n`` landmarks and what an estimator with a frame of its own learnt of them, with errors drawn from ``sigma``."""
+def free_map(n, rng):
+    """A log with ``n`` landmarks and what an estimator with a frame of its own learnt of them, with random errors."""
     places = rng.uniform(-10.0, 10.0, (n, 2))
     world = World(landmarks={f"L{i}": Landmark(x=x, y=y) for i, (x, y) in enumerate(places.tolist())})
-    learnt = se2.transform_from(FRAME, places) + rng.multivariate_normal(np.zeros(2), sigma, n)
-    points = {f"L{i}": LearntPoint(p, sigma) for i, p in enumerate(learnt)}
+    learnt = se2.transform_from(FRAME, places) + rng.multivariate_normal(np.zeros(2), SIGMA, n)
+    points = {f"L{i}": LearntPoint(p, SIGMA) for i, p in enumerate(learnt)}
     return Log("log", Rig(), world, {}, arc()), points, replace(arc(), poses=se2.compose(FRAME, arc().poses))
 
 

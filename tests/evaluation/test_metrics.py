@@ -17,6 +17,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.result import RunResult, Timings
 from factors import se2
 
+NOTHING, NOTHING_LEARNT, NO_CONFIG = Diagnostics(), Learnt(), {}
 TIMINGS = Timings(np.array([0.5]), np.array([2.0]), 1.0, 10.0, 0.1, 100.0)
 
 
@@ -32,12 +33,10 @@ def drive(n=600, dt=0.1, speed=0.4):
     return t, np.array(truth), np.array(estimate)
 
 
-def result_of(t, poses, status, final=None, diagnostics=None, learnt=None, config=None):
+def result_of(t, poses, status, diagnostics=NOTHING, learnt=NOTHING_LEARNT, config=NO_CONFIG):
     covariances = np.tile(np.eye(3), (len(t), 1, 1))
-    final = Trajectory(t, poses, covariances) if final is None else final
-    diagnostics = Diagnostics() if diagnostics is None else diagnostics
-    learnt = Learnt() if learnt is None else learnt
-    return RunResult("log", config or {}, t, poses, covariances, status, final, diagnostics, learnt, TIMINGS, {})
+    final = Trajectory(t, poses, covariances)
+    return RunResult("log", config, t, poses, covariances, status, final, diagnostics, learnt, TIMINGS, {})
 
 
 def test_in_a_gap_of_the_reference_nothing_is_scored():

@@ -26,8 +26,8 @@ def track():
     return Track(trajectory, trajectory)
 
 
-def log_of(track, *, reference=True, has_heading=True):
-    truth = Trajectory(track.final.t, track.final.poses + 0.02, has_heading=has_heading) if reference else None
+def log_of(track, *, reference=True):
+    truth = Trajectory(track.final.t, track.final.poses + 0.02) if reference else None
     return Log("log", Rig(), World(landmarks={"a": Landmark(x=1.0, y=2.0)}), {}, truth)
 
 

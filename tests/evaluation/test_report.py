@@ -36,8 +36,8 @@ def words_of(page):
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
 
 
-def data_of(page, identity="viewer"):
-    return json.loads(re.search(rf'id="{identity}">(.*?)</script>', page, flags=re.DOTALL)[1])
+def data_of(page):
+    return json.loads(re.search(r'id="viewer">(.*?)</script>', page, flags=re.DOTALL)[1])
 
 
 class Elements(HTMLParser):

@@ -1,22 +1,11 @@
 """Which files a log of an experiment is made from: what is kept of a run must not outlive a change in one of them."""
 
 import pytest
+from mapped_hall import HEAD, VELOCITIES
 
 from factorgraph_loc.experiments.log_source import RecordedSource
 
-MANIFEST = """\
-title = "t"
-reader = "mapped"
-path = "run"
-world = "hall.world.toml"
-licence = "none stated"
-origin = "made by hand"
-
-[options.odometry]
-file = "wheels.csv"
-columns = { t = "t", v = "v", w = "w" }
-units = { t = "s" }
-"""
+MANIFEST = f'world = "hall.world.toml"\n{HEAD}{VELOCITIES}'
 
 
 @pytest.fixture

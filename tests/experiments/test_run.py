@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc import BearingRangeStream, InputError, RunFailedError, StartPose, Trajectory, VelocityStream, World
+from factorgraph_loc import InputError, RunFailedError, StartPose, Trajectory, VelocityStream, World
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import estimator_type
@@ -89,16 +89,6 @@ def test_what_is_older_than_the_prior(log, fake):
     assert result.t[-1] <= 2.0
 
 
-def test_a_late_measurement_is_fed_when_it_arrives(log, fake):
-    s = log.streams["bearing_range"]
-    late = BearingRangeStream(s.t - np.array([0, 0, 0, 0, 0.8, 0.8, 0, 0]), s.landmark, s.range, s.bearing)
-    # it arrives with the newest of its stream so far, at 0.52 s
-    run(replace(log, streams=dict(log.streams) | {"bearing_range": late}), RunConfig("fake"))
-    calls = [call for call in fake.made.calls if call[0] != "estimate"]
-    where = next(i for i, (kind, t) in enumerate(calls) if kind == "BearingRange" and t == pytest.approx(0.22))
-    assert max(t for _, t in calls[:where]) == pytest.approx(0.52)
-
-
 def test_sensors_are_a_setting(log, fake):
     result = run(log, RunConfig("fake", sensors=("odometry",)))
     assert fake.made.setup.sensors == ("odometry",)
@@ -141,17 +131,6 @@ def test_a_clock_that_jumps_costs_no_ticks(log, name, far):
     assert any("a gap above 60 s without any measurement" in warning for warning in result.warnings)
     assert result.timings.real_time_factor < 1e4
     assert result.config["tick_gap"] == 60.0
-
-
-def test_what_an_estimator_cannot_compute_is_one_line(log, fake, monkeypatch):
-    def fail(_, measurement):
-        if measurement.t > 0.5:
-            np.linalg.inv(np.zeros((2, 2)))
-
-    monkeypatch.setattr(fake, "process", fail)
-    with pytest.raises(RunFailedError) as told:
-        run(log, RunConfig("fake"))
-    assert str(told.value) == "fake on straight: bearing_range at 0.520 s: Singular matrix"
 
 
 def test_priors(log):

@@ -73,3 +73,6 @@ def test_no_tag_of_the_map_is_ever_read(reading):
     stream = replace(reading.streams["rfid"], epc=["", "x"])
     result = run(replace(reading, streams=dict(reading.streams) | {"rfid": stream}), RunConfig("fake", sensors=ALL[:2]))
     assert any("none of the 3 tags of the map is read" in warning for warning in result.warnings)
+    unmapped = replace(reading, world=reading.world.model_copy(update={"tags": {}}))
+    result = run(unmapped, RunConfig("fake", sensors=ALL[:2]))
+    assert any("reads are of no use without a map" in warning for warning in result.warnings)

@@ -206,15 +206,6 @@ def test_the_weight_is_the_slope_of_the_loss(squared, scale):
     assert 2.0 * slope == pytest.approx(float(geman_mcclure_weight(np.array(squared), scale)), rel=1e-3)
 
 
-def test_the_likelihood_of_particles_is_the_cost_of_the_factor():
-    model = BearingRangeModel(mounting=(0.1, 0.0, 0.2))
-    seen, ranges, bearings = np.array(((3.0, 1.0), (-2.0, 4.0))), np.array((3.0, np.nan)), np.array((0.1, 2.0))
-    particles = np.random.default_rng(1).normal(size=(5, 3))
-    factor = BearingRangeFactor(model, seen, ranges, bearings)
-    costs = [factor.cost([p]) for p in particles]
-    np.testing.assert_allclose(log_likelihood(model, particles, seen, ranges, bearings), np.negative(costs), atol=1e-12)
-
-
 @given(models, st.integers(0, 10_000))
 def test_each_particle_has_the_likelihood_of_its_own_sensor(model, seed):
     rng = np.random.default_rng(seed)

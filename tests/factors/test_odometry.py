@@ -11,7 +11,7 @@ from numerical import by_each, derivative
 
 from factors import se2
 from factors.graph import pose_array
-from factors.motion import Increment, propagate
+from factors.motion import Increment
 from factors.odometry.chain import OdometryChain
 from factors.odometry.factor import OdometryFactor, ScaleFreeOdometryFactor
 from factors.odometry.model import (
@@ -123,17 +123,6 @@ def test_rows_at_once_are_those_one_by_one(late):
         t = float(rows[: i + 20, 0].max())
         assert one.state(t) == other.state(t)
     assert other.add_velocities(*np.empty((3, 0))) == 0
-
-
-def test_a_way_in_one_call_is_state_and_motion():
-    chain = velocities(OdometryModel(along=Growth(0.1, 0.2, 0.3)), [(0.0, 0.5, 0.1), (0.3, 0.4, -0.2), (1.0, 0.3, 0.3)])
-    start = chain.state(0.2)
-    end, motion = chain.travelled(start, 1.7)
-    expected = chain.relative(start, chain.state(1.7))
-    assert end == chain.state(1.7)
-    np.testing.assert_array_equal(motion.delta, expected.delta)
-    np.testing.assert_array_equal(motion.covariance, expected.covariance)
-    assert (motion.duration, motion.still) == (expected.duration, expected.still)
 
 
 def test_old_rows_are_forgotten_and_recent_ones_kept():
@@ -349,20 +338,3 @@ def test_a_robot_that_turns_is_slower_than_commanded():
     assert backwards.x < 0.0
     assert on_the_spot.path == 0.0
     assert on_the_spot.heading == pytest.approx(0.5)
-
-
-def test_a_pose_is_moved_along_the_odometry_by_one_call_as_by_several():
-    chain = velocities(NOISY, [(0.0, 1.0, 0.5), (0.3, 0.7, -0.8), (1.1, 0.0, 0.0)], estimated=(0, 2))
-    pose, covariance = np.array((2.0, -1.0, 3.0)), np.diag((0.1, 0.2, 0.05)) ** 2
-    constants = np.array((0.03, -0.01))
-    start, end = chain.state(0.2), chain.state(1.4)
-    increment = chain.relative(start, end)
-    delta, _ = recalibrated(increment, np.array((0.03, 0.0, -0.01, 0.0)))
-    at, body, world = chain.moved(start, 1.4, pose, covariance, constants)
-    np.testing.assert_allclose(at, se2.compose(pose, delta), atol=1e-12)
-    expected = propagate(covariance, Increment(delta, increment.covariance, increment.duration))
-    np.testing.assert_allclose(body, expected, atol=1e-15)
-    np.testing.assert_allclose(world, se2.body_to_world(at, body), atol=1e-15)
-    deltas, covariances = chain.relatives(np.array([start]), np.array([end]), constants)
-    np.testing.assert_allclose(deltas[0], delta, atol=1e-12)
-    np.testing.assert_allclose(covariances[0], increment.covariance, atol=1e-15)

@@ -8,7 +8,6 @@ import pytest
 from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels as odometry_kernels
-from factors.odometry.chain import OdometryChain
 from factors.odometry.factor import whitener
 from factors.odometry.model import (
     MINIMUM_HEADING_VARIANCE,
@@ -102,23 +101,3 @@ def test_a_gaussian_is_predicted_by_its_jacobians(rng, places):
 def test_a_whitener_is_the_inverse_of_the_root(rng):
     spread = covariance(rng)
     np.testing.assert_allclose(whitener(spread), np.linalg.inv(np.linalg.cholesky(spread)), rtol=1e-6, atol=1e-9)
-
-
-def test_a_gaussian_in_one_call_is_predicted_along_the_motion():
-    constants, indices = np.array((0.02, -0.01)), np.array((0, 2))
-    chain = OdometryChain(OdometryModel(along=Growth(0.1, 0.2, 0.3)), estimated=indices)
-    for row in ((0.0, 0.5, 0.1), (0.3, 0.4, -0.2), (1.0, 0.3, 0.3)):
-        chain.add_velocity(*row)
-    start, pose = chain.state(0.2), np.array((1.0, 2.0, 3.0))
-    root = np.random.default_rng(3).standard_normal((6, 6))
-    end, at, transition, noise, after = chain.predicted(start, 1.7, pose, root @ root.T, constants, 4)
-    expected, motion = chain.travelled(start, 1.7)
-    delta, by_changes = recalibrated(motion, np.array((0.02, 0.0, -0.01, 0.0)))
-    whole = np.eye(6)
-    whole[:3, :3], whole[:3, 4:] = se2.adjoint(se2.inverse(delta)), by_changes[:, indices]
-    before = whole @ root @ root.T @ whole.T
-    before[:3, :3] += motion.covariance
-    assert end == expected
-    np.testing.assert_array_equal(noise, motion.covariance)
-    for one, other in ((at, se2.compose(pose, delta)), (transition, whole[:3]), (after, before)):
-        np.testing.assert_allclose(one, other, atol=1e-12)

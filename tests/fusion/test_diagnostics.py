@@ -1,60 +1,10 @@
 """What estimators tell of measurements: each counts once, in time or late, and also where an estimator goes back in time."""
 
-from dataclasses import replace
-
-import landmark_world
 import numpy as np
-import pytest
-from landmark_world import simulate
 
-from factorgraph_loc import BearingRangeStream, PoseEstimate
-from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc import PoseEstimate
 from factorgraph_loc.model.belief import gaussian_belief
 from factorgraph_loc.model.diagnostics import Diagnostics
-
-SETTINGS = {"particle_filter": {"particles": 300}, "smoother": {"lag": 5.0}}
-ESTIMATORS = ("ekf", "particle_filter", "smoother", "batch")
-
-
-def looks(log):
-    return np.unique(log.streams["bearing_range"].t)
-
-
-def told(result):
-    return np.sort([t for t, _, _ in result.diagnostics.nis["bearing_range"]])
-
-
-@pytest.fixture(scope="module")
-def late():
-    """Each third look comes 0.3 s late, after the next one; the landmark x is in no map."""
-    log = simulate(seconds=15.0)
-    seen = log.streams["bearing_range"]
-    stamps = np.unique(seen.t)
-    delayed = np.isin(seen.t, stamps[::3])
-    order = np.argsort(seen.t + 0.3 * delayed, kind="stable")
-    names = ["x" if name == "a" else name for name in seen.landmark]
-    stream = BearingRangeStream(seen.t[order], [names[i] for i in order], seen.range[order], seen.bearing[order])
-    return replace(log, streams={**log.streams, "bearing_range": stream})
-
-
-@pytest.mark.parametrize("name", ESTIMATORS)
-def test_a_late_look_counts_once(late, name):
-    result = run(late, RunConfig(name, SETTINGS.get(name, {})))
-    stream = late.streams["bearing_range"]
-    known = {t for t, name in zip(stream.t.tolist(), stream.landmark, strict=True) if name != "x"}
-    assert told(result).tolist() == sorted(known)
-    assert result.diagnostics.ignored == {"landmark not in the map": list(stream.landmark).count("x")}
-    values = sum(n != "x" for n in stream.landmark)
-    assert len(result.diagnostics.residuals["bearing_range.range"]) == values
-    assert result.diagnostics.late == {}
-
-
-@pytest.mark.parametrize("name", ["smoother", "batch"])
-def test_a_look_counts_once_when_a_graph_goes_back(name):
-    kidnapped = landmark_world.kidnapped()
-    result = run(kidnapped, RunConfig(name))
-    assert [what.partition(":")[0] for _, what in result.diagnostics.events] == ["lost"]
-    assert told(result).tolist() == looks(kidnapped).tolist()
 
 
 def test_what_is_taken_back_leaves_no_trace():

@@ -58,22 +58,6 @@ def test_a_robot_that_is_carried_far() -> None:
     assert np.nanmax(evaluated(result.final, carried.reference).position) < 0.5
 
 
-def test_nothing_known_is_read() -> None:
-    """Every tag is dead: dead reckoning, without a claim to know better."""
-    log = office({"dead": 1.0})
-    result = run(log, RunConfig("smoother"))
-    assert any("none of the 40 tags of the map is read" in warning for warning in result.warnings)
-    assert np.all(np.isfinite(result.poses))
-    assert np.sqrt(result.covariances[-1, 0, 0]) > 0.3
-
-
-def test_without_a_map_it_is_told_that_reads_are_of_no_use() -> None:
-    log = office()
-    unmapped = replace(log, world=log.world.model_copy(update={"tags": {}}))
-    result = run(unmapped, RunConfig("ekf"))
-    assert any("reads are of no use without a map" in warning for warning in result.warnings)
-
-
 def test_belief_while_it_seeks_has_particles_that_move_with_the_odometry() -> None:
     log = office()
     sensors = ("odometry", "rfid")

@@ -1,7 +1,5 @@
 """Smoother and batch where their place is not known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from landmark_world import simulate, with_sightings
@@ -9,11 +7,6 @@ from landmark_world import simulate, with_sightings
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import cut, join
-
-CONFIGS = {
-    "smoother": RunConfig("smoother"),
-    "batch": RunConfig("batch"),
-}
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +25,7 @@ def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
     s = elsewhere.streams["bearing_range"]
     alone = with_sightings(elsewhere, (np.array(s.landmark) == s.landmark[0]) | (s.t > 33.0))
     carried = join(cut(log, 0.0, 10.0), alone)
-    result = run(carried, CONFIGS["smoother"])
+    result = run(carried, RunConfig("smoother"))
     status = np.array(result.status)
     ((t, _),) = result.diagnostics.events
     assert 18.0 < t < 22.0
@@ -46,7 +39,7 @@ def test_one_landmark_does_not_tell_the_place(name, log):
     """The start stays open, and everything is still there when the others come."""
     s = log.streams["bearing_range"]
     lone = with_sightings(log, np.array(s.landmark) == "b")
-    result = run(cut(lone, 0.0, 8.0), replace(CONFIGS[name], prior="unknown"))
+    result = run(cut(lone, 0.0, 8.0), RunConfig(name, prior="unknown"))
     assert result.diagnostics.events == []
     assert len(result.final) == 0
     assert "localized" not in result.status
@@ -62,22 +55,9 @@ def test_one_landmark_does_not_tell_the_place(name, log):
         assert np.abs(distance_of_b - truth).max() < 0.5
 
     late = with_sightings(log, (np.array(s.landmark) == "b") | (s.t > 8.0))
-    result = run(late, replace(CONFIGS[name], prior="unknown"))
+    result = run(late, RunConfig(name, prior="unknown"))
     assert result.final.t[0] < 0.3
     assert off(result.final, log).max() < 0.3
-
-
-@pytest.mark.parametrize(("name", "how"), [("smoother", "no rows"), ("batch", "not in the map")])
-def test_nothing_tells_the_place(name, how, log):
-    config, count = replace(CONFIGS[name], prior="unknown"), len(log.streams["bearing_range"].t)
-    none, renamed = np.zeros(count, dtype=bool), ["ghost"] * count
-    log = with_sightings(log, none) if how == "no rows" else with_sightings(log, landmark=renamed)
-    result = run(log, config)
-    assert set(result.status) == {"unlocalized"}
-    assert np.all(np.isnan(result.poses))
-    assert len(result.final) == 0
-    assert result.diagnostics.events == []
-    assert len(result.warnings) == 1
 
 
 def test_landmarks_that_are_to_be_estimated_cannot_tell_the_place(log):

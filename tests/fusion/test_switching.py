@@ -76,14 +76,6 @@ def test_it_hands_over_mean_and_covariance(office):
     assert estimator.belief().particles is None
 
 
-def test_what_the_other_filter_would_take_is_counted(office, switched):
-    ignored = switched.diagnostics.ignored
-    assert ignored["landmarks while tags are read"] > 0
-    assert ignored["rfid while no tag is read"] > 0
-    sightings = sum(1 for _ in office.measurements(("bearing_range",)))
-    assert ignored["landmarks while tags are read"] < sightings
-
-
 def test_rows_that_neither_filter_uses_are_counted_once(office):
     estimator = switching(office)
     estimator.initialize(PosePrior(0.0, office.reference.poses[0], np.eye(3)))

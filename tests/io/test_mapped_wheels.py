@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mapped_hall import write_mapped
 
 import factorgraph_loc as fgloc
 
@@ -14,14 +15,9 @@ def table(tmp_path):
 
     def make(column, more=""):
         lines = [f"{t},{a},{b}" for t, a, b in ROWS]
-        (tmp_path / "wheels.csv").write_text("\n".join(["t,a,b", *lines, ""]))
-        (tmp_path / "cart.toml").write_text(
-            'title = "t"\nreader = "mapped"\nlicence = "l"\norigin = "o"\npath = "."\n[options.odometry]\n'
-            f'file = "wheels.csv"\n{more}\n'
-            f'[options.odometry.columns]\nt = "t"\nleft{column} = "a"\nright{column} = "b"\n'
-            '[options.odometry.units]\nt = "s"\n'
-        )
-        return tmp_path / "cart.toml"
+        columns = f'columns = {{ t = "t", left{column} = "a", right{column} = "b" }}\nunits = {{ t = "s" }}\n'
+        options = f'[options.odometry]\nfile = "wheels.csv"\n{columns}{more}\n'
+        return write_mapped(tmp_path, options, wheels="\n".join(["t,a,b", *lines, ""]))
 
     return make
 

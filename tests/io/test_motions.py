@@ -2,21 +2,13 @@
 
 import numpy as np
 import pytest
+from mapped_hall import write_mapped
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.motions import between_poses, between_ways
 from factors import se2
 
 STEP = np.array((0.05, 0.0, 0.02))  # in 0.1 s
-MANIFEST = """\
-title = "a hall"
-reader = "mapped"
-path = "run"
-licence = "none stated"
-origin = "made by hand"
-[options.odometry]
-file = "wheels.csv"
-"""
 
 
 def stamps(count):
@@ -74,10 +66,8 @@ def test_encoders_that_are_set_to_0_go_on_as_before():
 @pytest.fixture
 def hall(tmp_path, one):
     def read(columns, rows):
-        (tmp_path / "run").mkdir(exist_ok=True)
-        (tmp_path / "run" / "wheels.csv").write_text("\n".join(rows) + "\n")
-        (tmp_path / "hall.toml").write_text(MANIFEST + columns)
-        return one(tmp_path / "hall.toml")
+        options = f'[options.odometry]\nfile = "wheels.csv"\n{columns}'
+        return one(write_mapped(tmp_path, options, wheels="\n".join([*rows, ""])))
 
     return read
 

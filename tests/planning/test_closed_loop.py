@@ -39,12 +39,6 @@ def test_a_run_ends_where_the_place_is_known() -> None:
     assert run.seconds == run.truth.t[-1]
 
 
-def test_policies_stand_on_other_estimators_too() -> None:
-    run = office(estimator="particle_filter")
-    assert run.localized
-    assert run.error_position < 0.3
-
-
 def test_a_corner_between_two_poses_of_a_way_is_seen() -> None:
     """A patrol that begins beside a corner does not try to go through it for ever."""
     run = run_active(preset("symmetric"), "patrol", "active_mcl", 1110, ActiveSettings(max_metres=40.0, particles=200))

@@ -157,17 +157,6 @@ def with_sightings(log, keep=None, **columns):
     return replace(log, streams={**log.streams, "bearing_range": stream})
 
 
-def dirty(log, seed=5):
-    """A tenth of the rows says anything."""
-    rng, s = np.random.default_rng(seed), log.streams["bearing_range"]
-    bad = rng.random(len(s.t)) < 0.1
-    return with_sightings(
-        log,
-        range=np.where(bad, rng.uniform(0.3, 8.0, len(bad)), s.range),
-        bearing=np.where(bad, rng.uniform(-np.pi, np.pi, len(bad)), s.bearing),
-    )
-
-
 def swapped(log, one, other):
     """The log with two landmarks of its map in each other's place."""
     landmarks = dict(log.world.landmarks)

@@ -36,6 +36,13 @@ file = "truth.csv"
 columns = { t = "stamp", x = "east", y = "north", heading = "yaw" }
 units = { t = "s", x = "cm", y = "cm", heading = "deg" }
 """
+HEAD = MANIFEST.partition("[options")[0]
+VELOCITIES = """
+[options.odometry]
+file = "wheels.csv"
+columns = { t = "t", v = "v", w = "w" }
+units = { t = "s" }
+"""
 WHEELS = """
 [options.odometry]
 file = "wheels.csv"
@@ -46,17 +53,19 @@ units = { t = "ms" }
 """
 
 
+def write_mapped(folder, options, **tables):
+    """A manifest with these options, and beside it a folder with tables, each a text by the name of its file."""
+    (folder / "run").mkdir(exist_ok=True)
+    for name, text in tables.items():
+        (folder / "run" / f"{name}.csv").write_text(text)
+    (folder / "hall.toml").write_text(HEAD + options)
+    return folder / "hall.toml"
+
+
 @pytest.fixture
 def hall(tmp_path):
     """A manifest with its folder: odometry of a spreadsheet, ItemTest's reads, a reference in centimetres."""
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / "wheels.csv").write_text(ODOMETRY)
-    (folder / "reads.csv").write_text(READS)
-    (folder / "truth.csv").write_text(TRUTH)
-    manifest = tmp_path / "hall.toml"
-    manifest.write_text(MANIFEST)
-    return manifest
+    return write_mapped(tmp_path, MANIFEST.removeprefix(HEAD), wheels=ODOMETRY, reads=READS, truth=TRUTH)
 
 
 @pytest.fixture
@@ -64,7 +73,7 @@ def with_options(hall):
     """The manifest with other options in place of all of its own."""
 
     def change(text):
-        hall.write_text(MANIFEST.partition("[options")[0] + text)
+        hall.write_text(HEAD + text)
         return hall
 
     return change

@@ -20,7 +20,7 @@ TURN = 0.015  # rad, that the odometry is off by from one keyframe to the next
 STEPS = np.array((0.0, 0.4, 0.8, 1.2, 1.6))
 
 
-def drive(rng, count=60, wrong=0.0, slip=0.0):
+def drive(rng, wrong=0.0, slip=0.0):
     """True poses, keyframes, poses by odometry, which misses a turn ``slip`` [rad] in the third step, and what waits: named points
     with noise of a pixel."""
     truth = np.column_stack((STEPS - 2.0, 0.0 * STEPS, 0.1 * STEPS))
@@ -31,7 +31,7 @@ def drive(rng, count=60, wrong=0.0, slip=0.0):
         increment = Increment(moved, np.diag((0.01, 0.01, TURN)) ** 2, 0.6)
         keyframes.append(Keyframe(k, 0.6 * k, keyframes[0].odometry, increment))
         guess.append(se2.compose(guess[-1], moved))
-    points, waiting = camera_world.room(4 * count), {}
+    points, waiting = camera_world.room(240), {}
     for k, pose in enumerate(truth):
         pixels, depth = reprojection.predict(MODEL, pose, points.positions)
         rows = np.flatnonzero(MODEL.contains(pixels) & (depth > 0.3))

@@ -25,8 +25,8 @@ def looked(points):
     return camera_world.with_views(points, views=1)
 
 
-def shown(film, poses=POSES, off=DRIFT, memory=None, sigmas=SIGMAS, way=10.0):
-    """What is said of images of the points ``film`` from ``poses``, on a track that is ``off`` them, by one that knows
+def shown(film, off=DRIFT, memory=None, sigmas=SIGMAS, way=10.0):
+    """What is said of images of the points ``film`` from :data:`POSES`, on a track that is ``off`` them, by one that knows
     ``memory``; and which points the features really show."""
     rng = np.random.default_rng(4)
     memory = film if memory is None else memory
@@ -34,9 +34,9 @@ def shown(film, poses=POSES, off=DRIFT, memory=None, sigmas=SIGMAS, way=10.0):
     estimates = dict(zip(keys, memory.positions, strict=True))
     old = OldPoints(memory, keys, np.zeros(len(memory)))
     closure, said = LoopClosure(), []
-    for i, pose in enumerate(poses):
+    for i, pose in enumerate(POSES):
         frame, truth = camera_world.frame(film, pose, float(i), rng)
-        guess = se2.compose(pose, np.broadcast_to(off, (len(poses), 3))[i])
+        guess = se2.compose(pose, np.broadcast_to(off, (len(POSES), 3))[i])
         estimates[pose_key(i)] = guess
         keyframe = Keyframe(i, float(i), None, None)
         image = Image(frame, keyframe, (guess, np.diag(sigmas**2)), way)

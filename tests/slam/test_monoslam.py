@@ -7,11 +7,10 @@ import pytest
 from by_hand import made
 from scipy.stats import chi2
 
-from factorgraph_loc import IncrementOdometry, PixelSightings, PointMap, Rig, Tick, World
+from factorgraph_loc import IncrementOdometry, PixelSightings, PointMap, Rig, World
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.model.log import cut
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.slam.monoslam_state import Innovation
@@ -119,24 +118,6 @@ def test_a_point_behind_the_camera_is_no_catastrophe():
     estimate = estimator.estimate()
     assert np.all(np.isfinite(estimate.pose))
     assert np.hypot(*estimate.pose[:2]) < 0.1
-
-
-def test_a_late_image_is_put_in_at_its_time(drive):
-    log = cut(drive(6, seconds=12.0), 0.0, 10.0)
-    held: list[float] = []
-    for shuffled in (False, True):
-        estimator = made("monoslam", log.rig, log.world, SENSORS)
-        estimator.initialize(PosePrior(0.0, log.reference.poses[0], 1e-4 * np.eye(3)))
-        measurements = list(log.measurements(SENSORS))
-        images = [i for i, m in enumerate(measurements) if isinstance(m, PixelSightings)]
-        if shuffled:
-            late = measurements.pop(images[20])
-            measurements.insert(images[22], late)
-        for m in measurements:
-            estimator.process(m)
-        estimator.process(Tick(10.0))
-        held.append(estimator.estimate().pose)
-    np.testing.assert_allclose(held[0], held[1], atol=1e-12)
 
 
 def test_what_it_cannot_use_is_counted(drive):

@@ -37,15 +37,6 @@ def made(points, descriptors, seen, seen_descriptors):
     return Feature("made", lambda _: next(answers))
 
 
-def test_mutual_matches_of_known_vectors():
-    first = np.array(((0.0, 0.0), (10.0, 0.0), (11.0, 0.0)), dtype=np.float32)
-    second = np.array(((10.0, 1.0), (0.0, 3.0), (0.0, 50.0)), dtype=np.float32)
-    i, j, ratio = mutual_matches(first, second)
-    # the third vector's nearest is the first of the others, which is nearer to the second
-    assert (i.tolist(), j.tolist()) == ([0, 1], [1, 0])
-    assert ratio == pytest.approx((3.0 / np.hypot(10.0, 1.0), 1.0 / np.hypot(10.0, 3.0)))
-
-
 def test_mutual_matches_of_bits_and_of_too_few():
     first = np.array(((0b1111,), (0b0000,)), dtype=np.uint8)
     second = np.array(((0b0001,), (0b1110,)), dtype=np.uint8)

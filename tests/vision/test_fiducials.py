@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from mapped_hall import HEAD, VELOCITIES
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import InputError, load
@@ -87,32 +88,22 @@ name = "cart"
 sensors = ["odometry", "sightings"]
 camera = { width = 640, height = 480, fx = 400, fy = 400, cx = 319.5, cy = 239.5, x = 0.1, z = 0.9, pixel_sigma = 0.5 }
 """
-MANIFEST = """\
-title = "markers in a hall"
-reader = "mapped"
-path = "run"
+MANIFEST = f"""\
 rig = "cart.rig.toml"
 world = "hall.world.toml"
-licence = "none stated"
-origin = "made by hand"
-
+{HEAD}
 [markers]
 family = "tag36h11"
-
-[options.odometry]
-file = "odometry.csv"
-columns = { t = "t", v = "v", w = "w" }
-units = { t = "s" }
-
+{VELOCITIES}
 [options.camera]
 file = "images.csv"
-columns = { t = "t", file = "file" }
-units = { t = "s" }
+columns = {{ t = "t", file = "file" }}
+units = {{ t = "s" }}
 
 [options.reference]
 file = "truth.csv"
-columns = { t = "t", x = "x", y = "y", heading = "heading" }
-units = { t = "s" }
+columns = {{ t = "t", x = "x", y = "y", heading = "heading" }}
+units = {{ t = "s" }}
 """
 STEP = np.array((0.05, 0.0, 0.01))  # a tenth of a second at 0.5 m/s
 
@@ -134,7 +125,7 @@ def hall(tmp_path_factory):
     (run / "truth.csv").write_text(
         "t,x,y,heading\n" + "".join(f"{a},{x},{y},{h}\n" for a, (x, y, h) in zip(t, poses, strict=True))
     )
-    (run / "odometry.csv").write_text("t,v,w\n" + "".join(f"{a},0.55,0.0\n" for a in t))
+    (run / "wheels.csv").write_text("t,v,w\n" + "".join(f"{a},0.55,0.0\n" for a in t))
     (run / "images.csv").write_text("t,file\n" + "".join(f"{t[i]},{i}.png\n" for i in range(0, len(t), 4)))
     camera = fgloc.read_rig(folder / "cart.rig.toml").camera.model()
     rng = np.random.default_rng(0)

@@ -3,15 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import short_logs
 from camera_world import CAMERA, room, simulate
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.registry import create, settings_of
-from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.camera.known_points import lifted
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
@@ -84,18 +80,3 @@ def test_covariances_hold_where_the_points_are_estimated_too():
     assert position < 0.1  # of 0.25 where the points take the tilt for theirs
     # of three drives, whose errors come from one drift each: five standard deviations of 9 degrees of freedom are below 10
     assert max(causal, final) < 10.0
-
-
-def test_a_late_image_tells_of_the_floor_once():
-    """What an EKF knows when all have come is what it would know without delay."""
-    log = uneven(simulate(SEEDS[0]))
-    setup = Setup(log.rig, log.world, log.rig.sensors, np.random.default_rng(1))
-    ends = []
-    for one in (log, short_logs.late(log, "sightings")):
-        ekf = create("ekf", setup, settings_of("ekf", {}))
-        ekf.initialize(resolve_prior(log, None)[0])
-        for m in one.measurements(one.rig.sensors):
-            ekf.process(m)
-        ends.append(ekf.estimate())
-    np.testing.assert_allclose(ends[1].pose, ends[0].pose, atol=1e-9)
-    np.testing.assert_allclose(ends[1].covariance, ends[0].covariance, rtol=1e-6)

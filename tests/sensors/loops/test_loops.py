@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mapped_hall import VELOCITIES, write_mapped
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -26,9 +27,9 @@ NOISE = OdometryNoise(
 RIG = Rig(sensors=("odometry", "loops"), odometry=OdometrySettings(noise=NOISE), loops=LoopSettings(sigma_place=0.3))
 
 
-def drive(seed, false=0.6, with_pose=False):
-    """Rounds of a square, with loops of which the share ``false`` join places that are not the same."""
-    rng = np.random.default_rng(seed)
+def drive(with_pose=False):
+    """Rounds of a square, with loops of which six in ten join places that are not the same."""
+    rng, false = np.random.default_rng(3), 0.6
     quarter = 2.0
     w = np.pi / 2.0 / quarter
     one_side = [(SPEED, 0.0)] * round(SIDE / SPEED / STEP) + [(0.0, w)] * round(quarter / STEP)
@@ -74,7 +75,7 @@ def right_ones(log):
 
 @pytest.mark.parametrize(("estimator", "with_pose"), [("smoother", False), ("batch", True)])
 def test_false_loops_do_no_harm(estimator, with_pose):
-    log = drive(3, with_pose=with_pose)
+    log = drive(with_pose=with_pose)
     alone, _ = final_error(replace(log, rig=RIG.model_copy(update={"sensors": ("odometry",)})), estimator)
     best, _ = final_error(right_ones(log), estimator)
     found, _ = final_error(log, estimator)
@@ -83,7 +84,7 @@ def test_false_loops_do_no_harm(estimator, with_pose):
 
 
 def test_filters_and_a_window_count_what_they_cannot_use():
-    log = drive(3)
+    log = drive()
     count = len(log.streams["loops"].t)
     for estimator, settings in (("ekf", {}), ("particle_filter", {"particles": 50}), ("smoother", {"lag": 5.0})):
         ignored = final_error(log, estimator, **settings)[1].diagnostics.ignored["loops: the earlier pose is not kept"]
@@ -91,7 +92,7 @@ def test_filters_and_a_window_count_what_they_cannot_use():
 
 
 def test_scores_below_the_rigs_are_not_used():
-    log = drive(3)
+    log = drive()
     loops = replace(log.streams["loops"], score=np.full(len(log.streams["loops"].t), 0.2))
     log = replace(
         log,
@@ -104,7 +105,7 @@ def test_scores_below_the_rigs_are_not_used():
 
 @pytest.mark.parametrize("format", ["csv", "parquet"])
 def test_a_log_with_loops_is_read_as_it_was_written(tmp_path, format):
-    log = drive(3, with_pose=True)
+    log = drive(with_pose=True)
     write_native(log, tmp_path / "log", format)
     read, written = load(tmp_path / "log")[0].streams["loops"], log.streams["loops"]
     for name in ("t", "age", "x", "y", "heading", "score"):
@@ -112,7 +113,7 @@ def test_a_log_with_loops_is_read_as_it_was_written(tmp_path, format):
 
 
 def folder_with(tmp_path, text):
-    write_native(replace(drive(3), streams={"odometry": drive(3).streams["odometry"]}), tmp_path / "log")
+    write_native(replace(drive(), streams={"odometry": drive().streams["odometry"]}), tmp_path / "log")
     (tmp_path / "log/loops.csv").write_text(text)
     return tmp_path / "log"
 
@@ -141,20 +142,9 @@ def test_a_row_that_is_no_loop_is_named(tmp_path, rows, message):
         load(folder_with(tmp_path, rows))
 
 
-MANIFEST = """
-title = "log"
-licence = "ours"
-origin = "a test"
-reader = "mapped"
-path = "log"
-
-[options.odometry]
-file = "wheels.csv"
-columns = { t = "t", v = "v", w = "w" }
-units = { t = "s" }
-
+FOUND = """
 [options.loops]
-file = "found.txt"
+file = "found.csv"
 header = false
 separator = " "
 columns = { t = "2", before_ns = "3", score = "4" }
@@ -165,11 +155,10 @@ clock_offset = -100.0
 
 
 def test_a_mapped_table_with_two_stamps_in_seconds_and_another_clock(tmp_path):
-    (tmp_path / "log").mkdir()
-    (tmp_path / "log/wheels.csv").write_text("t,v,w\n0.0,0.5,0.0\n9.0,0.0,0.0\n")
-    (tmp_path / "log/found.txt").write_text("loop 105.0 102.5 0.8\nother 1 2 3\nloop 108.0 101.0 0.4\n")
-    (tmp_path / "log.toml").write_text(MANIFEST)
-    loops = load(tmp_path / "log.toml", data_root=tmp_path)[0].streams["loops"]
+    rows = "loop 105.0 102.5 0.8\nother 1 2 3\nloop 108.0 101.0 0.4\n"
+    wheels = "t,v,w\n0.0,0.5,0.0\n9.0,0.0,0.0\n"
+    manifest = write_mapped(tmp_path, VELOCITIES + FOUND, wheels=wheels, found=rows)
+    loops = load(manifest, data_root=tmp_path)[0].streams["loops"]
     np.testing.assert_allclose(loops.t, (5.0, 8.0))
     np.testing.assert_allclose(loops.age, (2.5, 7.0))
     np.testing.assert_allclose(loops.score, (0.8, 0.4))
