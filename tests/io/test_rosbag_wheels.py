@@ -106,16 +106,6 @@ def test_the_rig_tells_the_size_of_the_wheels(maker):
 
 
 def test_wheels_are_proposed_by_their_names(tmp_path, bag_maker):
-    with bag_maker(tmp_path / "topics") as made:
-        add_topics(made, [1.0], [1.0])
-    found = proposed(made.path)
-    wheels = {"left": "data", "right": "data", "right_topic": "/right_wheel/speed", "radius": 0.1, "track": 0.5}
-    assert found.options == {
-        "odometry": {"topic": "/left_wheel/speed", "use": "twist", "wheels": wheels},
-        "clock": "receive",
-    }
-    assert found.uses == {"/left_wheel/speed": "odometry", "/right_wheel/speed": "odometry: right wheel"}
-    assert "are taken for speeds of wheels [rad/s]; measure radius and track" in found.notes[0]
     with bag_maker(tmp_path / "joints") as made:
         add_wheels(made, [0.0], [0.0], names=("left_arm", "wheel_left_joint", "wheel_right_joint"))
     found = proposed(made.path)

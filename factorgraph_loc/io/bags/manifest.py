@@ -23,12 +23,8 @@ TRUTH = re.compile(
     r"truth|(^|[/_])gt($|[/_])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
 )
 LEFT, RIGHT = re.compile("left", re.IGNORECASE), re.compile("right", re.IGNORECASE)
-WHEEL, SPEED = re.compile("wheel", re.IGNORECASE), re.compile("speed|vel|rate|rpm", re.IGNORECASE)
-SCALARS = {f"std_msgs/msg/{name}" for name in ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64")}
-SCALARS |= {f"std_msgs/msg/{name}" for name in ("UInt8", "UInt16", "UInt32", "UInt64")}
+WHEEL = re.compile("wheel", re.IGNORECASE)
 WHEELS = {"radius": 0.1, "track": 0.5}  # m
-NUMBERS = {"twist": "speeds of wheels [rad/s]", "pose": "angles of wheels [rad]"}
-MEASURE = "measure radius and track [m]: here, or as [odometry.wheels] in the rig, which comes first"
 NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORECASE)
 
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
@@ -169,27 +165,18 @@ def propose(bag: Bag) -> Proposal:
 
 
 def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Prefer odometry, then transforms of its frame, then measured velocities, then wheels, then commands."""
+    """Prefer odometry, then transforms of its frame, then velocities, then wheels; commands are no measurements."""
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
     frames = {} if origin is None else {"parent": origin, "child": robot}
-    pairs = _pairs(topics)
     ranked = [
         topic
-        for kinds, measured in (
-            ({ODOMETRY}, True),
-            (set(TF) if frames else set(), True),
-            (set(TWISTS), True),
-            ({JOINTS}, True),
-            ({topic.type for topic in topics if topic.name in pairs}, True),
-            (set(TWISTS), False),
-        )
+        for kinds in ({ODOMETRY}, set(TF) if frames else set(), set(TWISTS), {JOINTS})
         for topic in topics
         if topic.type in kinds
         and (topic.type not in TF or topic.name == tree.topic)
-        and (topic.type not in SCALARS or topic.name in pairs)
         and not TRUTH.search(topic.name)
-        and bool(NOT_MEASURED.search(topic.name)) != measured
+        and not NOT_MEASURED.search(topic.name)
     ]
     if not ranked:
         out.notes.append("no topic looks like odometry, which every estimator needs: name one in [options.odometry]")
@@ -200,13 +187,6 @@ def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> Non
         out.notes.append(f"the orientations in {ranked[0].name} are not set: its velocities are used, not its poses")
     elif ranked[0].type == JOINTS:
         settings = _joints(bag, ranked[0], out.notes)
-    elif pair := pairs.get(ranked[0].name):
-        settings = {"use": "twist" if SPEED.search(ranked[0].name) else "pose"}
-        settings["wheels"] = {"left": "data", "right": "data", "right_topic": pair} | WHEELS
-        out.uses[pair] = "odometry: right wheel"
-        out.notes.append(f"{ranked[0].name} and {pair} are taken for {NUMBERS[settings['use']]}; {MEASURE}")
-    elif NOT_MEASURED.search(ranked[0].name):
-        out.notes.append(f"{ranked[0].name} contains commanded velocities, not measured ones")
     out.take("odometry", ranked, **settings)
 
 
@@ -219,15 +199,6 @@ def _has_no_pose(bag: Bag, topic: Topic) -> bool:
     return not any((turned.x, turned.y, turned.z, turned.w))
 
 
-def _pairs(topics: Sequence[Topic]) -> dict[str, str]:
-    """Topics of numbers that are of a left and a right wheel by their names: the right one of each left one."""
-    names = {topic.name for topic in topics if topic.type in SCALARS}
-    right_of = {
-        name: LEFT.sub(lambda match: "Right" if match[0][0] == "L" else "right", name) for name in sorted(names)
-    }
-    return {name: right for name, right in right_of.items() if right != name and right in names}
-
-
 def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
     """The settings of wheels that are joints, by the names in the first message."""
     first = next(bag.messages([topic.name]), None)
@@ -235,7 +206,10 @@ def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
     wheels = [name for name in names if WHEEL.search(name)] or names
     left = next((name for name in wheels if LEFT.search(name)), "left_wheel_joint")
     right = next((name for name in wheels if RIGHT.search(name)), "right_wheel_joint")
-    notes.append(f"wheels: {left} and {right} are taken for them, of the joints {listed(names)}; {MEASURE}")
+    notes.append(
+        f"wheels: {left} and {right} are taken for them, of the joints {listed(names)}; measure radius and track [m]: "
+        "here, or as [odometry.wheels] in the rig, which comes first"
+    )
     return {"wheels": {"left": left, "right": right} | WHEELS}
 
 
