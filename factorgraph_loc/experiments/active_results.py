@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, grid, legend, styles
-from factorgraph_loc.evaluation.statistics import Interval, mcnemar, median_difference, median_ratio, quantile
+from factorgraph_loc.evaluation.statistics import mcnemar, median_difference, median_ratio, quantile
 from factorgraph_loc.evaluation.warned import Row
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
@@ -147,8 +147,8 @@ def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     header += ["failed only first / second", "p (McNemar)"]
     lines = []
     for compared in differences(rows):
-        difference = Interval(compared["difference"], compared["low"], compared["high"])
-        ratio = Interval(compared["ratio"], compared["ratio_low"], compared["ratio_high"])
+        difference = [compared[key] for key in ("difference", "low", "high")]
+        ratio = [compared[key] for key in ("ratio", "ratio_low", "ratio_high")]
         lines.append(
             [
                 *(
@@ -168,8 +168,8 @@ def metres_text(value: float) -> str:
     return NEVER if math.isinf(value) else _text(value, 1)
 
 
-def _interval_text(interval: Interval, digits: int) -> str:
-    value, low, high = (_text(bound, digits) for bound in (interval.value, interval.low, interval.high))
+def _interval_text(interval: Sequence[float], digits: int) -> str:
+    value, low, high = (_text(bound, digits) for bound in interval)
     return f"{value} ({low} to {high})"
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,6 +43,13 @@ if TYPE_CHECKING:
 
 SUFFIX = ".world.toml"
 POINTS = "points"
+KINDS = (POINTS, "landmarks", "tags")  # the first that a log has is mapped
+FLAGS = {  # options of one kind of map
+    "estimator": ("--estimator", "landmarks"),
+    "settings": ("--set", "landmarks"),
+    "tag_height": ("--tag-height", "tags"),
+    "points": ("--set points", POINTS),
+}
 HEIGHTS = (-10.0, 20.0)  # m
 OF_REFERENCE = "that of the reference"
 BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without one"
@@ -118,44 +125,35 @@ def make_map(log: Log, options: MapOptions | None = None, progress: Progress = l
     if options.drop_dead:
         return _without_dead(log, options, progress)
     what = _mapped_kind(log, options)
-    if what == "points":
+    if what == POINTS:
         return _of_points(log, options, progress)
     return _of_tags(log, options, progress) if what == "tags" else _of_landmarks(log, options, progress)
 
 
-def _mapped_kind(log: Log, options: MapOptions) -> Literal["landmarks", "tags", "points"]:
+def _mapped_kind(log: Log, options: MapOptions) -> str:
     """The kind of map. Raises InputError for options of another kind."""
-    of_landmarks = bool(options.settings) or options.estimator != MAP_ESTIMATORS[0]
-    of_tags = options.tag_height is not None
-    of_others = of_landmarks or of_tags
-    of, available = options.of, _mappable(log)
-    if of == POINTS and of_others:
-        raise InputError(
-            "--estimator, --set of an estimator and --tag-height are for other maps, but points are mapped here"
-        )
-    extends = not options.extend or log.world.points is not None
-    if of == POINTS or (of is None and not of_others and extends and POINTS in available):
-        return "points"
-    if options.points:
-        raise InputError("--set points... is for maps of points, but others are mapped here")
-    if of not in (None, "landmarks", "tags"):
-        raise InputError(f"--of is {quoted(of)}, expected landmarks, tags or points")
-    if of == "tags" or (of is None and "landmarks" not in available and "tags" in available):
-        if of_landmarks:
-            raise InputError("--estimator and --set are for maps of landmarks, but tags are mapped here")
-        return "tags"
-    if of_tags or options.poses is not None:
-        raise InputError("--poses and --tag-height are for maps of tags, but landmarks are mapped here")
-    return "landmarks"
+    if options.of not in (None, *KINDS):
+        raise InputError(f"--of is {quoted(options.of)}, expected {' or '.join(KINDS)}")
+    usual = MapOptions()
+    given = {flag: kind for name, (flag, kind) in FLAGS.items() if getattr(options, name) != getattr(usual, name)}
+    what = options.of or next(iter(given.values()), None) or _usual_kind(log, extend=options.extend)
+    if flag := next((flag for flag, kind in given.items() if kind != what), None):
+        raise InputError(f"{flag} is for maps of {given[flag]}, but {what} are mapped here")
+    return what
 
 
-def _mappable(log: Log) -> dict[str, str]:
-    """The layers of a world that can be mapped from a log, and the sensors that observe them."""
-    by_layer = {sensor.detects: sensor for sensor in sensors().values() if sensor.detects}
+def _usual_kind(log: Log, *, extend: bool) -> str:
+    """The kind of map that is made by default."""
+    known = _mappable(log) - ({POINTS} if extend and log.world.points is None else set())
+    return next((kind for kind in KINDS if kind in known), "landmarks")
+
+
+def _mappable(log: Log) -> set[str]:
+    """The layers of a world that can be mapped from a log."""
     return {
-        layer: sensor.name
-        for layer, sensor in by_layer.items()
-        if (first := sensor.channels[0].name) in log.streams and not lacking_section(log.rig, first)
+        sensor.detects
+        for sensor in sensors().values()
+        if sensor.detects and (first := sensor.channels[0].name) in log.streams and not lacking_section(log.rig, first)
     }
 
 
@@ -165,6 +163,8 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
         raise InputError(
             f"--estimator is {quoted(estimator)}, expected one that estimates landmarks: {', '.join(MAP_ESTIMATORS)}"
         )
+    if options.poses is not None:
+        raise InputError("--poses is for maps of tags, but landmarks are mapped here")
     if "landmarks" in settings:
         raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")
     require_mappable(log)
@@ -219,7 +219,7 @@ def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     camera = log.rig.find(CameraSettings)
     if camera is None:
         raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
-    if "points" not in _mappable(log):
+    if POINTS not in _mappable(log):
         raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
     if options.extend and log.world.points is None:
         raise InputError(f"{log.name}: has no map of points that could be extended; leave --extend out")

@@ -10,7 +10,6 @@ types ``slam2d``. The file contains the motion between poses (``EDGE_SE2``) and 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -29,7 +28,6 @@ from factorgraph_loc.sensors.landmarks.summary import located_landmarks
 from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.text import listed
-from factors.motion import Increment
 from factors.se2 import Array
 
 KITTI = ".kitti"
@@ -69,34 +67,15 @@ def write_kitti(trajectory: Trajectory | Trajectory3, path: Path) -> Path:
     return times
 
 
-@dataclass(frozen=True)
-class LandmarkEdge:
-    """A landmark at ``point`` (2,) in the robot's frame, with ``covariance`` (2, 2) [m^2], sighted from the pose ``index``."""
-
-    index: int
-    landmark: str
-    point: Array
-    covariance: Array
-
-
-@dataclass(frozen=True)
-class PoseGraph:
-    """``t`` (N,) and estimated ``poses`` (N, 3); ``motions``: N - 1, between consecutive poses. ``landmarks``: positions (2,)
-    by name; ``known``: whether they come from the map and are fixed.
-    """
-
-    t: Array
-    poses: Array
-    motions: tuple[Increment, ...]
-    landmarks: Mapping[str, Array]
-    known: bool
-    sightings: tuple[LandmarkEdge, ...]
-
-
-def pose_graph(
-    log: Log, trajectory: Trajectory, sensors: Sequence[str], learnt: Mapping[str, LearntPoint] | None = None
-) -> PoseGraph:
-    """The pose graph of a log, with poses at the stamps of ``trajectory`` and of the sightings between them.
+def write_g2o(
+    log: Log,
+    trajectory: Trajectory,
+    sensors: Sequence[str],
+    path: Path,
+    learnt: Mapping[str, LearntPoint] | None = None,
+) -> None:
+    """Write the pose graph of a log as a g2o file: poses at the stamps of ``trajectory`` and of the sightings between them,
+    numbered from 0, then landmarks. Landmarks of a map are fixed, otherwise the first pose is.
 
     ``sensors``: the channels of the log to use. Landmarks are those of the map or, if it has none, ``learnt``. Raises
     InputError for fewer than two poses, or a log without odometry.
@@ -114,26 +93,20 @@ def pose_graph(
     t = np.unique(np.concatenate((trajectory.t, [s.t for s in observed])))
     if len(t) < 2:
         raise InputError(f"{log.name}: the run has {len(t)} poses, expected two or more for a pose graph")
-    index = {at: i for i, at in enumerate(t.tolist())}
-    sightings = tuple(LandmarkEdge(index[at], name, point, covariance) for at, name, point, covariance in observed)
     sighted = {s.landmark for s in observed}
-    landmarks = {name: place for name, place in landmarks.items() if name in sighted}
+    number = {name: len(t) + i for i, name in enumerate(name for name in landmarks if name in sighted)}
+    lines = [f"VERTEX_SE2 {i} {_numbers(pose)}" for i, pose in enumerate(trajectory.at(t))]
+    lines += [f"VERTEX_XY {number[name]} {_numbers(landmarks[name])}" for name in number]
     motion = whole_motion(log, moving(used, TURN))
-    motions = tuple(motion.relative(a, b) for a, b in pairwise([motion.state(at) for at in t.tolist()]))
-    return PoseGraph(t, trajectory.at(t), motions, landmarks, bool(log.world.landmarks), sightings)
-
-
-def write_g2o(graph: PoseGraph, path: Path) -> None:
-    """Write a g2o file: poses, numbered from 0, then landmarks. Landmarks of a map are fixed, otherwise the first pose is."""
-    number = {name: len(graph.t) + i for i, name in enumerate(graph.landmarks)}
-    lines = [f"VERTEX_SE2 {i} {_numbers(pose)}" for i, pose in enumerate(graph.poses)]
-    lines += [f"VERTEX_XY {number[name]} {_numbers(place)}" for name, place in graph.landmarks.items()]
-    for i, motion in enumerate(graph.motions):
-        lines.append(f"EDGE_SE2 {i} {i + 1} {_numbers(motion.delta)} {_information(motion.covariance)}")
-    for s in graph.sightings:
-        lines.append(f"EDGE_SE2_XY {s.index} {number[s.landmark]} {_numbers(s.point)} {_information(s.covariance)}")
+    states = [motion.state(at) for at in t.tolist()]
+    for i, (a, b) in enumerate(pairwise(states)):
+        step = motion.relative(a, b)
+        lines.append(f"EDGE_SE2 {i} {i + 1} {_numbers(step.delta)} {_information(step.covariance)}")
+    for at, name, point, covariance in observed:
+        place = int(np.searchsorted(t, at))
+        lines.append(f"EDGE_SE2_XY {place} {number[name]} {_numbers(point)} {_information(covariance)}")
     # last, as GTSAM stops reading here
-    lines += [f"FIX {i}" for i in (number.values() if graph.known and number else (0,))]
+    lines += [f"FIX {i}" for i in (number.values() if log.world.landmarks and number else (0,))]
     with writing(path):
         write_text(path, "\n".join(lines) + "\n")
 
