@@ -1,4 +1,4 @@
-"""The packages of the project in layers, what each imports and what it shows: the tables of docs/architecture.md."""
+"""The packages of the project in layers, what each imports and what it shows: tree and table of docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -22,6 +22,12 @@ LAYERS = (
     ("experiments", "live"),
     ("api", "cli", "builtin", ""),
 )
+OTHERS = {
+    "scripts": "Tests, tables of the docs, conversion of recordings, examples; in benchmarks/ a package for each page of results.",
+    "datasets": "Manifests and rigs of known recordings.",
+    "docs": "These pages.",
+    "tests": "Tests by package; golden/ has the stored results of all estimators.",
+}
 HEIGHT = {package: height for height, packages in enumerate(LAYERS) for package in packages}
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
@@ -89,21 +95,31 @@ def _face(path: Path) -> tuple[str, ...]:
 FACES = {m: _face(path) for m, path in MODULES.items() if path.name == "__init__.py" and m != "factorgraph_loc"}
 
 
-def tables() -> Iterator[str]:
-    """The lines of the table, the top layer first."""
-    yield "| package | what it is | imports |"
-    yield "|---|---|---|"
+def tree() -> Iterator[str]:
+    """The lines of the tree of folders, the top layer first."""
+    yield from ("```text", "factorgraph_loc/")
     for packages in reversed(LAYERS):
         for package in packages:
-            if package:
-                yield f"| `{package}` | {_what(package)} | {_listed(_below(package))} |"
-    yield from ("", "## What a package shows", "")
-    yield "The last column is `__all__`: the modules and names that other packages may import."
-    yield from ("", "| package | modules | private modules | public |", "|---|---|---|---|")
+            if package not in ("", "factors"):
+                folder = MODULES[f"factorgraph_loc.{package}"].name == "__init__.py"
+                yield f"    {package + ('/' if folder else '.py'):16}{_what(package)}"
+    yield f"{'factors/':20}{_what('factors')}"
+    yield from (f"{folder + '/':20}{what}" for folder, what in OTHERS.items())
+    yield "```"
+
+
+def tables() -> Iterator[str]:
+    """The lines of the table of imports and public names."""
+    yield "| package | imports | modules | private modules | public |"
+    yield "|---|---|---|---|---|"
     for package, face in sorted(FACES.items()):
         inside = {m.rpartition(".")[2] for m in MODULES if m.rpartition(".")[0] == package}
         name = package.removeprefix("factorgraph_loc.")
-        yield f"| `{name}` | {len(inside)} | {len(inside - set(face))} | {_listed(face)} |"
+        below = _listed(_below(name)) if name in HEIGHT else ""
+        yield f"| `{name}` | {below} | {len(inside)} | {len(inside - set(face))} | {_listed(face)} |"
+
+
+SECTIONS = {"Packages": tree, "Imports and public names": tables}
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -117,6 +133,7 @@ def _below(package: str) -> list[str]:
 
 
 def _what(package: str) -> str:
+    """The first sentence about a package."""
     name = package if package == "factors" else f"factorgraph_loc.{package}"
-    text = ast.get_docstring(ast.parse(MODULES[name].read_text())) or ""
-    return " ".join(text.partition("\n\n")[0].split()).replace("``", "`").replace(":mod:", "").replace("|", r"\|")
+    text = " ".join((ast.get_docstring(ast.parse(MODULES[name].read_text())) or "").split())
+    return text.partition(". ")[0].rstrip(".").replace("``", "").replace(":mod:", "").replace("`", "") + "."

@@ -1,4 +1,4 @@
-"""Recorded logs by name: those of ``fgloc datasets``, and those of the converters, which are not written to a folder here."""
+"""Recorded logs by name: those of ``fgloc datasets``, and those that scripts/convert writes."""
 
 import re
 from pathlib import Path
@@ -20,13 +20,13 @@ CONVERTED = {
 def recorded_log(name: str, data_root: Path | None = None, odometry_seed: int = 0) -> Log:
     """The log ``name``. ``data_root``: the data folder, by default the environment's FGLOC_DATA; ``odometry_seed``: of the
     simulated odometry of the aisle's runs."""
-    if name not in CONVERTED:
+    found = re.fullmatch(r"(woods-r|rfid-aisle-run)(\d+)", name)
+    if found is None:
         return read_log(name, data_root=data_root)
-    path = find_data_root(data_root, name) / CONVERTED[name]
-    number = int(re.findall(r"\d+$", name)[0])
-    if CONVERTED[name] == WOODS:
-        return read_woods(path, float(number))
-    return read_rfid_aisle(path, number, odometry_seed)
+    root = find_data_root(data_root, name)
+    if found[1] == "woods-r":
+        return read_woods(root / WOODS, float(found[2]))
+    return read_rfid_aisle(root / AISLE, int(found[2]), odometry_seed)
 
 
 def present_logs(data_root: Path | None = None) -> set[str]:

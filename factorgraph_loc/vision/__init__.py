@@ -1,4 +1,4 @@
-"""Point features of images (the paper's colour features, SIFT, ORB), their matching, tracking and localization in a map."""
+"""Point features of images (colour features, SIFT, ORB): matching, tracking, localization in a map."""
 
 __all__ = [
     "association",

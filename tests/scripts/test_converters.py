@@ -1,4 +1,4 @@
-"""The converters of recordings to logs in the native format."""
+"""The conversion of recordings to logs in the native format."""
 
 import math
 
@@ -20,9 +20,9 @@ def a_read(us, epc="E-1", phase="90"):
 @pytest.fixture
 def aisle(tmp_path):
     """One second of poses; a round of each antenna, one of the third before the poses and one across their end."""
-    run = tmp_path / "aisle" / "run4"
+    run = tmp_path / "rfid_aisle" / "run4"
     run.mkdir(parents=True)
-    (tmp_path / "aisle" / "tags.csv").write_text(TAGS)
+    (tmp_path / "rfid_aisle" / "tags.csv").write_text(TAGS)
     poses = [f"{0.001 * k:.6f} 0.0 0.1 {T0 / 1e6 + 0.005 * k:.6f}" for k in range(201)]
     (run / "reference_pose.txt").write_text("\n".join(poses) + "\n")
     (run / "first.txt").write_text(
@@ -30,14 +30,14 @@ def aisle(tmp_path):
     )
     (run / "second.txt").write_text(a_read(140_000) + a_read(190_000) + a_read(240_001))
     (run / "third.txt").write_text(a_read(-20_000) + a_read(400_000))
-    return tmp_path / "aisle"
+    return tmp_path
 
 
 def test_a_run_of_the_aisle(aisle, tmp_path, capsys):
-    assert run_script("convert_rfid_aisle", aisle, 4, "-o", tmp_path / "log") == 0
+    assert run_script("convert", "rfid-aisle-run4", "--data-root", aisle, "-o", tmp_path / "logs") == 0
     assert "3 of 9 reads are outside of the reference" in capsys.readouterr().err
-    log = read_log(tmp_path / "log")
-    assert (log.name, log.t0_ns, log.rig.name) == ("log", T0 * 1000, "rfid-aisle")
+    log = read_log(tmp_path / "logs/rfid-aisle-run4")
+    assert (log.name, log.t0_ns, log.rig.name) == ("rfid-aisle-run4", T0 * 1000, "rfid-aisle")
     reads = log.streams["rfid"]
     assert reads.antenna == ["first", "first", "second", "second", "second", "third"]
     assert reads.epc == ["E-1", "E-2", "E-1", "E-1", "E-1", "E-1"]
@@ -57,8 +57,9 @@ def test_a_run_of_the_aisle(aisle, tmp_path, capsys):
 def test_the_seed_changes_the_odometry_only(aisle, tmp_path):
     logs = []
     for seed in (0, 1):
-        run_script("convert_rfid_aisle", aisle, 4, "--odometry-seed", seed, "-o", tmp_path / f"seed{seed}")
-        logs.append(read_log(tmp_path / f"seed{seed}"))
+        options = ("--data-root", aisle, "--odometry-seed", seed, "-o", tmp_path / f"seed{seed}")
+        run_script("convert", "rfid-aisle-run4", *options)
+        logs.append(read_log(tmp_path / f"seed{seed}/rfid-aisle-run4"))
     first, second = logs
     assert np.any(first.streams["odometry"].dx != second.streams["odometry"].dx)
     np.testing.assert_array_equal(first.streams["rfid"].t, second.streams["rfid"].t)
@@ -71,9 +72,10 @@ def test_woods(tmp_path):
     r[0, 0], r[0, 16] = 0.5, 2.0
     fields = {"t": np.array([[0.0], [0.1], [0.2]]), "v": column + 0.25, "om": column, "r": r, "b": np.sign(r) * 4.0}
     truth = {"x_true": column, "y_true": column, "th_true": column + 4.0, "true_valid": np.array([[1], [0], [1]])}
-    savemat(tmp_path / "dataset2.mat", {**fields, **truth, "l": np.arange(34.0).reshape(17, 2)})
-    for name, max_range, seen in (("near", 2.0, ["1"]), ("all", 5.0, ["1", "17"])):
-        run_script("convert_woods", tmp_path / "dataset2.mat", "--max-range", max_range, "-o", tmp_path / name)
+    (tmp_path / "utias").mkdir()
+    savemat(tmp_path / "utias/dataset2.mat", {**fields, **truth, "l": np.arange(34.0).reshape(17, 2)})
+    run_script("convert", "woods-r2", "woods-r5", "--data-root", tmp_path, "-o", tmp_path)
+    for name, seen in (("woods-r2", ["1"]), ("woods-r5", ["1", "17"])):
         log = read_log(tmp_path / name)
         assert (log.name, log.rig.name) == (name, "woods")
         assert list(log.streams["bearing_range"].landmark) == seen
@@ -83,9 +85,8 @@ def test_woods(tmp_path):
     assert log.world.position("2").tolist() == [2.0, 3.0]
 
 
-@pytest.mark.parametrize("script", ["convert_woods", "convert_rfid_aisle"])
-def test_a_missing_file_is_named(script, tmp_path):
-    number = [13] if "aisle" in script else []
-    with pytest.raises(SystemExit, match="nothing"):
-        run_script(script, tmp_path / "nothing", *number, "-o", tmp_path / "out")
+@pytest.mark.parametrize(("name", "missing"), [("woods-r5", "dataset2.mat"), ("rfid-aisle-run13", "rfid_aisle")])
+def test_a_missing_file_is_named(name, missing, tmp_path):
+    with pytest.raises(SystemExit, match=missing):
+        run_script("convert", name, "--data-root", tmp_path, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()

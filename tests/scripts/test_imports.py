@@ -11,7 +11,8 @@ from collections import defaultdict
 from graphlib import TopologicalSorter
 
 import pytest
-from package_tables import FACES, HEIGHT, MODULES, ROOT, imported, named, names_in, package_of, steps, tables
+from package_tables import FACES, HEIGHT, MODULES, ROOT, SECTIONS, imported, named, names_in, package_of, steps
+from page_tables import with_tables
 
 EXCEPTIONS: set[tuple[str, str]] = set()
 
@@ -136,6 +137,5 @@ def test_every_folder_is_a_package():
 
 def test_the_page_of_the_architecture_is_up_to_date():
     page = (ROOT / "docs/architecture.md").read_text()
-    assert page.partition("<!-- tables -->\n\n")[2].splitlines() == list(tables()), (
-        "scripts/architecture --docs docs/architecture.md"
-    )
+    for section, lines in SECTIONS.items():
+        assert page == with_tables(page, lines(), section), "scripts/architecture --docs docs/architecture.md"

@@ -1,1 +1,5 @@
-"""The sections of scripts/benchmarks/bench_active."""
+"""Active localization: the sections of docs/active.md."""
+
+from active_benchmark.sections import estimators, policies
+
+SECTIONS = {"policies": policies, "estimators": estimators}

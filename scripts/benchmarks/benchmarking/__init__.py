@@ -1,1 +1,1 @@
-"""Common parts of the benchmarks: their command line, tables, and parallel jobs."""
+"""Common parts of the benchmarks: tables, parallel jobs, and statistics of many runs."""

@@ -95,5 +95,6 @@ def series(trajectory: Trajectory, log: Log, max_gap: float = MAX_GAP) -> Series
 
 
 def stacked(runs: Sequence[Series]) -> Array:
-    """NEES (R, N) of runs whose references have the same stamps."""
-    return np.stack([one.nees for one in runs])
+    """NEES (R, N) of runs at the first N times, which all of them have."""
+    count = min(len(one.nees) for one in runs)
+    return np.stack([one.nees[:count] for one in runs])

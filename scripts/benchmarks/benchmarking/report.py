@@ -1,37 +1,58 @@
-"""Common parts of the sections: options, parallel jobs, tables, statistics of many runs."""
+"""Common parts of the sections: options, parallel jobs, tables, errors of many runs."""
 
 from __future__ import annotations
 
-import csv
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarking.ensemble import Series
-from benchmarking.statistics import Ratio, rmse_ratio
+from benchmarking.ensemble import RunErrors, Series, stacked
+from benchmarking.statistics import Ratio, rmse_ratio, share_in_band
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.evaluation.statistics import pooled_rms
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.processes import run_each
 
 ENOUGH = 10  # trials for an interval of a share
+NOTHING = "–"
+KINDS = ("causal", "final")
+ACCURACY = (
+    "causal [m]",
+    "[deg]",
+    "final [m]",
+    "[deg]",
+    "final p95 [m]",
+    "ANEES causal / final",
+    "inside causal / final",
+)
 
 
 @dataclass(frozen=True)
 class Options:
-    """``seeds``: number of simulated logs of each kind, None for each section's default; ``jobs``: parallel processes."""
+    """``seeds``: number of simulated logs of each kind, ``duration`` [s]: of simulated drives, None for each section's default;
+    ``jobs``: parallel processes; ``cache``: folder of rendered drives, None for one below ``out``."""
 
     seeds: int | None
     jobs: int
     data_root: Path | None
     out: Path
+    duration: float | None = None
+    cache: Path | None = None
 
     def count(self, usual: int) -> int:
         return usual if self.seeds is None else self.seeds
+
+    def seconds(self, usual: float) -> float:
+        return usual if self.duration is None else self.duration
+
+    @property
+    def drives(self) -> Path:
+        return self.cache or self.out / "drives"
 
 
 @dataclass
@@ -50,28 +71,31 @@ class Report:
         self.lines += [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)]
         self.lines.append("")
 
-    def figures(self, name: str, heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-        """Write results of single runs as CSV beside the report."""
-        folder = self.options.out / self.name
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows([heads, *rows])
-
     def collect(
-        self, function: Callable[[Any], Any], jobs: Sequence[Any], labels: Sequence[str], workers: int | None = None
-    ) -> dict[int, Any]:
-        """The results of the successful jobs, by index."""
-        found: dict[int, Any] = {}
-        for i, outcome in run_each(function, jobs, self.options.jobs if workers is None else workers):
+        self, function: Callable[..., Any], jobs: Mapping[Any, tuple[Any, ...]], workers: int | None = None
+    ) -> dict[Any, Any]:
+        """The results of ``function`` for the arguments of each job, by the key of the job, without those that failed."""
+        keys, found = list(jobs), dict[Any, Any]()
+        call = partial(_called, function)
+        for i, outcome in run_each(call, list(jobs.values()), workers or self.options.jobs):
             if isinstance(outcome, Exception):
-                self.failed.append(f"{labels[i]}: {outcome}")
+                label = keys[i] if isinstance(keys[i], str) else ", ".join(map(str, keys[i]))
+                self.failed.append(f"{label}: {outcome}")
                 if not isinstance(outcome, FglocError):
-                    print(f"{labels[i]}: {outcome!r}", file=sys.stderr)
+                    print(f"{label}: {outcome!r}", file=sys.stderr)
             else:
-                found[i] = outcome
-            print(f"\r{self.name}: {len(found)} of {len(jobs)}", end="", file=sys.stderr, flush=True)
-        print(file=sys.stderr)
-        return found
+                found[keys[i]] = outcome
+            self.tell(len(found), len(jobs))
+        return {key: found[key] for key in keys if key in found}
+
+    def tell(self, done: float, total: float) -> None:
+        """Print how much is done."""
+        end = "\n" if done == total else ""
+        print(f"\r{self.name}: {done:.0f} of {total:.0f}", end=end, file=sys.stderr, flush=True)
+
+
+def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    return function(*arguments)
 
 
 def rmses(runs: Sequence[Series]) -> np.ndarray:
@@ -96,6 +120,22 @@ def spread_cell(runs: Sequence[Series]) -> str:
     errors = together(runs)
     nees = np.mean([np.nanmean(one.nees) for one in runs])
     return f"{position:.3f} / {np.median(errors):.3f} / {np.percentile(errors, 95):.3f} / {heading:.1f} / {nees:.1f}"
+
+
+def accuracy_cells(runs: Sequence[RunErrors]) -> tuple[str, ...]:
+    """The cells of :data:`ACCURACY`, pooled over runs; NEES is that of a pose, 3 where covariances are right."""
+    cells: list[str] = []
+    nees, inside = [], []
+    for kind in KINDS:
+        members: list[Series] = [getattr(one, kind) for one in runs]
+        grid = stacked(members)
+        known = bool(np.isfinite(grid).any())
+        position, heading = pooled(members)
+        cells += [f"{position:.4f}", f"{heading:.3f}"] if known else [NOTHING, NOTHING]
+        nees.append(f"{np.nanmean(grid):.2f}" if known else NOTHING)
+        inside.append(f"{100 * share_in_band(grid):.0f} %" if known and len(runs) > 1 else NOTHING)
+    p95 = np.percentile(together([one.final for one in runs]), 95)
+    return *cells, f"{p95:.4f}", " / ".join(nees), " / ".join(inside)
 
 
 def ratio_cells(a: Sequence[Series], b: Sequence[Series]) -> tuple[str, str]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, cut, join
@@ -36,96 +35,72 @@ class Trial:
     seconds: float
 
 
-@dataclass(frozen=True)
-class TrialJob:
-    """``count`` trials of a ``kind`` on a log, for :func:`run_trials`."""
-
-    kind: Literal["unknown start", "kidnapping"]
-    log: Log
-    estimator: str
-    count: int
-
-
-def run_trials(job: TrialJob) -> list[Trial]:
-    """The trials of a job; jobs can be sent to other processes."""
-    trials = start_trials if job.kind == "unknown start" else kidnapping_trials
-    return trials(job.log, job.estimator, job.count)
-
-
-def start_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
+def start_trials(log: Log, estimator: str, count: int) -> list[Trial]:
     """Unknown starts at ``count`` times spread evenly over a log with reference, as long as 3 landmarks are still to be seen.
 
     A start is correct if the estimator is localized within 60 s, or within the time in which it sees 3 different landmarks if
     that is longer, and then stays within 0.5 m and 15 degrees for 10 s.
     """
-    first, last = log.span()[0], _last_start(log)
+    stamps, names = _sightings(log)
+    first, last = log.span()[0], _third(stamps[::-1], names[::-1], log.span()[0])
     trials = []
     for i, t in enumerate(first + (last - first) * np.arange(count) / count):
-        deadline = max(START_TIME, _third_landmark(log, float(t)) - float(t))
+        later = stamps >= t
+        deadline = max(START_TIME, _third(stamps[later], names[later], log.span()[1]) - float(t))
         part = cut(log, float(t), float(t) + deadline + 2.0 * HOLD)
-        result = run(part, RunConfig(estimator, settings or {}, prior="unknown", seed=i))
+        result = run(part, RunConfig(estimator, prior="unknown", seed=i))
         claimed = np.array(result.status) == "localized"
         good = is_right(result, part)
         first_claim = int(np.argmax(claimed)) if claimed.any() else len(claimed)
         seconds = float(result.t[first_claim] - t) if claimed.any() else math.nan
-        right = bool(claimed.any()) and seconds <= deadline and bool(_holds(result.t, good, first_claim))
+        right = bool(claimed.any()) and seconds <= deadline and _holds(result.t, good, first_claim)
         wrong = bool(claimed.any()) and not bool(good[first_claim])
         trials.append(Trial(float(t), right, wrong, seconds))
     return trials
 
 
-def kidnapping_trials(log: Log, estimator: str, count: int, settings: Mapping[str, Any] | None = None) -> list[Trial]:
+def kidnapping_trials(log: Log, estimator: str, count: int) -> list[Trial]:
     """A robot that is kidnapped, ``count`` times, from one time of the log to one half the log later (or earlier).
 
     It is recovered if it is correct for 10 s, within 30 s of having seen 3 different landmarks at the new place.
     """
     first, last = log.span()
+    stamps, names = _sightings(log)
     trials = []
     for i in range(count):
         t = first + BEFORE + (last - first - BEFORE) * i / count
         other = first + (t - first + 0.5 * (last - first)) % (last - first)
-        deadline = _third_landmark(log, other) - other + RECOVERY_TIME
+        later = stamps >= other
+        deadline = _third(stamps[later], names[later], last) - other + RECOVERY_TIME
         before, after = cut(log, t - BEFORE, t), cut(log, other, other + deadline + 2.0 * HOLD)
         carried = join(before, after, gap=JUMP)
-        result = run(carried, RunConfig(estimator, settings or {}, prior="reference", seed=i))
+        result = run(carried, RunConfig(estimator, prior="reference", seed=i))
         moved = before.span()[1] + JUMP
         good = is_right(result, carried)
-        later = np.flatnonzero(result.t >= moved)
-        held = [int(k) for k in later if result.t[k] <= moved + deadline and _holds(result.t, good, int(k))]
-        seconds = float(result.t[held[0]] - moved) if held else math.nan
+        in_time = np.flatnonzero((result.t >= moved) & (result.t <= moved + deadline))
+        seconds = next((float(result.t[k] - moved) for k in in_time if _holds(result.t, good, k)), math.nan)
         at_deadline = int(np.searchsorted(result.t, moved + deadline).clip(max=len(result.t) - 1))
-        false = not held and result.status[at_deadline] == "localized"
-        trials.append(Trial(float(t), bool(held), false, seconds))
+        false = math.isnan(seconds) and result.status[at_deadline] == "localized"
+        trials.append(Trial(float(t), not math.isnan(seconds), false, seconds))
     return trials
 
 
-def _third_landmark(log: Log, t: float) -> float:
-    """The time of the third different landmark of the map after ``t``; the log's end if there is none."""
+def _sightings(log: Log) -> tuple[Array, NDArray[np.str_]]:
+    """Stamps and names of the landmarks of the map that are seen."""
     stream = log.streams["bearing_range"]
     assert isinstance(stream, BearingRangeStream)
-    met: set[str] = set()
-    for stamp, name in zip(stream.t.tolist(), stream.landmark, strict=True):
-        if stamp >= t and name in log.world.landmarks:
-            met.add(name)
-            if len(met) == LANDMARKS:
-                return float(stamp)
-    return log.span()[1]
+    names = np.array(stream.landmark)
+    known = np.isin(names, list(log.world.landmarks))
+    return stream.t[known], names[known]
 
 
-def _last_start(log: Log) -> float:
-    """The last time from which 3 different landmarks of the map are still seen; the log's begin if there is none."""
-    stream = log.streams["bearing_range"]
-    assert isinstance(stream, BearingRangeStream)
-    met: set[str] = set()
-    for stamp, name in zip(stream.t[::-1].tolist(), stream.landmark[::-1], strict=True):
-        if name in log.world.landmarks:
-            met.add(name)
-            if len(met) == LANDMARKS:
-                return float(stamp)
-    return log.span()[0]
+def _third(stamps: Array, names: NDArray[np.str_], otherwise: float) -> float:
+    """The time of the third different landmark; ``otherwise`` if there is none."""
+    _, first = np.unique(names, return_index=True)
+    return float(stamps[np.sort(first)[LANDMARKS - 1]]) if len(first) >= LANDMARKS else otherwise
 
 
-def is_right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
+def is_right(result: RunResult, log: Log) -> NDArray[np.bool_]:
     """Which causal estimates are correct; in a gap of the reference, as the one before (at the beginning, the one after)."""
     assert log.reference is not None
     truth = log.reference.at(result.t, max_gap=REFERENCE_GAP)
@@ -139,7 +114,15 @@ def is_right(result: RunResult, log: Log) -> np.typing.NDArray[np.bool_]:
     return right[scored[np.maximum(np.searchsorted(scored, np.arange(len(right)), side="right") - 1, 0)]]
 
 
-def _holds(t: Array, right: np.typing.NDArray[np.bool_], first: int) -> bool:
+def _holds(t: Array, right: NDArray[np.bool_], first: int) -> bool:
     """Whether all estimates of the following 10 s are correct."""
     during = (t >= t[first]) & (t <= t[first] + HOLD)
     return bool(right[during].all())
+
+
+TRIALS_OF = {"unknown start": start_trials, "kidnapping": kidnapping_trials}
+
+
+def run_trials(kind: str, log: Log, estimator: str, count: int) -> list[Trial]:
+    """``count`` trials of a kind of :data:`TRIALS_OF` on a log."""
+    return TRIALS_OF[kind](log, estimator, count)

@@ -1,1 +1,11 @@
-"""The sections of scripts/benchmarks/bench_camera."""
+"""Localization by a camera: the sections of docs/camera-results.md."""
+
+from camera_benchmark import faults, office, sevenscenes, slam, speed
+
+SECTIONS = {
+    "office": office.section,
+    "slam": slam.section,
+    "speed": speed.section,
+    "faults": faults.section,
+    "sevenscenes": sevenscenes.section,
+}

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from benchmarking.report import Report, pooled
+from benchmarking.report import NOTHING, Options, Report, pooled
 
-from camera_benchmark.drives import Drive, map_of, with_map, written
+from camera_benchmark.drives import Drive, log_of, map_of, with_map
 from camera_benchmark.faulty import FAULTS, Given
 from camera_benchmark.office import BOTH, CAMERA
-from camera_benchmark.options import CameraOptions
-from camera_benchmark.report import NOTHING, Attempt, attempt
+from camera_benchmark.report import Attempt, attempt
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.vision.feature_cache import VARIABLE
 
 SEEDS = 3
 FIRST = 9000
@@ -41,29 +38,23 @@ REPORTED = "smoother, camera"
 SHOWN = 110  # characters of a message
 
 
-@dataclass(frozen=True)
-class Job:
-    fault: str
-    drive: Drive
-    folder: Path
-
-
-def section(options: CameraOptions) -> Report:
+def section(options: Options) -> Report:
     report = Report("faults", options)
     drives = [Drive(FIRST + i, FIRST + i, options.seconds(DURATION)) for i in range(options.count(SEEDS))]
     # write and map a drive's images once, before several processes need them
-    ready = report.collect(
-        prepared, [Job(RIGHT, drive, options.drives) for drive in drives], [str(d.seed) for d in drives]
-    )
-    jobs = [Job(fault, drives[i], options.drives) for fault in FAULTS for i in sorted(ready)]
-    outcomes = report.collect(faulty, jobs, [f"{job.fault}, seed {job.drive.seed}" for job in jobs])
+    ready = report.collect(prepared, {("drive", drive.seed): (drive, options.drives) for drive in drives})
+    jobs = {
+        (fault, drive.seed): (fault, drive, options.drives)
+        for fault in FAULTS
+        for drive in drives
+        if ("drive", drive.seed) in ready
+    }
+    outcomes = report.collect(faulty, jobs)
     report.say(
         f"{len(ready)} rendered offices of {options.seconds(DURATION):.0f} s with a map from another drive, pooled. The cells are "
         f"position RMSE [m] of causal and final estimates, and the causal one of the last {AFTERWARDS:.0f} s of the worst run."
     )
-    runs = {
-        fault: [outcomes[i] for i, job in enumerate(jobs) if job.fault == fault and i in outcomes] for fault in FAULTS
-    }
+    runs = {fault: [found for (name, _), found in outcomes.items() if name == fault] for fault in FAULTS}
     runs = {fault: found for fault, found in runs.items() if found}
     rows = [
         (
@@ -83,21 +74,20 @@ def section(options: CameraOptions) -> Report:
     return report
 
 
-def prepared(job: Job) -> int:
-    written(job.drive, job.folder)
-    return len(map_of(job.drive, job.folder))
+def prepared(drive: Drive, folder: Path) -> int:
+    log_of(drive, folder)
+    return len(map_of(drive, folder))
 
 
-def faulty(job: Job) -> dict[str, Attempt]:
+def faulty(fault: str, drive: Drive, folder: Path) -> dict[str, Attempt]:
     """All runs on a drive with a fault, from image files."""
-    os.environ[VARIABLE] = str(job.folder)
-    log = with_map(written(job.drive, job.folder), map_of(job.drive, job.folder))
-    folder = job.folder / "faults" / f"{re.sub(r'[^a-z0-9]+', '-', job.fault.lower())}-{job.drive.seed}"
+    log = with_map(log_of(drive, folder), map_of(drive, folder))
+    files = folder / "faults" / f"{re.sub(r'[^a-z0-9]+', '-', fault.lower())}-{drive.seed}"
     outcomes: dict[str, Attempt] = {}
     for label, config in CONFIGS.items():
         of = without_map(log) if label == NO_MAP else log
-        given = Given(of, np.random.default_rng(job.drive.seed), folder)
-        outcomes[label] = attempt(FAULTS[job.fault](given), config)
+        given = Given(of, np.random.default_rng(drive.seed), files)
+        outcomes[label] = attempt(FAULTS[fault](given), config)
     return outcomes
 
 

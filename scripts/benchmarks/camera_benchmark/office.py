@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarking.report import Report
+from benchmarking.report import ACCURACY, NOTHING, Options, Report, accuracy_cells
 
 from camera_benchmark.drives import MAP_DURATION, MAP_RATE, RATE, TAGS, Drive, log_of, map_of, with_map
-from camera_benchmark.options import CameraOptions
-from camera_benchmark.report import (
-    ACCURACY,
-    NOTHING,
-    Attempt,
-    Attempts,
-    accuracy_cells,
-    attempts,
-    failures,
-    ratio_cell,
-    succeeded,
-)
+from camera_benchmark.report import Attempt, Attempts, attempts, failures, ratio_cell, succeeded
 from factorgraph_loc.experiments.run import RunConfig
 
 SEEDS = 20
@@ -43,35 +32,23 @@ CONFIGS = {
 }
 SLOW = {"particle_filter, rfid, camera": RunConfig("particle_filter", sensors=BOTH)}
 TARGETS = "final of the smoother with all sensors 0.05 m, 0.5 degrees, p95 0.10 m or less; `switching` 3 times as far off or more"
-FIGURES = tuple(f"{kind}.{what}_rmse" for kind in ("causal", "final") for what in ("position", "heading"))
 
 
-@dataclass(frozen=True)
-class Job:
-    drive: Drive
-    folder: Path
-    configs: dict[str, RunConfig]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """``runs`` by label; number of ``points`` in the map."""
-
-    runs: dict[str, Attempt]
-    points: int
-
-
-def section(options: CameraOptions) -> Report:
+def section(options: Options) -> Report:
     report = Report("office", options)
     count, duration = options.count(SEEDS), options.seconds(DURATION)
-    jobs = [
-        Job(Drive(FIRST + i, FIRST + i, duration), options.drives, CONFIGS | (SLOW if i < SLOW_SEEDS else {}))
+    jobs = {
+        ("seed", FIRST + i): (
+            Drive(FIRST + i, FIRST + i, duration),
+            options.drives,
+            CONFIGS | (SLOW if i < SLOW_SEEDS else {}),
+        )
         for i in range(count)
-    ]
-    outcomes = report.collect(localized, jobs, [f"seed {job.drive.seed}" for job in jobs])
-    found = {jobs[i].drive.seed: outcome.runs for i, outcome in outcomes.items()}
+    }
+    outcomes = report.collect(localized, jobs)
+    found = {seed: runs for (_, seed), (runs, _) in outcomes.items()}
     failures(report, found)
-    points = [outcome.points for outcome in outcomes.values()]
+    points = [count for _, count in outcomes.values()]
     if points:
         report.say(
             f"{len(found)} rendered offices with {TAGS} tags, {duration:.0f} s each, {RATE:.0f} images/s. The map of each has "
@@ -80,12 +57,6 @@ def section(options: CameraOptions) -> Report:
         )
     accuracy(report, found)
     comparisons(report, found)
-    single = [
-        (seed, label, *(one.figures.get(key) for key in FIGURES))
-        for seed, runs in sorted(found.items())
-        for label, one in runs.items()
-    ]
-    report.figures("runs", ("seed", "run", *FIGURES), single)
     return report
 
 
@@ -112,8 +83,7 @@ def comparisons(report: Report, found: Attempts) -> None:
     report.table(("run", "ratio (95 %)", "largest"), rows)
 
 
-def localized(job: Job) -> Outcome:
-    """All runs on one drive; jobs can be sent to other processes."""
-    log, _ = log_of(job.drive, job.folder)
-    points = map_of(job.drive, job.folder)
-    return Outcome(attempts(with_map(log, points), job.configs), len(points))
+def localized(drive: Drive, folder: Path, configs: Mapping[str, RunConfig]) -> tuple[dict[str, Attempt], int]:
+    """All runs on one drive, and the number of points in its map."""
+    points = map_of(drive, folder)
+    return attempts(with_map(log_of(drive, folder), points), configs), len(points)

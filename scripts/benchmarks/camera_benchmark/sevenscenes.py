@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from benchmarking.report import Report
+from benchmarking.report import Options, Report
 from scipy.spatial.transform import Rotation
 
-from camera_benchmark.options import CameraOptions
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.mapping.point_mapping import MadePoints, PointSettings, PosedFrames, map_points
 from factorgraph_loc.mapping.triangulation import Cameras
@@ -60,12 +59,12 @@ class Errors:
         return f"{100.0 * success:.0f} %", *middle, f"{p90[0]:.3f}", f"{p90[1]:.1f}"
 
 
-def section(options: CameraOptions) -> Report:
+def section(options: Options) -> Report:
     report = Report("sevenscenes", options)
     if options.data_root is None:
         raise InputError("sevenscenes: expected --data-root with a folder sevenscenes")
     log, cameras = read(options.data_root / "sevenscenes")
-    located_rows, single, map_rows = [], [], []
+    located_rows, map_rows = [], []
     for feature in EXTRACTORS:
         frames = frames_of(with_features(log, FrontendSettings(feature=feature, count=COUNT))[0])[1]
         made = mapped([frames[i] for i in MAPPED], cameras[MAPPED])
@@ -73,8 +72,6 @@ def section(options: CameraOptions) -> Report:
         for query, numbers in QUERIES.items():
             errors = errors_of(made, [frames[i] for i in numbers], cameras[numbers])
             located_rows.append((feature, query, *errors.cells()))
-            rows = zip(numbers.tolist(), errors.position.tolist(), errors.angle.tolist(), strict=True)
-            single += [(feature, query, *row) for row in rows]
     report.say(
         f"{COUNT} features an image. Medians and 90th percentiles. *Located*: within {NEAR} m and {TURNED:.0f} degrees."
     )
@@ -83,7 +80,6 @@ def section(options: CameraOptions) -> Report:
     report.say("The maps of images 0, 2, ... 198.")
     heads = ("points", "observations", "residual RMS [px]", "median [px]", "parallax [rad]", "sigma [m]")
     report.table(("feature", *heads), map_rows)
-    report.figures("images", ("feature", "images", "image", "position", "angle"), single)
     return report
 
 

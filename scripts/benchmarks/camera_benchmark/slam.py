@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from benchmarking.report import Report
+from benchmarking.report import ACCURACY, NOTHING, Options, Report, accuracy_cells
 
 from camera_benchmark.drives import RATE, TAGS, Drive, log_of
 from camera_benchmark.frame import FrameKnown, frame_known, sentence
-from camera_benchmark.options import CameraOptions
-from camera_benchmark.report import (
-    ACCURACY,
-    NOTHING,
-    Attempt,
-    Attempts,
-    accuracy_cells,
-    attempts,
-    failures,
-    succeeded,
-)
+from camera_benchmark.report import Attempt, Attempts, attempts, failures, succeeded
 from factorgraph_loc.evaluation.statistics import pooled_rms
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation import preset, simulate
@@ -32,7 +21,6 @@ FIRST, FIRST_RENDERED = 5000, 7000  # the latter as in the section office
 POINTS = 600
 NO_MAP = {"landmarks": "unknown"}
 TARGET = 0.15  # m
-FIGURES = ("causal.position_rmse", "final.position_rmse", "final.anees", "aligned.position_rmse", "landmarks.count")
 ODOMETRY = ("odometry",)
 
 
@@ -48,15 +36,7 @@ def configs(seen: str) -> dict[str, RunConfig]:
     }
 
 
-@dataclass(frozen=True)
-class Job:
-    """A drive; its images are rendered if there is a ``folder`` for them."""
-
-    drive: Drive
-    folder: Path | None
-
-
-def section(options: CameraOptions) -> Report:
+def section(options: Options) -> Report:
     report = Report("slam", options)
     report.say(
         "The start is known to 0.1 m and 0.05 rad. Only tags reduce its error later. *Aligned*: the final trajectory is aligned "
@@ -69,32 +49,24 @@ def section(options: CameraOptions) -> Report:
         count, duration = options.count(runs), options.seconds(usual)
         if folder is not None:
             count = min(count, runs)
-        jobs = [Job(Drive(first + i, first + i, duration, everywhere=True), folder) for i in range(count)]
-        labels = [f"{name}, seed {job.drive.seed}" for job in jobs]
-        known = report.collect(frame, jobs, labels)
-        outcomes = report.collect(mapped, jobs, labels)
-        found = {jobs[i].drive.seed: outcome for i, outcome in outcomes.items()}
+        jobs = {(name, seed): (Drive(seed, seed, duration), folder) for seed in range(first, first + count)}
+        known = report.collect(frame, jobs)
+        found = {seed: outcome for (_, seed), outcome in report.collect(mapped, jobs).items()}
         failures(report, found)
         what = f"at most 20 of {POINTS} identified points in each" if folder is None else "rendered"
         report.say(f"{len(found)} offices of {duration:.0f} s, {RATE:.0f} images/s, {what}.")
         report.say(sentence(list(known.values())))
-        table(report, name, found)
+        table(report, found)
     return report
 
 
-def table(report: Report, name: str, found: Attempts) -> None:
+def table(report: Report, found: Attempts) -> None:
     rows = []
     for label in configs(""):
         runs = succeeded(found, label)
         if runs:
             rows.append((label, *accuracy_cells(list(runs.values())), *aligned_cells(found, label)))
     report.table(("estimator", *ACCURACY, "aligned final [m]", "[deg]"), rows)
-    single = [
-        (seed, label, *(one.figures.get(key) for key in FIGURES))
-        for seed, runs in sorted(found.items())
-        for label, one in runs.items()
-    ]
-    report.figures(name, ("seed", "estimator", *FIGURES), single)
 
 
 def aligned_cells(found: Attempts, label: str) -> tuple[str, str]:
@@ -107,21 +79,21 @@ def aligned_cells(found: Attempts, label: str) -> tuple[str, str]:
     return cells[0], cells[1]
 
 
-def mapped(job: Job) -> dict[str, Attempt]:
-    """All runs on a drive; jobs can be sent to other processes."""
-    if job.folder is not None:
-        return attempts(log_of(job.drive, job.folder)[0], configs("camera"))
-    return attempts(simulate(settings(job), job.drive.seed), configs("sightings"))
+def mapped(drive: Drive, folder: Path | None) -> dict[str, Attempt]:
+    """All runs on a drive, whose images are rendered if there is a ``folder`` for them."""
+    if folder is not None:
+        return attempts(log_of(drive, folder), configs("camera"))
+    return attempts(simulate(settings(drive, folder), drive.seed), configs("sightings"))
 
 
-def frame(job: Job) -> FrameKnown:
+def frame(drive: Drive, folder: Path | None) -> FrameKnown:
     """What tells where the frame of a drive lies."""
-    return frame_known(simulate(settings(job), job.drive.seed))
+    return frame_known(simulate(settings(drive, folder), drive.seed))
 
 
-def settings(job: Job) -> SimulationSettings:
+def settings(drive: Drive, folder: Path | None) -> SimulationSettings:
     """Those of a drive, with identified points unless it is rendered."""
-    if job.folder is not None:
-        return job.drive.settings()
+    if folder is not None:
+        return drive.settings()
     world = {"tags": TAGS, "points": POINTS}
-    return preset("office", {"world": world, "pixels": {"rate": RATE}, "drive": {"duration": job.drive.duration}})
+    return preset("office", {"world": world, "pixels": {"rate": RATE}, "drive": {"duration": drive.duration}})

@@ -12,11 +12,9 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from benchmarking.report import Report
+from benchmarking.report import NOTHING, Options, Report
 
 from camera_benchmark.drives import COUNT, FEATURE, RATE, Drive, log_of, map_of, with_map
-from camera_benchmark.options import CameraOptions
-from camera_benchmark.report import NOTHING
 from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
@@ -65,13 +63,6 @@ STEPS = (
 
 
 @dataclass(frozen=True)
-class Chain:
-    """What is kept of drives is in ``folder``."""
-
-    folder: Path
-
-
-@dataclass(frozen=True)
 class Links:
     """Seconds for a drive with ``images``, and a map of ``points``."""
 
@@ -84,50 +75,39 @@ class Links:
     smooth: float
 
 
-@dataclass(frozen=True)
-class Job:
-    steps: Steps
-    duration: float
-
-
-def section(options: CameraOptions) -> Report:
+def section(options: Options) -> Report:
     report = Report("speed", options)
     chain(report, options)
     estimators(report, options.seconds(DURATION))
     return report
 
 
-def chain(report: Report, options: CameraOptions) -> None:
+def chain(report: Report, options: Options) -> None:
     """From images to poses, and the rendering speed."""
-    job = Chain(options.drives)
-    for what, function in (("chain", chained), ("renderer", rendered)):
-        found = report.collect(function, [job], [what], workers=1)
-        if found and what == "chain":
-            links: Links = found[0]
-            report.say(
-                f"{links.images} files of 640 x 480 px, at most {COUNT} features (`{links.feature}`) in each, in a map of "
-                f"{links.points} points. {os.cpu_count()} processes find features, the rest has one. *Smooth*: the smoother "
-                "without the association of features with points of the map. Targets: 15 images/s, 10 % of the time to smooth."
-            )
-            whole = links.find + links.follow + links.associate + links.smooth
-            parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}
-            cells = (f"{1e3 * s / links.images:.1f} ({100 * s / whole:.0f} %)" for s in parts.values())
-            heads = (*(f"{name} [ms]" for name in parts), "images/s")
-            report.table(heads, [(*cells, f"{links.images / whole:.1f}")])
-        elif found:
-            report.say(f"The renderer makes {found[0]:.1f} images/s on one core; target: 20.")
+    for links in report.collect(chained, {"chain": (options.drives,)}, workers=1).values():
+        report.say(
+            f"{links.images} files of 640 x 480 px, at most {COUNT} features (`{links.feature}`) in each, in a map of "
+            f"{links.points} points. {os.cpu_count()} processes find features, the rest has one. *Smooth*: the smoother "
+            "without the association of features with points of the map. Targets: 15 images/s, 10 % of the time to smooth."
+        )
+        whole = links.find + links.follow + links.associate + links.smooth
+        parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}
+        cells = (f"{1e3 * s / links.images:.1f} ({100 * s / whole:.0f} %)" for s in parts.values())
+        heads = (*(f"{name} [ms]" for name in parts), "images/s")
+        report.table(heads, [(*cells, f"{links.images / whole:.1f}")])
+    for rate in report.collect(rendered, {"renderer": ()}, workers=1).values():
+        report.say(f"The renderer makes {rate:.1f} images/s on one core; target: 20.")
 
 
 def estimators(report: Report, duration: float) -> None:
-    jobs = [Job(steps, duration) for steps in STEPS]
-    found = report.collect(timed, jobs, [f"{job.steps.what}, {job.steps.config.estimator}" for job in jobs], workers=1)
+    jobs = {(i, steps.what): (steps, duration) for i, steps in enumerate(STEPS)}
     report.say(
         f"Steps of {duration:.0f} s in `office` with identified points. A step is an image with about 20 points, or also a round "
         "of all eight antennas, and the estimate after it. *Second half*: of the run."
     )
     rows = []
-    for i, (ms, points, learnt) in sorted(found.items()):
-        steps, half = jobs[i].steps, ms[len(ms) // 2 :]
+    for (i, _), (ms, points, learnt) in report.collect(timed, jobs, workers=1).items():
+        steps, half = STEPS[i], ms[len(ms) // 2 :]
         median, p99, worst = np.median(ms), np.percentile(ms, 99), ms.max()
         step = f"{median:.2f} / {p99:.2f} / {worst:.1f}"
         later = f"{np.median(half):.2f} / {np.percentile(half, 99):.2f}"
@@ -136,12 +116,12 @@ def estimators(report: Report, duration: float) -> None:
     report.table(heads, rows)
 
 
-def chained(job: Chain) -> Links:
+def chained(kept: Path) -> Links:
     """From the files of a drive to its poses, without a cache."""
     drive = Drive(FIRST, FIRST, IMAGES / RATE)
-    points = map_of(drive, job.folder)
+    points = map_of(drive, kept)
     config = RunConfig("smoother", {"lag": 10.0}, ("odometry", "rfid", "camera"))
-    warm, _ = log_of(replace(drive, seed=FIRST + 1, duration=WARM_UP), job.folder)
+    warm = log_of(replace(drive, seed=FIRST + 1, duration=WARM_UP), kept)
     run(with_map(warm, points), config)
     with tempfile.TemporaryDirectory() as name:
         os.environ[VARIABLE] = name
@@ -163,7 +143,7 @@ def chained(job: Chain) -> Links:
     return Links(prepared.images, FEATURE, len(points), find, sum(follow), associate, smooth - associate)
 
 
-def rendered(_: Chain) -> float:
+def rendered() -> float:
     """Images per second, without the scene and compilation."""
     drive = Drive(FIRST, FIRST, RENDERED / RATE)
     images = iter(film(drive.settings(), drive.seed))
@@ -192,13 +172,13 @@ def spent(owner: object, name: str) -> Iterator[list[float]]:
         setattr(owner, name, function)
 
 
-def timed(job: Job) -> tuple[np.ndarray, float, str]:
+def timed(steps: Steps, duration: float) -> tuple[np.ndarray, float, str]:
     """Milliseconds (M,) of each step, mean number of points per image, and number of points with known depth."""
-    run(simulate(preset("office", changed(job.steps, WARM_UP)), SEED + 1), job.steps.config)
-    log = simulate(preset("office", changed(job.steps, job.duration)), SEED)
+    run(simulate(preset("office", changed(steps, WARM_UP)), SEED + 1), steps.config)
+    log = simulate(preset("office", changed(steps, duration)), SEED)
     _, counts = np.unique(log.streams["sightings"].t, return_counts=True)
-    result = run(log, job.steps.config)
-    learnt = str(len(result.learnt.landmarks)) if job.steps.config.estimator == "monoslam" else NOTHING
+    result = run(log, steps.config)
+    learnt = str(len(result.learnt.landmarks)) if steps.config.estimator == "monoslam" else NOTHING
     return result.timings.update_ms, float(counts.mean()), learnt
 
 

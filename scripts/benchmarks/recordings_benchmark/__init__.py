@@ -1,1 +1,5 @@
-"""Public recordings: list, conversion to logs, and results of the estimators."""
+"""Public recordings: the section of docs/recordings.md."""
+
+from recordings_benchmark.recordings import section
+
+SECTIONS = {"recordings": section}

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 LIST = Path(__file__).with_name("recordings.toml")
-RAW = "https://raw.githubusercontent.com"
-
-
-@dataclass(frozen=True)
-class File:
-    """A file of a public repository at a commit; ``name``: its local name."""
-
-    repository: str
-    commit: str
-    path: str
-    name: str
 
 
 @dataclass(frozen=True)
 class Recording:
     """``kind``: conversion function of :mod:`recordings_benchmark.prepare`, with its ``options``. ``prior``: of logs without a
     start; ``seconds``: maximum duration. ``odometry``, ``others``: origin of the odometry, and the other sensors, as texts for
-    the table."""
+    the table. ``files``: the URL of each by its local name."""
 
     name: str
     title: str
@@ -34,7 +22,8 @@ class Recording:
     odometry: str
     others: str
     kind: str
-    files: tuple[File, ...]
+    origin: str
+    files: dict[str, str]
     prior: str | None = None
     seconds: float | None = None
     options: dict[str, Any] = field(default_factory=dict)
@@ -43,23 +32,15 @@ class Recording:
 def listed() -> tuple[Recording, ...]:
     """Those of ``recordings.toml``."""
     content = tomllib.loads(LIST.read_text(encoding="utf-8"))
-    sources = content["source"]
     found = []
     for entry in content["recording"]:
-        source = sources[entry.pop("source")]
-        commit = entry.pop("commit", source["commit"])
-        files = [
-            File(source["repository"], commit, path, entry["name"] + "-" + path.rsplit("/", 1)[-1])
-            for path in entry.pop("files")
-        ]
-        found.append(Recording(**entry, licence=source["licence"], files=tuple(files)))
+        source = content["source"][entry.pop("source")]
+        commit, paths = entry.pop("commit", source["commit"]), entry.pop("files")
+        root = f"https://raw.githubusercontent.com/{source['repository']}/{commit}"
+        files = {f"{entry['name']}-{path.rsplit('/', 1)[-1]}": f"{root}/{path}" for path in paths}
+        origin = f"https://github.com/{source['repository']}"
+        found.append(Recording(**entry, licence=source["licence"], origin=origin, files=files))
     return tuple(found)
-
-
-def commands(recordings: Sequence[Recording]) -> list[str]:
-    """Commands to download the files into the present folder."""
-    files = [file for recording in recordings for file in recording.files]
-    return [f"curl -L -o {file.name} {RAW}/{file.repository}/{file.commit}/{file.path}" for file in files]
 
 
 RECORDINGS = listed()

@@ -7,17 +7,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from urllib.request import urlretrieve
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import write_toml
+from factorgraph_loc.files.models import replacing, write_toml
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.io.readers import load
-from factorgraph_loc.io.readers.pose_file import read_kitti
+from factorgraph_loc.io.readers.pose_file import read_kitti, read_pose_file
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.measurement import Stream
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream, Landmark
@@ -44,12 +46,16 @@ TAGS, THINNED = 3, 10  # ranges per row; decimation factor, to 10 Hz
 
 
 def prepare(recording: Recording, folder: Path, out: Path) -> Log:
-    """The log of a recording with files in ``folder``, also written to ``out``. Raises InputError for damaged files."""
-    paths = [folder / file.name for file in recording.files]
-    if missing := [path for path in paths if not path.is_file()]:
-        raise InputError(
-            f"{missing[0]}: is missing, scripts/benchmarks/bench_recordings --fetch prints how to fetch it"
-        )
+    """The log of a recording with files in ``folder``, also written to ``out``. Raises InputError for damaged files, and for
+    missing ones that cannot be fetched."""
+    paths = [folder / name for name in recording.files]
+    for path, url in zip(paths, recording.files.values(), strict=True):
+        try:
+            if not path.is_file():
+                with replacing(path) as temporary:
+                    urlretrieve(url, temporary)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be fetched from {url}: {error}") from error
     if recording.kind == "bag":
         return _bag(recording, paths[0], out)
     log = KINDS[recording.kind](recording, paths)
@@ -65,7 +71,7 @@ def prepare(recording: Recording, folder: Path, out: Path) -> Log:
 def _bag(recording: Recording, path: Path, out: Path) -> Log:
     manifest = out / f"{recording.name}.toml"
     content = {"title": recording.title, "reader": "rosbag", "path": path.name, "licence": recording.licence}
-    content |= {"origin": f"https://github.com/{recording.files[0].repository}"}
+    content |= {"origin": recording.origin}
     out.mkdir(parents=True, exist_ok=True)
     write_toml(manifest, content | {"options": recording.options})
     log = load(manifest, data_root=path.parent)[0]
@@ -105,12 +111,12 @@ def _librsf(recording: Recording, paths: list[Path]) -> Log:
 
 def _trajectory(recording: Recording, paths: list[Path]) -> Log:
     """A reference only: the odometry is simulated, or the motion between the poses of another program."""
-    form, axis = recording.options["format"], "xyz".index(recording.options.get("axis", "x"))
-    if form == "kitti":
-        truth = _kitti(paths[0], paths[1])
-        others = [_kitti(path, paths[1]) for path in paths[2:]]
+    axis = "xyz".index(recording.options.get("axis", "x"))
+    if recording.options["format"] == "kitti":
+        times = paths.pop(1)
+        truth, *others = (_planar(read_kitti(path, times), axis) for path in paths)
     else:
-        truth, *others = (_stamped(path, form, axis) for path in paths)
+        truth, *others = (_planar(read_pose_file(path), axis) for path in paths)
     t0 = truth.t[0]
     reference = Trajectory(truth.t - t0, truth.poses)
     if not others:
@@ -122,27 +128,11 @@ def _trajectory(recording: Recording, paths: list[Path]) -> Log:
     )
 
 
-def _kitti(path: Path, times: Path) -> Trajectory:
-    found = read_kitti(path, times)
-    assert found.t_ns is not None
-    return Trajectory(found.t_ns / 1e9, found.planar(0).poses)
-
-
-def _stamped(path: Path, form: str, axis: int) -> Trajectory:
-    """Poses of TUM (t x y z qx qy qz qw) or EuRoC (ns, x, y, z, qw, qx, qy, qz, ...), seen from above; ``axis``: the one whose
-    direction is the heading. A camera, or the IMU of EuRoC, looks along z."""
-    if form == "tum":
-        t, x, y, _, qx, qy, qz, qw = np.loadtxt(path, comments="#", usecols=range(8)).T
-    else:
-        nanoseconds, x, y, _, qw, qx, qy, qz = np.loadtxt(path, comments="#", delimiter=",", usecols=range(8)).T
-        t = nanoseconds / 1e9
-    ahead = (
-        (1.0 - 2.0 * (qy**2 + qz**2), 2.0 * (qx * qy + qw * qz)),
-        (2.0 * (qx * qy - qw * qz), 1.0 - 2.0 * (qx**2 + qz**2)),
-        (2.0 * (qx * qz + qw * qy), 2.0 * (qy * qz - qw * qx)),
-    )[axis]
-    kept = np.append(True, np.diff(t) > 0.0)
-    return Trajectory(t[kept], np.column_stack((x, y, np.arctan2(ahead[1], ahead[0])))[kept])
+def _planar(path: PosePath, axis: int) -> Trajectory:
+    """Poses from above; ``axis``: the one whose direction is the heading. A camera, or the IMU of EuRoC, looks along z."""
+    ahead = path.rotations[:, :, axis]
+    poses = np.column_stack((path.positions[:, :2], np.arctan2(ahead[:, 1], ahead[:, 0])))
+    return Trajectory(path.seconds(), poses)
 
 
 def _trolley(recording: Recording, paths: list[Path]) -> Log:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from benchmarking.ensemble import RunErrors, run_errors, series
-from benchmarking.report import Options, Report, pooled, spread_cell
+from benchmarking.report import Options, Report, spread_cell
 from benchmarking.statistics import first_held
 from benchmarking.trials import HOLD, POSITION
 from recorded_logs import recorded_log
@@ -35,21 +35,6 @@ START_SPAN = 90.0  # s of a run for evaluating an unknown start
 
 
 @dataclass(frozen=True)
-class Learning:
-    run: int
-    data_root: Path | None
-    out: Path
-
-
-@dataclass(frozen=True)
-class Test:
-    run: int
-    odometry_seed: int
-    rig: Rig
-    data_root: Path | None
-
-
-@dataclass(frozen=True)
 class Tested:
     """``runs``: errors by estimator and sensors; ``starts``: seconds of each estimator until an unknown start is correct."""
 
@@ -59,41 +44,33 @@ class Tested:
 
 def section(options: Options) -> Report:
     report = Report("aisle", options)
-    learning = [Learning(number, options.data_root, options.out / "aisle") for number in RUNS]
-    rigs = report.collect(learnt_on, learning, [f"learning on run {number}" for number in RUNS])
-    tests = [
-        Test(number, seed, rigs[1 - i], options.data_root)
-        for i, number in enumerate(RUNS)
+    learning = {("learning on run", number): (number, options.data_root, options.out / "aisle") for number in RUNS}
+    rigs = {number: rig for (_, number), rig in report.collect(learnt_on, learning).items()}
+    tests = {
+        (number, seed): (number, seed, rigs[other], options.data_root)
+        for number, other in zip(RUNS, reversed(RUNS), strict=True)
         for seed in range(min(SEEDS, options.count(SEEDS)))
-        if 1 - i in rigs
-    ]
-    found = report.collect(tested, tests, [f"run {test.run}, odometry seed {test.odometry_seed}" for test in tests])
-    outcomes = [(tests[i], found[i]) for i in sorted(found)]
+        if other in rigs
+    }
+    outcomes: dict[tuple[int, int], Tested] = report.collect(tested, tests)
     accuracy(report, outcomes)
     unknown_starts(report, outcomes)
     return report
 
 
-def accuracy(report: Report, outcomes: list[tuple[Test, Tested]]) -> None:
+def accuracy(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
     report.say(
         f"Both runs, each with the rig learnt on the other one, {len(outcomes) // len(RUNS)} odometry seeds each. *Shipped rig*: "
         "`datasets/rfid-aisle.rig.toml`, learnt on both. The cells are RMSE / median / p95 [m] / heading RMSE [degrees] / ANEES."
     )
     rows = []
-    for key in dict.fromkeys(key for _, outcome in outcomes for key in outcome.runs):
-        members = [outcome.runs[key] for _, outcome in outcomes]
+    for key in dict.fromkeys(key for outcome in outcomes.values() for key in outcome.runs):
+        members = [outcome.runs[key] for outcome in outcomes.values()]
         rows.append((*key, *(spread_cell([getattr(one, kind) for one in members]) for kind in ("causal", "final"))))
     report.table(("estimator", "sensors", "causal", "final"), rows)
-    single = [
-        (*key, test.run, test.odometry_seed, *pooled([one.causal]), *pooled([one.final]))
-        for test, outcome in outcomes
-        for key, one in outcome.runs.items()
-    ]
-    heads = ("estimator", "sensors", "run", "odometry_seed", "causal_m", "causal_deg", "final_m", "final_deg")
-    report.figures("runs", heads, single)
 
 
-def unknown_starts(report: Report, outcomes: list[tuple[Test, Tested]]) -> None:
+def unknown_starts(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
     report.say(
         "Unknown start with detections: seconds from the first scan until the error is below "
         f"{POSITION} m for {HOLD:.0f} s, for each odometry seed."
@@ -101,7 +78,7 @@ def unknown_starts(report: Report, outcomes: list[tuple[Test, Tested]]) -> None:
     rows = []
     for estimator in ESTIMATORS:
         for number in RUNS:
-            seconds = [outcome.starts[estimator] for test, outcome in outcomes if test.run == number]
+            seconds = [outcome.starts[estimator] for (run, _), outcome in outcomes.items() if run == number]
             if seconds:
                 cells = ", ".join("never" if np.isnan(s) else f"{s:.0f}" for s in seconds)
                 rows.append((f"run {number}", estimator, cells, f"{max(seconds):.0f}"))
@@ -113,32 +90,32 @@ def aisle(number: int, seed: int, data_root: Path | None) -> Log:
     return recorded_log(f"rfid-aisle-run{number}", data_root, seed)
 
 
-def learnt_on(job: Learning) -> Rig:
+def learnt_on(number: int, data_root: Path | None, out: Path) -> Rig:
     """The rig learnt from one recording with surveyed antennas, and with the tempering of the shipped rig."""
-    log = aisle(job.run, LEARNING_SEED, job.data_root)
+    log = aisle(number, LEARNING_SEED, data_root)
     assert log.rig.rfid is not None
-    job.out.mkdir(parents=True, exist_ok=True)
-    name = f"learnt-on-run{job.run}"
+    out.mkdir(parents=True, exist_ok=True)
+    name = f"learnt-on-run{number}"
     given = read_rig(PLACES)
-    sections = dict(learn_rfid([log], given, job.out / name).sections)
+    sections = dict(learn_rfid([log], given, out / name).sections)
     sections["rfid"] = sections["rfid"].model_copy(update={"tempering": log.rig.rfid.tempering})
     rig = given.model_copy(update=sections)
-    write_rig(rig, job.out / f"{name}.rig.toml")
+    write_rig(rig, out / f"{name}.rig.toml")
     return rig
 
 
-def tested(job: Test) -> Tested:
+def tested(number: int, seed: int, rig: Rig, data_root: Path | None) -> Tested:
     """All estimators on one recording with one odometry seed."""
-    log = aisle(job.run, job.odometry_seed, job.data_root)
+    log = aisle(number, seed, data_root)
     shipped = log.rig
-    log = replace(log, rig=job.rig)
+    log = replace(log, rig=rig)
     runs = {("dead_reckoning", "odometry"): run_errors(run(log, RunConfig("dead_reckoning")), log)}
     for estimator, name in RUN:
         runs[estimator, name] = run_errors(run(log, RunConfig(estimator, sensors=SENSORS[name])), log)
     for name in ("detections", "+ phase"):
         config = RunConfig("smoother", sensors=SENSORS[name])
         runs["smoother", name + SHIPPED] = run_errors(run(replace(log, rig=shipped), config), log)
-    starts = {estimator: seconds_to_right(log, estimator, job.odometry_seed) for estimator in ESTIMATORS}
+    starts = {estimator: seconds_to_right(log, estimator, seed) for estimator in ESTIMATORS}
     return Tested(runs, starts)
 
 

@@ -38,46 +38,30 @@ CASES = (
 
 
 @dataclass(frozen=True)
-class Learning:
-    case: Case
-    out: Path
-
-
-@dataclass(frozen=True)
 class Learnt:
     rig: Rig
     value: float
     error: float
 
 
-@dataclass(frozen=True)
-class Trial:
-    """``rig``: None for that of the simulation."""
-
-    case: Case
-    seed: int
-    rig: Rig | None
-
-
 def section(options: Options) -> Report:
     report = Report("blind", options)
-    cases = [Learning(case, options.out / "blind") for case in CASES]
-    found: Mapping[int, Learnt] = report.collect(learnt, cases, [case.what for case in CASES])
+    jobs = {case.what: (case, options.out / "blind") for case in CASES}
+    found: Mapping[str, Learnt] = report.collect(learnt, jobs)
     seeds = TRIED_ON[: options.count(len(TRIED_ON))]
-    trials = [
-        Trial(CASES[i], seed, rig) for i, one in sorted(found.items()) for rig in (one.rig, None) for seed in seeds
-    ]
-    runs = report.collect(tried, trials, [f"{trial.case.what}, {trial.seed}" for trial in trials])
+    trials = {
+        (case.what, learns, seed): (case, seed, found[case.what].rig if learns else None)
+        for case in CASES
+        if case.what in found
+        for learns in (True, False)
+        for seed in seeds
+    }
+    runs: Mapping[tuple[str, bool, int], RunErrors] = report.collect(tried, trials)
     rows = []
-    for i, one in sorted(found.items()):
-        case = CASES[i]
+    for case in (case for case in CASES if case.what in found):
+        one = found[case.what]
         mine, theirs = (
-            [
-                runs[j].causal
-                for j, trial in enumerate(trials)
-                if trial.case == case and (trial.rig is None) == true and j in runs
-            ]
-            for true in (False, True)
+            [run.causal for key, run in runs.items() if key[:2] == (case.what, learns)] for learns in (True, False)
         )
         anees = [f"{np.mean([np.nanmean(run.nees) for run in group]):.2f}" for group in (mine, theirs)]
         values = (f"`{case.key}` {case.given:g}", f"{case.true:g}", f"{one.value:.3f} ± {one.error:.3f}")
@@ -114,17 +98,17 @@ def with_beam(rig: Rig, **changes: float) -> Rig:
     return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
 
-def learnt(job: Learning) -> Learnt:
+def learnt(case: Case, out: Path) -> Learnt:
     """What the logs without their references teach."""
-    case = job.case
     logs = [replace(office(case, seed), reference=None) for seed in LEARNT_ON]
-    job.out.mkdir(parents=True, exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
     rig = with_beam(logs[0].rig, **{case.key: case.given})
-    found = calibrate(logs, job.out / f"{case.key}-{case.given:g}.rig.toml", rig=rig, overwrite=True)
+    found = calibrate(logs, out / f"{case.key}-{case.given:g}.rig.toml", rig=rig, overwrite=True)
     constant = next(c for c in found.knowledge.constants if c.sensor == "rfid" and c.name.endswith(case.key))
     return Learnt(found.rig, constant.fitted, constant.error)
 
 
-def tried(trial: Trial) -> RunErrors:
-    log = office(trial.case, trial.seed)
-    return run_errors(run(replace(log, rig=trial.rig or log.rig), RunConfig("smoother")), log)
+def tried(case: Case, seed: int, rig: Rig | None) -> RunErrors:
+    """The errors with a rig, None for that of the simulation."""
+    log = office(case, seed)
+    return run_errors(run(replace(log, rig=rig or log.rig), RunConfig("smoother")), log)

@@ -54,12 +54,12 @@ FAULTS: dict[str, tuple[dict[str, Any], Change | None]] = {
 def section(options: Options) -> Report:
     report = Report("faults", options)
     count = options.count(SEEDS)
-    jobs, labels = [], []
+    jobs = {}
     for fault, (changes, change) in FAULTS.items():
         settings = preset("office", {"drive": {"duration": DURATION}, "faults": changes})
-        jobs += [EnsembleJob(settings, FIRST + i, CONFIGS, change) for i in range(count)]
-        labels += [fault] * count
-    outcomes = report.collect(run_ensemble, jobs, labels)
+        for seed in range(FIRST, FIRST + count):
+            jobs[fault, seed] = (EnsembleJob(settings, seed, CONFIGS, change),)
+    outcomes = report.collect(run_ensemble, jobs)
     report.say(
         f"`office`, {count} worlds of {DURATION:.0f} s, pooled. "
         "*Status*: share of the time at which it is localized / ambiguous / unlocalized. "
@@ -68,7 +68,7 @@ def section(options: Options) -> Report:
     rows = []
     for estimator in CONFIGS:
         for fault in FAULTS:
-            runs = [outcomes[i][estimator] for i, label in enumerate(labels) if label == fault and i in outcomes]
+            runs = [runs[estimator] for (name, _), runs in outcomes.items() if name == fault]
             if runs:
                 rows.append((fault, estimator, *cells(runs)))
     report.table(("fault", "estimator", "causal [m] / [deg]", "worst [m]", "final [m] / [deg]", "status [%]"), rows)

@@ -65,7 +65,7 @@ def section(options: Options) -> Report:
     seeds = range(FIRST, FIRST + options.count(SEEDS))
     jobs = [Job(what, tags, seed) for what in ("start", "return") for tags in TAGS for seed in seeds]
     jobs += [Job("scan", tags, FIRST) for tags in SIZES]
-    outcomes = report.collect(measured, jobs, [f"{j.what}, {j.tags} tags, seed {j.seed}" for j in jobs])
+    outcomes = report.collect(measured, {(job.what, job.tags, job.seed): (job,) for job in jobs})
     report.say(
         f"{len(seeds)} runs of each kind in a hall of 100 x 60 m, each in a new world. *Right in time*: within {START:.0f} s of an "
         f"unknown start, within {RETURN:.0f} s of each of two kidnappings, and for 10 s from then on. *Busy*: processor time of a "
@@ -73,9 +73,9 @@ def section(options: Options) -> Report:
     )
     rows: list[tuple[str, ...]] = []
     groups: dict[tuple[str, int, str], list[Any]] = {}
-    for i in sorted(outcomes):
-        for name, outcome in outcomes[i].items():
-            groups.setdefault((jobs[i].what, jobs[i].tags, name), []).append(outcome)
+    for (what, tags, _), by_name in outcomes.items():
+        for name, outcome in by_name.items():
+            groups.setdefault((what, tags, name), []).append(outcome)
     for (what, tags, name), found in groups.items():
         if what != "scan":
             rows.append((what, f"{tags:,}", name, *row(found)))

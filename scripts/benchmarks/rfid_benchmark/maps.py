@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from benchmarking.report import Options, Report
@@ -15,33 +16,28 @@ from rfid_benchmark.aisle import RUNS
 NEAR = 0.05  # m
 
 
-@dataclass(frozen=True)
-class Job:
-    run: int
-    phases: bool
-    options: Options
-
-
 def section(options: Options) -> Report:
     report = Report("maps", options)
-    jobs = [Job(run, phases, options) for run in RUNS for phases in (True, False)]
-    found = report.collect(made, jobs, [f"run {job.run}{'' if job.phases else ' without phases'}" for job in jobs])
+    jobs = {
+        (f"run {run}", "yes" if phases else "no"): (run, phases, options.data_root)
+        for run in RUNS
+        for phases in (True, False)
+    }
     report.say("Distances [m] of the tags mapped along the reference from their survey.")
     rows = []
-    for i, (distances, count) in sorted(found.items()):
-        job = jobs[i]
+    for key, (distances, count) in report.collect(made, jobs).items():
         near = f"{np.mean(distances <= NEAR):.0%}"
         figures = (np.sqrt(np.mean(distances**2)), np.median(distances), distances.max())
         cells = [f"{len(distances)} of {count}", *(f"{figure:.3f}" for figure in figures), near]
-        rows.append((f"run {job.run}", "yes" if job.phases else "no", *cells))
+        rows.append((*key, *cells))
     report.table(("log", "phases", "tags", "root mean square", "median", "largest", f"within {NEAR} m"), rows)
     return report
 
 
-def made(job: Job) -> tuple[np.ndarray, int]:
+def made(run: int, phases: bool, data_root: Path | None) -> tuple[np.ndarray, int]:
     """The distances of the located tags, and the number of those in the survey."""
-    log = recorded_log(f"rfid-aisle-run{job.run}", job.options.data_root)
-    if not job.phases:
+    log = recorded_log(f"rfid-aisle-run{run}", data_root)
+    if not phases:
         assert log.rig.rfid is not None
         log = replace(log, rig=log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"phase": None})}))
     found = make_map(log, MapOptions(of="tags")).details

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from benchmarking.ensemble import EnsembleJob, RunErrors, run_ensemble, stacked
-from benchmarking.report import Options, Report, pooled, ratio_cells, together
-from benchmarking.statistics import share_in_band
+from benchmarking.ensemble import EnsembleJob, RunErrors, run_ensemble
+from benchmarking.report import ACCURACY, KINDS, Options, Report, accuracy_cells, ratio_cells
 
 from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation.settings import preset
@@ -23,52 +21,23 @@ def section(options: Options) -> Report:
     report = Report("office", options)
     found: dict[str, Found] = {}
     for name, (usual, configs) in PRESETS.items():
-        count = options.count(usual)
-        jobs = [EnsembleJob(preset(name), seed, configs) for seed in range(count)]
-        outcomes = report.collect(run_ensemble, jobs, [f"{name} {seed}" for seed in range(count)])
+        jobs = {(name, seed): (EnsembleJob(preset(name), seed, configs),) for seed in range(options.count(usual))}
+        outcomes = report.collect(run_ensemble, jobs).values()
         if outcomes:
-            found[name] = {label: [outcomes[i][label] for i in sorted(outcomes)] for label in configs}
-            single = [
-                (i, label, *pooled([one.causal]), *pooled([one.final]))
-                for i, outcome in sorted(outcomes.items())
-                for label, one in outcome.items()
-            ]
-            heads = ("seed", "estimator", "causal_m", "causal_deg", "final_m", "final_deg")
-            report.figures(name, heads, single)
+            found[name] = {label: [outcome[label] for outcome in outcomes] for label in configs}
     worlds = ", ".join(f"{len(runs['smoother'])} worlds of {name}" for name, runs in found.items())
     report.say(
         f"{worlds}, 10 min each, pooled. *Inside*: share of times at which ANEES over worlds is in its 95 % band."
     )
-    accuracy(report, found)
+    cells = [(name, label, *accuracy_cells(one)) for name, runs in found.items() for label, one in runs.items()]
+    report.table(("preset", "estimator", *ACCURACY), cells)
     report.say(
         "Ratios of pooled position RMSE, with constants as states, a 95 % interval over worlds, and the largest of a single world."
     )
-    ratios(report, found)
-    return report
-
-
-def accuracy(report: Report, found: dict[str, Found]) -> None:
     rows = []
     for name, runs in found.items():
-        for label, members in runs.items():
-            causal, final = [one.causal for one in members], [one.final for one in members]
-            (position, heading), (final_position, final_heading) = pooled(causal), pooled(final)
-            inside = " / ".join(f"{100 * share_in_band(stacked(kind)):.0f} %" for kind in (causal, final))
-            nees = " / ".join(f"{np.nanmean(stacked(kind)):.2f}" for kind in (causal, final))
-            p95 = np.percentile(together(final), 95)
-            cells = (f"{position:.3f}", f"{heading:.2f}", f"{final_position:.3f}", f"{final_heading:.2f}", f"{p95:.3f}")
-            rows.append((name, label, *cells, nees, inside))
-    heads = ("preset", "estimator", "causal [m]", "[deg]", "final [m]", "[deg]", "final p95 [m]")
-    report.table((*heads, "ANEES causal / final", "inside causal / final"), rows)
-
-
-def ratios(report: Report, found: dict[str, Found]) -> None:
-    rows = []
-    for name, runs in found.items():
-        both = runs["smoother"], runs["particle filter"]
-        causal, final = ([[getattr(one, kind) for one in members] for members in both] for kind in ("causal", "final"))
-        rows += [
-            (name, "smoother / particle filter, causal", *ratio_cells(*causal)),
-            (name, "smoother / particle filter, final", *ratio_cells(*final)),
-        ]
+        for kind in KINDS:
+            both = ([getattr(one, kind) for one in runs[label]] for label in ("smoother", "particle filter"))
+            rows.append((name, f"smoother / particle filter, {kind}", *ratio_cells(*both)))
     report.table(("preset", "ratio", "pooled (95 %)", "largest"), rows)
+    return report

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from benchmarking.ensemble import EnsembleJob, Series, job_log, run_ensemble, run_errors, series
 from benchmarking.report import Options, Report, pooled, ratio_cells
@@ -25,27 +23,22 @@ SMOOTHERS = {
 }
 
 
-@dataclass(frozen=True)
-class Room:
-    seed: int
-
-
 def section(options: Options) -> Report:
     report = Report("optimum", options)
     rooms, offices = options.count(ROOMS), options.count(OFFICES)
-    outcomes = report.collect(in_room, [Room(seed) for seed in range(rooms)], [f"room {i}" for i in range(rooms)])
+    outcomes = report.collect(in_room, {("room", seed): (seed,) for seed in range(rooms)}).values()
     report.say(
         f"A room of 6 x 4 m with 8 tags, 60 s, odometry without constant errors, {len(outcomes)} worlds. "
         "Causal estimates at the scans, against the grid filter (5 cm, 3 degrees), which is optimal."
     )
-    table(report, {label: [outcomes[i][label] for i in sorted(outcomes)] for label in FILTERS}, "grid filter")
-    jobs = [EnsembleJob(preset("office"), seed, SMOOTHERS) for seed in range(offices)]
-    outcomes = report.collect(run_ensemble, jobs, [f"office {i}" for i in range(offices)])
+    table(report, {label: [outcome[label] for outcome in outcomes] for label in FILTERS}, "grid filter")
+    jobs = {("office", seed): (EnsembleJob(preset("office"), seed, SMOOTHERS),) for seed in range(offices)}
+    outcomes = report.collect(run_ensemble, jobs).values()
     report.say(
         f"`office`, {len(outcomes)} worlds, final estimates, against a particle smoother of 5,000 particles "
         "and 200 trajectories drawn backwards, with the same states."
     )
-    finals = {label: [outcomes[i][label].final for i in sorted(outcomes)] for label in SMOOTHERS}
+    finals = {label: [outcome[label].final for outcome in outcomes] for label in SMOOTHERS}
     table(report, finals, "particle smoother")
     return report
 
@@ -61,9 +54,9 @@ def table(report: Report, found: dict[str, list[Series]], optimal: str) -> None:
     report.table(("estimator", "RMSE [m]", "heading [deg]", "ANEES", "ratio (95 %)", "largest"), rows)
 
 
-def in_room(job: Room) -> dict[str, Series]:
+def in_room(seed: int) -> dict[str, Series]:
     """Causal errors of all filters at the scans."""
-    log = job_log(EnsembleJob(preset("office", ROOM), job.seed, {}, without_constants))
+    log = job_log(EnsembleJob(preset("office", ROOM), seed, {}, without_constants))
     best = series(optimal_filter(log), log)
     found = {"grid filter": best}
     for label, config in FILTERS.items():

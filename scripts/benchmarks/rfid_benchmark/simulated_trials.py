@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import process_time
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from benchmarking.statistics import first_held
@@ -51,7 +50,6 @@ class SimulatedTrialJob:
     seeds: tuple[int, ...]
     estimator: str
     deadline: float
-    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Clock:
@@ -81,7 +79,7 @@ def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
 def started(log: Log, job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     """The trial on the log of such a drive."""
     clock = Clock()
-    result = run(log, RunConfig(job.estimator, job.settings, prior="unknown", seed=seed), watch=clock)
+    result = run(log, RunConfig(job.estimator, prior="unknown", seed=seed), watch=clock)
     first = float(log.streams["rfid"].t[0])
     good = is_right(result, log)
     claims = np.flatnonzero(np.array(result.status) == "localized")
@@ -104,7 +102,7 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     other = float(log.reference.t[np.argmax(away if away.any() else later)])
     before = cut(log, 0.0, BEFORE)
     carried = join(before, cut(log, other, other + after), gap=JUMP)
-    result = run(carried, RunConfig(job.estimator, job.settings, prior="reference", seed=seed))
+    result = run(carried, RunConfig(job.estimator, prior="reference", seed=seed))
     stamps = carried.streams["rfid"].t
     first = float(stamps[stamps > max(before.streams["rfid"].t)][0])
     good = is_right(result, carried)

@@ -24,18 +24,17 @@ def section(options: Options) -> Report:
     report = Report("starts", options)
     seeds = range(FIRST, FIRST + options.count(SEEDS))
     chunks = [tuple(seeds[i : i + CHUNK]) for i in range(0, len(seeds), CHUNK)]
-    jobs = [
-        SimulatedTrialJob(kind, preset(name), chunk, estimator, deadline)
+    jobs = {
+        (kind, name, estimator, deadline, chunk[0]): (
+            SimulatedTrialJob(kind, preset(name), chunk, estimator, deadline),
+        )
         for kind, name, deadline in KINDS
         for estimator in ("smoother", "particle_filter")
         for chunk in chunks
-    ]
-    labels = [f"{job.kind}, {job.simulation.name}, {job.estimator}, from seed {job.seeds[0]}" for job in jobs]
-    outcomes = report.collect(run_simulated_trials, jobs, labels)
+    }
     found: dict[tuple[str, str, str, float], list[SimulatedTrial]] = {}
-    for i in sorted(outcomes):
-        job = jobs[i]
-        found.setdefault((job.kind, job.simulation.name, job.estimator, job.deadline), []).extend(outcomes[i])
+    for (*key, _), trials in report.collect(run_simulated_trials, jobs).items():
+        found.setdefault(tuple(key), []).extend(trials)
     report.say(
         f"{len(seeds)} trials of each kind, with 95 % intervals. *Right in time*: from then on below 0.5 m and 15 degrees "
         "for 10 s. *Called so in time*: the status is rightly `localized` by then (in brackets: the median time). "
@@ -52,11 +51,6 @@ def section(options: Options) -> Report:
         if any(not t.seconds <= deadline for t in trials)
     ]
     report.say("Seeds of late runs: " + ("; ".join(late) or "none") + ".")
-    heads = ("kind", "preset", "estimator", "seed", "seconds", "claimed", "false", "doubt")
-    single = [
-        (*key[:3], t.seed, t.seconds, t.claimed, t.false, t.doubt) for key, trials in found.items() for t in trials
-    ]
-    report.figures("trials", heads, single)
     return report
 
 

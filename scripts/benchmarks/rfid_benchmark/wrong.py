@@ -54,11 +54,12 @@ def section(options: Options) -> Report:
     report = Report("wrong", options)
     seeds = range(FIRST, FIRST + options.count(SEEDS))
     jobs = {
-        (case.what, knows, seed): job(case, knows, seed) for case in CASES for knows in (False, True) for seed in seeds
+        (case.what, knows, seed): (job(case, knows, seed),)
+        for case in CASES
+        for knows in (False, True)
+        for seed in seeds
     }
-    labels = [f"{what}, {'known' if knows else 'not known'}, {seed}" for what, knows, seed in jobs]
-    found = report.collect(run_ensemble, list(jobs.values()), labels)
-    outcomes = {key: found[i] for i, key in enumerate(jobs) if i in found}
+    outcomes = report.collect(run_ensemble, jobs)
     rows = []
     for name in CONFIGS:
         for case in CASES:

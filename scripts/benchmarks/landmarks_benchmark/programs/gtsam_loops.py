@@ -1,7 +1,5 @@
 """Plain loops around GTSAM, with a keyframe at each stamp with landmarks, whose places are known.
 
-Usage: python -m speed_benchmark.programs.gtsam_loops PROBLEM lag|full|batch
-
 ``lag`` and ``full`` estimate the constants that the project does, the gyro's bias and four of the landmark sensor, by factors of
 their own in numpy; ``batch`` has GTSAM's own factors: Levenberg and Marquardt's algorithm from dead reckoning, with Huber's loss
 and then with that of Geman and McClure, and the marginals.
@@ -16,7 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from speed_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, command, composed, turned, wrapped
+from landmarks_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, composed, turned, wrapped
 
 LAG = 10.0  # s
 HUBER, GEMAN_MCCLURE = 1.345, 4.0
@@ -194,7 +192,3 @@ def _levelled(graph: Any) -> Any:
             factor = factor.cloneWithNewNoiseModel(gtsam.noiseModel.Robust.Create(loss, robust.noise()))
         made.add(factor)
     return made
-
-
-if __name__ == "__main__":
-    command({"lag": lag, "full": full, "batch": batch})

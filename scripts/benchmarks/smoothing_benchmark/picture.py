@@ -9,8 +9,8 @@ from benchmarking.statistics import Ratio
 
 from factorgraph_loc.drawing.figures import COLOURS, dress, empty, legend
 from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS
-from smoothing_tables.cases import SMOOTHER, Case
-from smoothing_tables.tables import ALIGNED, shown
+from smoothing_benchmark.cases import SMOOTHER, Case
+from smoothing_benchmark.tables import ALIGNED, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +37,7 @@ def picture(cases: Sequence[Case]) -> Figure:
         axis.set_title(TITLES[kind])
         axis.axvline(1.0, color="0.3", linewidth=1.0)
         for number, label in enumerate(filters):
-            look = {"color": COLOURS[number], "marker": MARKS[number % len(MARKS)], "linestyle": "none"}
+            style = {"color": COLOURS[number], "marker": MARKS[number % len(MARKS)], "linestyle": "none"}
             for line, case in enumerate(cases):
                 ratio = _ratio(case, label, kind)
                 if ratio is None:
@@ -45,7 +45,7 @@ def picture(cases: Sequence[Case]) -> Figure:
                 place = line + APART * (case.filters.index(label) - (len(case.filters) - 1) / 2.0)
                 if len(case.logs) >= ENOUGH_LOGS:
                     axis.plot((ratio.low, ratio.high), (place, place), color=COLOURS[number], linewidth=2.0)
-                axis.plot(ratio.value, place, label=f"smoother / {shown(label)}", markersize=8, **look)
+                axis.plot(ratio.value, place, label=f"smoother / {shown(label)}", markersize=8, **style)
         axis.set_xscale("log")
         axis.set_xticks(TICKS, [f"{tick:g}" for tick in TICKS])
         axis.minorticks_off()

@@ -1,4 +1,4 @@
-"""The extended Kalman filter of filterpy. Usage: python -m speed_benchmark.programs.filterpy_ekf PROBLEM composed|rows"""
+"""The extended Kalman filter of filterpy."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from speed_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, command, turned, wrapped
+from landmarks_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, turned, wrapped
 
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom: beyond it the noise is widened
 
@@ -84,7 +84,3 @@ def _run(problem: Problem, *, each_row: bool) -> Found:
             found.t.append(t)
             found.poses.append(f.x.copy())
     return found
-
-
-if __name__ == "__main__":
-    command({"composed": composed, "rows": rows})

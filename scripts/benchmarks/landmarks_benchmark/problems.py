@@ -17,7 +17,7 @@ from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factorgraph_loc.simulation import preset, simulate
 from factors.landmarks.model import located, sigmas
 from factors.se2 import Array
-from speed_benchmark.programs.plain import Problem
+from landmarks_benchmark.programs.plain import Problem
 
 SENSORS = ("odometry", "bearing_range")
 TICK = 0.1  # s

@@ -1,7 +1,4 @@
-"""An extended Kalman filter and a particle filter in plain numpy.
-
-Usage: python -m speed_benchmark.programs.numpy_filters PROBLEM ekf|particles
-"""
+"""An extended Kalman filter and a particle filter in plain numpy."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from speed_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, command, turned, wrapped
+from landmarks_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, turned, wrapped
 
 GATE = 9.21  # 99 % of chi-square with two degrees of freedom: beyond it the noise is widened
 PARTICLES, SEED, ROBUST = 5000, 0, 4.0
@@ -112,7 +109,3 @@ def _log_likelihood(x: Any, row: Any) -> Any:
     squared = ((np.hypot(dx, dy) - distance) / s_distance) ** 2
     squared += (wrapped(np.arctan2(dy, dx) - x[2] - bearing) / s_bearing) ** 2
     return -0.5 * squared / (1.0 + squared / ROBUST**2)
-
-
-if __name__ == "__main__":
-    command({"ekf": ekf, "particles": particles})

@@ -1,18 +1,10 @@
-"""A log of odometry and landmarks as plain numbers, for programs that know nothing of this project: numpy and the standard
-library are all that they need, so that they also run in an environment that has only the package they show.
-
-A program is called with the file of a problem, and prints one line of JSON: see :func:`measured`.
-"""
+"""A log of odometry and landmarks as plain numbers, for programs that know nothing of this project but these."""
 
 from __future__ import annotations
 
-import json
 import math
-import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +12,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 MOTION, SIGHTING, TICK = range(3)
-WARM_UP = 15.0  # s of the log, which are run before the measured run
 LEAST_VARIANCE = 1e-8  # of a motion, so that its covariance can be inverted
 MAX_GAP = 0.1  # s between neighbours of the reference that a pose is compared with
 
@@ -48,20 +39,6 @@ class Problem:
     reference_t: Array
     reference: Array
 
-    def save(self, path: Path) -> None:
-        """Write it as an npz file."""
-        with path.open("wb") as file:
-            np.savez(file, **{f.name: getattr(self, f.name) for f in fields(self)})
-
-    def until(self, seconds: float) -> Problem:
-        """The first ``seconds``."""
-        end = self.start + seconds
-        seen = self.sightings[:, 0] <= end
-        moves, ticks = self.moves[self.moves[:, 0] <= end], self.ticks[self.ticks <= end]
-        cut = {"moves": moves, "ticks": ticks, "sightings": self.sightings[seen], "raw": self.raw[seen]}
-        whole = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Problem(**{**whole, **cut})
-
     def events(self, *, raw: bool = False) -> list[tuple[int, float, Any]]:
         """(kind, time, what): for a motion (duration, speed, turn rate); for a stamp with landmarks a list of (x, y, range,
         bearing, their standard deviations), or with ``raw`` as the sensor reports them; for a tick None."""
@@ -74,26 +51,14 @@ class Problem:
         made += [(TICK, t, None) for t in self.ticks.tolist()]
         return sorted(made, key=lambda event: (event[1], event[0]))
 
-    def rmse(self, t: list[float], poses: list[Any]) -> tuple[float, float]:
-        """Root mean square errors of position [m] and heading [rad], where the reference is dense."""
+    def position_rmse(self, t: Any, poses: Any) -> float:
+        """Root mean square error of the position [m], where the reference is dense."""
         stamps, found = np.array(t), np.array(poses, dtype=float)
         i = np.clip(np.searchsorted(self.reference_t, stamps, side="right"), 1, len(self.reference_t) - 1)
-        before, after = self.reference[i - 1], self.reference[i]
         gap = self.reference_t[i] - self.reference_t[i - 1]
-        part = (stamps - self.reference_t[i - 1]) / gap
         inside = (stamps >= self.reference_t[0]) & (stamps <= self.reference_t[-1]) & (gap <= MAX_GAP + 1e-9)
-        true = before[:, :2] + part[:, None] * (after - before)[:, :2]
-        heading = before[:, 2] + part * wrapped(after[:, 2] - before[:, 2])
-        off = np.hypot(*(found[:, :2] - true).T)[inside]
-        turned = wrapped(found[:, 2] - heading)[inside]
-        return float(np.sqrt(np.mean(off**2))), float(np.sqrt(np.mean(turned**2)))
-
-
-def read_problem(path: Path) -> Problem:
-    """The problem that :meth:`Problem.save` wrote."""
-    with np.load(path) as data:
-        known: dict[str, Any] = {name: data[name] if data[name].ndim else float(data[name]) for name in data}
-    return Problem(**known)
+        true = [np.interp(stamps, self.reference_t, self.reference[:, axis]) for axis in (0, 1)]
+        return float(np.sqrt(np.mean(np.sum((found[:, :2] - np.transpose(true))[inside] ** 2, axis=1))))
 
 
 def wrapped(angle: Any) -> Any:
@@ -166,29 +131,3 @@ class Found:
 
 
 Loop = Callable[[Problem], Found]
-
-
-def measured(problem: Problem, loop: Loop) -> dict[str, float]:
-    """Processor time of a loop [s], the median, the 99th percentile, and that of the first and of the last quarter of its updates
-    [us], and its errors [m, rad]."""
-    loop(problem.until(WARM_UP))
-    started = time.process_time()
-    found = loop(problem)
-    seconds = time.process_time() - started
-    position, heading = problem.rmse(found.t, found.poses)
-    return {"seconds": seconds, **quantiles(found.updates), "position": position, "heading": heading}
-
-
-def quantiles(updates: list[float]) -> dict[str, float]:
-    """Of processor times [s], in us."""
-    if not updates:
-        return {}
-    us, quarter = 1e6 * np.array(updates), max(1, len(updates) // 4)
-    first, last = float(np.median(us[:quarter])), float(np.median(us[-quarter:]))
-    return {"median": float(np.median(us)), "p99": float(np.percentile(us, 99.0)), "first": first, "last": last}
-
-
-def command(loops: dict[str, Loop]) -> None:
-    """``PROGRAM PROBLEM LOOP``: measure one of the loops, and print what was found."""
-    path, name = sys.argv[1:]
-    print(json.dumps(measured(read_problem(Path(path)), loops[name])))

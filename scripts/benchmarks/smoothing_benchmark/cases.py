@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,24 +13,6 @@ from factorgraph_loc.evaluation.statistics import pooled_rms
 from factors.se2 import Array
 
 SMOOTHER = "smoother"
-# the experiments of each section of the page: file, and the name of each list of sensors
-SECTIONS: Mapping[str, Mapping[str, Mapping[str, str]]] = {
-    "known-map": {
-        "sensors": {
-            "odometry,bearing_range": "landmarks",
-            "odometry,rfid": "tags",
-            "odometry,rfid,phase": "tags with phase",
-            "odometry,sightings": "camera",
-        }
-    },
-    "ranges": {"ranges": {"": "ranges"}},
-    "wrong-models": {"wrong_models": {"": "tags, wrong models"}},
-    "no-map": {
-        "no_map": {"odometry,bearing_range": "landmarks, no map"},
-        "no_map_camera": {"odometry,sightings": "camera, no map"},
-    },
-}
-FILES = Path(__file__).parents[2] / "experiments/smoothing"
 
 
 @dataclass(frozen=True)

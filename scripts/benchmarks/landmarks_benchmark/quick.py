@@ -11,8 +11,8 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,37 +25,24 @@ from factorgraph_loc.files.models import read_text, write_text
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.vision.features import extractor
-from speed_benchmark.ours import CONFIGS, PARTICLES, seconds_of, timed
-from speed_benchmark.problems import landmark_log, problem_of
-from speed_benchmark.programs import gtsam_loops, numpy_filters
-from speed_benchmark.programs.plain import Loop, Problem
+from landmarks_benchmark.ours import CONFIGS, PARTICLES, Times, Work, least, timed_loop, timed_run
+from landmarks_benchmark.problems import landmark_log, problem_of
+from landmarks_benchmark.programs import gtsam_loops, numpy_filters
 
 SECONDS = 120.0  # of the drive among landmarks
 OTHER_SECONDS = 30.0  # of those among tags and points
 ROUNDS = 3
+BESIDE = {
+    "EKF": "numpy EKF",
+    "EKF, 5 constants": "numpy EKF",
+    "smoother, lag 10 s, 5 constants": "GTSAM, fixed lag",
+    "smoother, 5 constants": "GTSAM, iSAM2",
+    "smoother, full history, 5 constants": "GTSAM, iSAM2",
+    "particle filter, 5,000": "numpy particles",
+    "batch": "GTSAM, batch",
+}
 WORSE = 1.25  # times the stored ratio
 """A ratio that is farther above the stored one is a loss of speed."""
-Work = Callable[[], float]
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two workloads that return their processor time [s]; ``beside``: what the reference is."""
-
-    ours: Work
-    reference: Work
-    beside: str
-
-
-def measure(pairs: Mapping[str, Pair], rounds: int = ROUNDS) -> dict[str, tuple[float, float]]:
-    """The least time [s] of ours and of the reference, of each pair. The first round compiles, and does not count."""
-    best = dict.fromkeys(pairs, (np.inf, np.inf))
-    for i in range(rounds + 1):
-        for name, pair in pairs.items():
-            both = pair.ours(), pair.reference()
-            if i:
-                best[name] = min(best[name][0], both[0]), min(best[name][1], both[1])
-    return best
 
 
 def losses(found: Mapping[str, float], stored: Mapping[str, float]) -> list[str]:
@@ -80,13 +67,14 @@ def quick(out: Path, against: Path | None) -> int:
     """Measure, print the table, and store it; the exit code is 1 if a ratio is worse than the one of ``against``."""
     stored = read_ratios(against) if against is not None else {}
     out.parent.mkdir(parents=True, exist_ok=True)
-    pairs = workloads()
-    found = measure(pairs)
+    pairs, beside = workloads()
+    best = least(pairs, ROUNDS)
+    found = {name: (ours.seconds, reference.seconds) for name, (ours, reference) in best.items()}
     ratios = {name: ours / reference for name, (ours, reference) in found.items()}
     print("| ours | s | reference | s | ours / reference | before |\n|---|---|---|---|---|---|")
     for name, (ours, reference) in found.items():
         before = f"{stored[name]:.2f}" if name in stored else "–"
-        print(f"| {name} | {ours:.3f} | {pairs[name].beside} | {reference:.3f} | {ratios[name]:.2f} | {before} |")
+        print(f"| {name} | {ours:.3f} | {beside[name]} | {reference:.3f} | {ratios[name]:.2f} | {before} |")
     write_text(out, json.dumps({"ratios": ratios, "seconds": found}, indent=1) + "\n")
     print(f"\nstored: {out}")
     worse = losses(ratios, stored)
@@ -95,60 +83,35 @@ def quick(out: Path, against: Path | None) -> int:
     return int(bool(worse))
 
 
-def workloads() -> dict[str, Pair]:
-    """All pairs, by name."""
-    log = landmark_log(SECONDS)
+def workloads() -> tuple[dict[str, tuple[Work, Work]], dict[str, str]]:
+    """All pairs of ours and a reference, and the name of the reference, by name."""
+    log, tags, points, picture = landmark_log(SECONDS), _tags(), _points(), _picture()
     problem = problem_of(log)
-    loops = {
-        "numpy EKF": _loop(numpy_filters.ekf, problem),
-        "numpy particles": _loop(numpy_filters.particles, problem),
-        "GTSAM, fixed lag": _loop(gtsam_loops.lag, problem),
-        "GTSAM, iSAM2": _loop(gtsam_loops.full, problem),
-        "GTSAM, batch": _loop(gtsam_loops.batch, problem),
+    references = {
+        "numpy EKF": timed_loop(numpy_filters.ekf, problem),
+        "numpy particles": timed_loop(numpy_filters.particles, problem),
+        "GTSAM, fixed lag": timed_loop(gtsam_loops.lag, problem),
+        "GTSAM, iSAM2": timed_loop(gtsam_loops.full, problem),
+        "GTSAM, batch": timed_loop(gtsam_loops.batch, problem),
+        "SIFT": _found("sift", picture),
+        "import numpy": lambda: _started("import numpy"),
     }
-    references = (
-        "numpy EKF",
-        "numpy EKF",
-        "GTSAM, fixed lag",
-        "GTSAM, iSAM2",
-        "GTSAM, iSAM2",
-        "numpy particles",
-        "GTSAM, batch",
-    )
-    beside = dict(zip(CONFIGS, references, strict=True))
-    pairs = {name: Pair(_run(log, CONFIGS[name]), loops[what], what) for name, what in beside.items()}
-    pairs["Localizer, EKF"] = Pair(lambda: _pushed(log), loops["numpy EKF"], "numpy EKF")
-    tags, points = _tags(), _points()
     window = RunConfig("smoother", {"lag": 10.0})
     particles = RunConfig("particle_filter", {"particles": PARTICLES})
-    for name, other, config, what in (
-        ("tags, smoother, lag 10 s", tags, window, "GTSAM, fixed lag"),
-        ("tags, particle filter, 5,000", tags, particles, "numpy particles"),
-        ("points, smoother, lag 10 s", points, window, "GTSAM, fixed lag"),
-    ):
-        pairs[name] = Pair(_run(other, config), loops[what], what)
-    picture = _picture()
-    pairs["features"] = Pair(_found("colour", picture), _found("sift", picture), "SIFT")
-    pairs["start of fgloc"] = Pair(
-        lambda: _started("from factorgraph_loc.cli import main"), lambda: _started("import numpy"), "import numpy"
-    )
-    return pairs
+    ours: dict[str, tuple[Work, str]] = {
+        **{name: (timed_run(log, CONFIGS[name]), what) for name, what in BESIDE.items()},
+        "Localizer, EKF": (lambda: _pushed(log), "numpy EKF"),
+        "tags, smoother, lag 10 s": (timed_run(tags, window), "GTSAM, fixed lag"),
+        "tags, particle filter, 5,000": (timed_run(tags, particles), "numpy particles"),
+        "points, smoother, lag 10 s": (timed_run(points, window), "GTSAM, fixed lag"),
+        "features": (_found("colour", picture), "SIFT"),
+        "start of fgloc": (lambda: _started("from factorgraph_loc.cli import main"), "import numpy"),
+    }
+    pairs = {name: (work, references[what]) for name, (work, what) in ours.items()}
+    return pairs, {name: what for name, (_, what) in ours.items()}
 
 
-def _loop(loop: Loop, problem: Problem) -> Work:
-    def work() -> float:
-        started = time.process_time()
-        loop(problem)
-        return time.process_time() - started
-
-    return work
-
-
-def _run(log: Log, config: RunConfig) -> Work:
-    return lambda: seconds_of(timed(log, config))
-
-
-def _pushed(log: Log) -> float:
+def _pushed(log: Log) -> Times:
     """The measurements of a log, one after the other, with an estimate after each stamp with landmarks."""
     assert log.start is not None
     localizer = Localizer(log.rig, log.world, "ekf", settings={"self_calibration": False})
@@ -159,7 +122,7 @@ def _pushed(log: Log) -> float:
         localizer.push(m)
         if not m.is_motion:
             localizer.estimate()
-    return time.process_time() - started
+    return Times(time.process_time() - started)
 
 
 def _tags() -> Log:
@@ -181,16 +144,16 @@ def _picture() -> np.ndarray:
 def _found(feature: str, picture: np.ndarray) -> Work:
     extract = extractor(feature)
 
-    def work() -> float:
+    def work() -> Times:
         started = time.process_time()
         extract.detectAndCompute(picture, None)
-        return time.process_time() - started
+        return Times(time.process_time() - started)
 
     return work
 
 
-def _started(code: str) -> float:
+def _started(code: str) -> Times:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-c", code], check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Times(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)

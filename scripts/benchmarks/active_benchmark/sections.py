@@ -1,0 +1,58 @@
+"""Distance until localized, by policy and estimator: runs and their tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarking.report import Options, Report
+
+from factorgraph_loc.evaluation.figures import write_picture
+from factorgraph_loc.experiments.active import jobs_of, run_jobs, write_tables
+from factorgraph_loc.experiments.active_results import comparison, difference_cells, summary_cells
+from factorgraph_loc.planning.settings import ActiveSettings
+from factorgraph_loc.simulation import preset
+
+WORLDS = ("office", "symmetric", "warehouse")
+POLICIES = ("information", "random", "patrol", "nearest_tags", "paper_literal")
+ESTIMATORS = ("active_mcl", "particle_filter", "smoother")
+SETTINGS = ActiveSettings()
+
+
+def policies(options: Options) -> Report:
+    """Policies in three worlds, with the filter of the paper."""
+    report = Report("policies", options)
+    rows = compared(report, ("active_mcl",), POLICIES, WORLDS, options.count(200))
+    # in the dense office robots are localized almost without driving
+    report.table(*difference_cells([row for row in rows if row["world"] != "office"]))
+    return report
+
+
+def estimators(options: Options) -> Report:
+    """The same policies on top of other estimators."""
+    report = Report("estimators", options)
+    compared(report, ESTIMATORS, POLICIES[:3], WORLDS[1:], options.count(10))
+    return report
+
+
+def compared(
+    report: Report, estimators: Sequence[str], policies: Sequence[str], worlds: Sequence[str], count: int
+) -> list[dict[str, Any]]:
+    """The rows of all runs, after their summary in the report."""
+    options, folder = report.options, report.options.out / report.name
+    jobs = [job for world in worlds for job in jobs_of(preset(world), policies, estimators, range(count), SETTINGS)]
+    results = run_jobs(jobs, options.out, options.jobs, report.tell)
+    report.failed += results.failures
+    degrees = math.degrees(SETTINGS.heading_limit)
+    report.say(
+        f"{count} robots in each world, the same for all policies. A robot gives up after {SETTINGS.max_metres:.0f} m. "
+        f"*Failed*: not localized by then, with standard deviations and errors below {SETTINGS.position_limit:g} m and "
+        f"{degrees:.0f} degrees. *Claimed wrongly*: localized with an error above three times that. Errors are medians at "
+        "the end. Planning is the time of a step."
+    )
+    report.table(*summary_cells(results.rows))
+    folder.mkdir(parents=True, exist_ok=True)
+    write_tables(results.rows, folder)
+    write_picture(comparison(results.rows), folder / "comparison.png")
+    return results.rows
