@@ -1,6 +1,7 @@
 """A short real log on disk, a small log with images, and a way to call the command line in this process."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from factors.camera.model import camera_pose
 
 testing._get_command = cache(testing._get_command)  # made once, not for each call, most of which take no longer
 Fgloc = Callable[..., Result]
+COMMAND = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]  # in a process of its own
 SECONDS = 60.0
 WALL = 3.0  # m: the picture hangs on the plane x = 3, 4 m wide and 2.4 m high, 100 px a metre
 CAMERA = CameraSettings(

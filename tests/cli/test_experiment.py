@@ -4,10 +4,11 @@ import json
 import os
 import signal
 import subprocess
-import sys
 
 import polars as pl
 import pytest
+
+from .conftest import COMMAND
 
 TEXT = """
 name = "lags"
@@ -82,15 +83,7 @@ def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, proc
     (tmp_path / "slow.toml").write_text(
         file.read_text().replace('"ekf"]', '{name = "particle_filter", settings = {particles = 200000}}]')
     )
-    command = [
-        sys.executable,
-        "-c",
-        "from factorgraph_loc.cli.main import main; main()",
-        "experiment",
-        "run",
-        "slow.toml",
-    ]
-    process = processes.start(*command, "--jobs", "1", stderr=subprocess.PIPE)
+    process = processes.start(*COMMAND, "experiment", "run", "slow.toml", "--jobs", "1", stderr=subprocess.PIPE)
     processes.wait_until(lambda: list(tmp_path.glob("out/lags/store/??/*")))
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
     stderr = process.communicate(timeout=processes.PATIENCE)[1]

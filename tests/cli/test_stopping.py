@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-COMMAND = [sys.executable, "-c", "from factorgraph_loc.cli.main import main; main()"]
+from .conftest import COMMAND
+
 LINES = {signal.SIGINT: "interrupted\n", signal.SIGTERM: "terminated\n", signal.SIGHUP: "hung up\n"}
 
 

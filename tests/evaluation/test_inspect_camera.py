@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from picture import SMALL
+from picture import SMALL, moved_over
 
 from factorgraph_loc import ImageStream, Log, PointMap, Rig, SightingStream, Trajectory, VelocityStream, World
 from factorgraph_loc.evaluation.inspect import inspect
@@ -19,10 +19,7 @@ CAMERA = SMALL.model_copy(update={"frontend": FrontendSettings(feature="orb", co
 @pytest.fixture
 def log(tmp_path):
     """Fifty images, and two points that are seen twice."""
-    picture = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 256, (120, 160), dtype=np.uint8), (0, 0), 1.5)
-    files = [tmp_path / f"{k}.png" for k in range(50)]
-    for file in files:
-        cv2.imwrite(str(file), picture)
+    files = moved_over(tmp_path, 50)
     t = np.arange(50) * 0.2
     seen = np.repeat((1.0, 2.0), 2)
     pixels = SightingStream(

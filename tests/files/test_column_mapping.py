@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusal import refusal
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
@@ -136,8 +137,4 @@ def test_json_lines_of_several_kinds(read):
     ],
 )
 def test_wrong_tables(read, content, mapping, fragments):
-    with pytest.raises(InputError) as caught:
-        read(content, **mapping)
-    assert "\n" not in str(caught.value)
-    for fragment in fragments:
-        assert fragment in str(caught.value)
+    refusal(lambda: read(content, **mapping), *fragments)

@@ -1,21 +1,19 @@
 """The particle filter: unknown start, wrong start, kidnapping; constants of the sensor; its cloud as a density; standing still."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from by_hand import made
 from landmark_world import simulate, with_sightings
 
 from factorgraph_loc import RunFailedError, Tick
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, pose_moments, systematic
-from factorgraph_loc.fusion.particle_filter import ParticleFilter, ParticleFilterSettings
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.setup import Setup
 from factors import se2
 
+SENSORS = ("odometry", "bearing_range")
 UNKNOWN = RunConfig("particle_filter", {"particles": 1000}, prior="unknown")
 
 
@@ -105,8 +103,7 @@ class Likely:
 @pytest.mark.parametrize("nowhere", [np.nan, -np.inf])
 def test_a_likelihood_that_is_no_number_comes_to_an_end(log, nowhere):
     """Particles for which it is none are impossible; where that are all, the run fails in one line."""
-    setup = Setup(log.rig, log.world, ("odometry", "bearing_range"), np.random.default_rng(1))
-    filter = ParticleFilter(setup, ParticleFilterSettings(particles=200))
+    filter = made("particle_filter", log.rig, log.world, SENSORS, 1, particles=200)
     filter.initialize(PosePrior(2.5, np.zeros(3), np.eye(3)))
     filter._weigh(Likely(lambda poses: np.where(poses[:, 0] > 0.0, 0.0, nowhere)))
     cloud = filter._state
@@ -123,8 +120,7 @@ def test_what_is_much_work_is_weighed_by_a_few_particles_first(log):
     deviation, that of these 0.13 of them, and that of the log of the evidence, which is -12.1, was 3.8."""
     found = []
     for work in (1, 1000):
-        setup = Setup(log.rig, log.world, ("odometry", "bearing_range"), np.random.default_rng(1))
-        filter = ParticleFilter(setup, ParticleFilterSettings(self_calibration=False))
+        filter = made("particle_filter", log.rig, log.world, SENSORS, 1, self_calibration=False)
         filter.initialize(PosePrior(2.5, np.zeros(3), np.eye(3)))
         place = Likely(lambda poses: -0.5 * np.sum(((poses - 0.5) / 0.02) ** 2, axis=1), work)
         evidence = filter._weigh(place)
@@ -150,11 +146,10 @@ def test_what_no_particle_explains_is_taken_in_few_shares():
 def test_ticks_move_no_particle(log):
     """Until something is seen the particles wait, however many ticks there are; the estimate has the moments that they have once
     they are moved: of 4,000 the mean to 5 standard errors, the covariance to 7, which fails in fewer than one of 10,000 runs."""
-    setup = Setup(log.rig, log.world, ("odometry", "bearing_range"), np.random.default_rng(1))
     found = []
     for ticks in (np.arange(0.0, 0.85, 0.05), [0.0, 0.8]):
-        setup = replace(setup, rng=np.random.default_rng(1))
-        estimator = ParticleFilter(setup, ParticleFilterSettings(particles=4000, self_calibration=False))
+        settings = {"particles": 4000, "self_calibration": False}
+        estimator = made("particle_filter", log.rig, log.world, SENSORS, 1, **settings)
         estimator.initialize(PosePrior(0.0, log.reference.poses[0], np.diag((0.1, 0.1, 0.05)) ** 2))
         for m in log.measurements(("odometry",)):
             if m.t < 0.9:

@@ -80,17 +80,6 @@ def test_bad_odometry(native, refused, text, fragments):
 
 
 HEADER = "t_ns,landmark,range,bearing\n"
-BAD_SIGHTINGS = {
-    "neither range nor bearing": ("1,A,1,0\n2,A,,\n", ":3: row", "a range, a bearing or both"),
-    "no name": ("1,,1,0\n", ":2: landmark is ''", "name of a landmark"),
-    "too late": ("2000000000,A,1,0\n1400000000,A,1,0\n", ":3: time", "at most 0.5 s older"),
-}
-
-
-@pytest.mark.parametrize(("text", "fragments"), [(t, f) for t, *f in BAD_SIGHTINGS.values()], ids=list(BAD_SIGHTINGS))
-def test_bad_sightings(native, refused, text, fragments):
-    (native / "bearing_range.csv").write_text(HEADER + text)
-    refused(native, "bearing_range.csv", *fragments)
 
 
 def test_ranges_that_cannot_be_are_left_out_and_bearings_beside_them_kept(native, one):
@@ -105,6 +94,19 @@ def test_ranges_that_cannot_be_are_left_out_and_bearings_beside_them_kept(native
 
 
 BAD_FILES = {
+    "neither range nor bearing": (
+        "bearing_range.csv",
+        HEADER + "1,A,1,0\n2,A,,\n",
+        "bearing_range.csv:3: row",
+        "a range, a bearing or both",
+    ),
+    "no name": ("bearing_range.csv", HEADER + "1,,1,0\n", "bearing_range.csv:2: landmark is ''", "name of a landmark"),
+    "too late": (
+        "bearing_range.csv",
+        HEADER + "2000000000,A,1,0\n1400000000,A,1,0\n",
+        "bearing_range.csv:3: time",
+        "at most 0.5 s older",
+    ),
     "imu going back": ("imu.csv", "t_ns,w\n5,0\n4,0\n", "imu.csv:3: time"),
     "reference going back": ("reference.tum", "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "reference.tum:2: time"),
     "unknown key": ("run.toml", "[rig]\nsensor = ['odometry']\n", "unknown key sensor", "did you mean sensors?"),

@@ -2,6 +2,7 @@
 
 import sqlite3
 
+import pytest
 from rosbag_drive import proposed
 from rosbag_reads import MS, POSES, T0, fill
 from rosbags.typesys import get_types_from_idl
@@ -17,24 +18,25 @@ def test_a_bag_of_ros_1_whose_recording_was_cut_off(tmp_path, bag_maker, refuse)
     refuse(path, "is not indexed", "`rosbag reindex`")
 
 
-def test_old_bags_hold_no_definitions(tmp_path, bag_maker, read, refuse):
+@pytest.fixture
+def undefined(tmp_path, bag_maker):
+    """A bag that does not define its types."""
+    with bag_maker(tmp_path / "drive", "sqlite3") as made:
+        fill(made)
+    with sqlite3.connect(tmp_path / "drive" / "drive.db3") as database:
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+    return tmp_path / "drive"
+
+
+def test_old_bags_hold_no_definitions(undefined, read, refuse):
     """Messages of ROS are known all the same, others cannot be read."""
-    with bag_maker(tmp_path / "drive", "sqlite3") as made:
-        fill(made)
-    with sqlite3.connect(tmp_path / "drive" / "drive.db3") as database:
-        database.execute("DELETE FROM message_definitions")
-    database.close()
-    assert len(read(tmp_path / "drive", rfid=None).streams["odometry"].t) == len(POSES)
-    refuse(tmp_path / "drive", "topic /rfid is of type shop_msgs/msg/Reads, which the bag does not define")
+    assert len(read(undefined, rfid=None).streams["odometry"].t) == len(POSES)
+    refuse(undefined, "topic /rfid is of type shop_msgs/msg/Reads, which the bag does not define")
 
 
-def test_a_topic_that_nobody_can_read_does_not_hide_the_others(tmp_path, bag_maker):
-    with bag_maker(tmp_path / "drive", "sqlite3") as made:
-        fill(made)
-    with sqlite3.connect(tmp_path / "drive" / "drive.db3") as database:
-        database.execute("DELETE FROM message_definitions")
-    database.close()
-    found = proposed(tmp_path / "drive")
+def test_a_topic_that_nobody_can_read_does_not_hide_the_others(undefined):
+    found = proposed(undefined)
     assert set(found.options) == {"odometry", "reference"}
     assert any("/rfid is of type shop_msgs/msg/Reads, which the bag does not define" in note for note in found.notes)
 

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from refusal import refusal
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import (
@@ -32,14 +33,14 @@ def started(log, name="smoother", **options):
 
 ONE = np.ones(1)
 BAD = [
-    (VelocityOdometry(1.0, "fast", 0.0), r"v is 'fast', expected numbers"),
-    (BearingRange(1.0, ("a", "b"), ONE, ONE), r"range has shape \(1,\), expected \(2,\)"),
-    (BearingRange(1.0, "ab", ONE, ONE), r"landmarks is 'ab', expected names"),
+    (VelocityOdometry(1.0, "fast", 0.0), "v is 'fast', expected numbers"),
+    (BearingRange(1.0, ("a", "b"), ONE, ONE), "range has shape (1,), expected (2,)"),
+    (BearingRange(1.0, "ab", ONE, ONE), "landmarks is 'ab', expected names"),
     (
         RfidScan(1.0, ("a",), np.array([1]), ("e",), ONE, ONE, ONE, ONE),
-        r"antenna is \[1\], expected indices of its 1 ant",
+        "antenna is [1], expected indices of its 1 ant",
     ),
-    (Tick(1.0), r"^Tick is not a measurement, expected one of VelocityOdometry, "),
+    (Tick(1.0), "Tick is not a measurement, expected one of VelocityOdometry, "),
 ]
 
 
@@ -48,9 +49,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(log, measurement, message
     localizer = started(log, "ekf")
     localizer.push(IncrementOdometry(0.5, 0.1, 0.0, 0.0))
     before = localizer.estimate()
-    with pytest.raises(InputError, match=message) as error:
-        localizer.push(measurement)
-    assert "\n" not in str(error.value)
+    refusal(lambda: localizer.push(measurement), message)
     assert np.array_equal(localizer.estimate().pose, before.pose)
 
 

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from mapped_hall import HEAD, VELOCITIES
+from refusal import refusal
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import InputError, load
@@ -174,10 +175,7 @@ def test_images_that_are_no_images_and_those_without_markers(hall):
 def test_wrong_manifests(hall, old, new, fragment):
     wrong = hall.parent / "wrong.toml"
     wrong.write_text(MANIFEST.replace(old, new))
-    with pytest.raises(InputError) as caught:
-        load(str(wrong))
-    assert "\n" not in str(caught.value)
-    assert fragment in str(caught.value)
+    refusal(lambda: load(str(wrong)), fragment)
 
 
 def test_markers_need_images(hall):

@@ -9,17 +9,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from picture import SMALL
 
 from factorgraph_loc import FeatureStream, ImageStream, InputError, Log, Rig, World
 from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.frontend import with_features
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.feature_cache import FeatureCache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
 from factorgraph_loc.vision.settings import FrontendSettings
 
 ORB = FrontendSettings(feature="orb", count=100)
-SIZE = (160, 120)
 SOURCE = Path(frontend.__file__).parents[2] / "vision"
 
 
@@ -47,15 +46,14 @@ def computed(monkeypatch):
 @pytest.fixture
 def log(tmp_path, picture):
     """A camera that moves over a picture by 4 px from image to image, of which there are ten."""
-    files = []
-    for k in range(10):
-        files.append(tmp_path / f"{k}.png")
-        cv2.imwrite(str(files[-1]), picture[20 : 20 + SIZE[1], 4 * k : 4 * k + SIZE[0]])
+    files = [tmp_path / f"{k}.png" for k in range(10)]
+    for k, file in enumerate(files):
+        cv2.imwrite(str(file), picture[20:140, 4 * k : 4 * k + 160])
     return log_of(files)
 
 
 def log_of(files, t=None):
-    camera = CameraSettings(width=SIZE[0], height=SIZE[1], fx=150.0, fy=150.0, cx=79.5, cy=59.5, time_offset=0.5)
+    camera = SMALL.model_copy(update={"time_offset": 0.5})
     stamps = 0.2 * np.arange(len(files)) if t is None else t
     return Log("pictures", Rig(camera=camera), World(), {"camera": ImageStream(stamps, files)})
 
@@ -206,7 +204,7 @@ def test_bad_images_are_frames_without_features(log):
 
 def test_a_hundred_black_images(log, tmp_path, computed):
     black = tmp_path / "black.png"
-    cv2.imwrite(str(black), np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8))
+    cv2.imwrite(str(black), np.zeros((120, 160, 3), dtype=np.uint8))
     files = log.streams["camera"].file
     found, (warning,) = frames(log_of([*files[:5], *[black] * 100, *files[5:]]))
     assert [len(f.pixels) > 0 for f in found] == [True] * 5 + [False] * 100 + [True] * 5
