@@ -119,7 +119,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Run several estimators on several logs; write a table and plots."""
-    from factorgraph_loc.evaluation.tables import comparison_table, further_tables, unscored, verdict
+    from factorgraph_loc.evaluation.tables import comparison_cells, further_tables, unscored, verdict
     from factorgraph_loc.experiments.compare import FINISHED
     from factorgraph_loc.experiments.compare import compare as compare_estimators
     from factorgraph_loc.files.temporary import require_free
@@ -148,10 +148,10 @@ def compare(
     if json:
         show.document({"runs": comparison.rows, "failures": comparison.failures, "warnings": comparison.warnings})
     else:
-        show.rich_table(comparison_table(comparison.rows))
+        show.table(*comparison_cells(comparison.rows), grouped=True)
         for title, columns in further_tables(comparison.rows, rpe=options.rpe).items():
             show.line(f"{title}:")
-            show.rich_table(comparison_table(comparison.rows, columns))
+            show.table(*comparison_cells(comparison.rows, columns), grouped=True)
         for line in (*unscored(comparison.rows), *verdict(comparison.rows)):
             show.line(line)
         show.line()

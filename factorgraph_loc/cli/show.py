@@ -9,12 +9,9 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from factorgraph_loc.text import MESSAGE, one_line, plain, plain_values
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 WARNINGS = 20  # number of warnings printed
 NARROW, PADDING = 18, 2  # characters: minimum width of a wrapped column, padding of each column
@@ -60,34 +57,36 @@ def document(content: Any) -> None:
     print("".join(c if c == "\n" or c.isprintable() else json.dumps(c)[1:-1] for c in text), flush=True)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], wrapped: Sequence[str] = ()) -> None:
-    """Print a table on stdout: the first column left-aligned, numbers right-aligned. ``wrapped``: columns of text, which take
-    several lines in a narrow terminal."""
+def table(
+    header: Sequence[str], rows: Sequence[Sequence[str]], wrapped: Sequence[str] = (), *, grouped: bool = False
+) -> None:
+    """Print a table on stdout: the first column left-aligned, numbers right-aligned.
+
+    ``wrapped``: columns of text, which take several lines in a narrow terminal; nothing is truncated. ``grouped``: rows of figures
+    by their first two columns, with a rule below the header, whose words are on lines of their own.
+    """
+    from rich import box
+    from rich.console import Console
     from rich.table import Table
 
-    out = Table(box=None, pad_edge=False, header_style="bold")
+    out = Table(box=box.SIMPLE_HEAD if grouped else None, pad_edge=grouped, header_style="bold")
     least: list[int] = []
     for i, name in enumerate(header):
-        numeric = i > 0 and all(_is_number(row[i]) for row in rows)
-        longest = max(map(len, (name, *(row[i] for row in rows))))
+        numeric = i > 1 if grouped else i > 0 and all(_is_number(row[i]) for row in rows)
+        title = plain(name).replace(" ", "\n" if grouped else " ")
+        longest = max(map(len, (*title.split("\n"), *(row[i] for row in rows))))
         least.append(min(longest, NARROW) if name in wrapped else longest)
         justify: Literal["left", "right"] = "right" if numeric else "left"
-        out.add_column(plain(name), justify=justify, no_wrap=name not in wrapped, overflow="fold", min_width=least[-1])
-    for row in rows:
-        out.add_row(*(plain(cell, MESSAGE) for cell in row))
-    rich_table(out, sum(least) + PADDING * len(least) if wrapped else None)
-
-
-def rich_table(content: Table, least: int | None = None) -> None:
-    """Print a rich table on stdout, at least so many characters wide, by default as wide as its text. A narrow terminal wraps its
-    lines but truncates nothing."""
-    from rich.console import Console
-
+        out.add_column(title, justify=justify, no_wrap=name not in wrapped, overflow="fold", min_width=least[-1])
+    for row, following in zip(rows, [*rows[1:], None], strict=True):
+        ends = grouped and (following is None or following[0] != row[0])
+        out.add_row(*(plain(cell, MESSAGE) for cell in row), end_section=ends)
     # with a height, as rich takes a dumb terminal for 80 columns otherwise
     console = Console(markup=False, emoji=False, highlight=False, width=1000, height=1000)
     if sys.stdout.isatty():
-        console.width = max(_terminal_width(), console.measure(content).maximum if least is None else least)
-    console.print(content)
+        whole = console.measure(out).maximum
+        console.width = max(_terminal_width(), sum(least) + PADDING * len(least) if wrapped else whole)
+    console.print(out)
 
 
 def _terminal_width() -> int:

@@ -1,9 +1,6 @@
 """The table of a comparison: a row for each log and estimator, then each estimator over all logs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,10 +8,7 @@ from factorgraph_loc.evaluation.scores import ACCURACY, ALIGNED, TABLE, Metric, 
 from factorgraph_loc.evaluation.statistics import average, pooled_rms
 from factorgraph_loc.evaluation.warned import Row
 from factorgraph_loc.model.scoring import KINDS
-from factorgraph_loc.text import MESSAGE, number, plain
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from factorgraph_loc.text import number
 
 ALL = "(all logs)"
 SCORED = "poses scored"
@@ -66,24 +60,6 @@ def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[li
             cells = [_pooled(metric, by_log) for metric in metrics]
             lines.append([ALL, name, *cells, counted(*by_log) or "-", _went_well(runs)])
     return ["log", "estimator", *(metric.column for metric in metrics), SCORED, "runs"], lines
-
-
-def comparison_table(rows: Sequence[Row], shown: Sequence[str] = ()) -> Table:
-    """The same as a table for the terminal."""
-    from rich import box  # noqa: PLC0415 - only a terminal needs it
-    from rich.table import Table  # noqa: PLC0415
-    from rich.text import Text  # noqa: PLC0415
-
-    header, lines = comparison_cells(rows, shown)
-    table = Table(box=box.SIMPLE_HEAD, header_style="bold")
-    for i, name in enumerate(header):
-        # wrap words to keep the table narrow; folded or truncated numbers would be worse
-        table.add_column(Text(name.replace(" ", "\n")), justify="left" if i < 2 else "right", no_wrap=True)
-    for line, following in zip(lines, [*lines[1:], None], strict=True):
-        table.add_row(
-            *(plain(cell, MESSAGE) for cell in line), end_section=following is None or following[0] != line[0]
-        )
-    return table
 
 
 def unscored(rows: Sequence[Row]) -> list[str]:

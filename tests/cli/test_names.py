@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from factorgraph_loc import BearingRangeStream, IncrementStream, Landmark, Log, Rig, Trajectory, World, write_native
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.app import app
-from factorgraph_loc.evaluation.tables import comparison_table
+from factorgraph_loc.evaluation.tables import comparison_cells
 from factorgraph_loc.files.models import read_toml, write_toml
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 
@@ -51,7 +51,7 @@ def test_any_name_gives_a_run_with_tables_and_plots(name: str, landmark: str, tm
 @pytest.mark.parametrize("name", ["\x1b[31m\x00\u202e\x9b", "a\nb", "caf\udce9", "[/red]:smile:{x}"])
 def test_whatever_is_printed_goes_through_one_function(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     row = {"log": name, "estimator": name, "seed": 0, "status": "ok"}
-    show.rich_table(comparison_table([row]))
+    show.table(*comparison_cells([row]), grouped=True)
     show.table(["name"], [[name]])
     show.fields({"name": name})
     show.document({name: name})
