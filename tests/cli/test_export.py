@@ -1,6 +1,7 @@
-"""``fgloc export``: files for other programs, by their suffix."""
+"""``fgloc export`` and ``fgloc view``: files for other programs, by their suffix, and which log and which runs are meant."""
 
 import json
+import sys
 
 import gtsam
 import numpy as np
@@ -11,6 +12,7 @@ from tum_files import read_tum
 
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.exports import rerun_viewer
 from factorgraph_loc.io.readers import load
 
 
@@ -72,3 +74,21 @@ def test_bad_input(refused, short_log, comparison, ekf, tmp_path):
         if file.stem != "reference":
             (bare / file.name).write_bytes(file.read_bytes())
     assert "has no reference to write" in refused("export", bare, "-o", tmp_path / "a.tum")
+
+
+@pytest.mark.parametrize("with_run", [False, True])
+def test_a_file_for_the_viewer(fgloc, short_log, ekf, tmp_path, with_run):
+    pytest.importorskip("rerun")
+    out = tmp_path / "view.rrd"
+    result = fgloc("view", *([ekf] if with_run else []), short_log, "--rrd", out)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout == f"wrote {out}: open it with rerun --bind 127.0.0.1 {out}\n"
+    assert out.read_bytes()[:4] == b"RRF2"
+
+
+def test_a_viewer_that_does_not_start(refused, short_log, monkeypatch):
+    pytest.importorskip("rerun")
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(rerun_viewer, "_is_listening", lambda _: False)
+    monkeypatch.setattr(rerun_viewer, "COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
+    assert "the viewer did not start; --rrd FILE writes a file" in refused("view", short_log)

@@ -11,6 +11,7 @@ from factors.rfid.places import is_wide
 BEAM = BeamModel()
 ANTENNAS = tuple(Antenna(0.2, 0.1 * k, 1.2, 1.5 * k) for k in range(4))
 WIDTH, DEPTH = 60.0, 40.0
+HEIGHTS = (0.4, 1.2, 2.0)
 
 
 def scene(heights, tempering=1.0, detection=BEAM):
@@ -34,42 +35,34 @@ def scene(heights, tempering=1.0, detection=BEAM):
     return likelihood, looks, near, anywhere
 
 
-@pytest.mark.parametrize("heights", [(1.2,), (0.4, 1.2, 2.0)])
-def test_poses_anywhere_are_as_likely_as_when_looked_at_alone(heights):
-    likelihood, looks, near, anywhere = scene(heights, 0.7)
-    poses = np.concatenate((near, anywhere))
-    together = likelihood.log_likelihood(poses, looks)
-    exact = -likelihood.score(poses, looks).nll
-    # cells of 5 cm; the likelihoods differ by hundreds
-    assert np.ptp(exact) > 50.0
-    assert np.mean(together - exact) == pytest.approx(0.0, abs=0.05)
-    assert np.std(together - exact) < 0.25
-
-
 LOGISTIC = LogisticModel((5.0, -0.6, -0.1, -3.0, 0.2, -0.1, -0.5, 1.5, 0.3, 0.1, -0.2))
 FACING = bake(LOGISTIC, 6.0, 0.3, (-0.8, 0.0, 0.8), 5)
 
 
 @pytest.mark.parametrize(
-    ("detection", "parameters"),
+    ("detection", "parameters", "heights", "bound"),
     [
-        (BeamModel(), (0.1, -0.6)),
-        (BeamModel(), (-0.2, 0.5)),
-        (LOGISTIC, (0.0, 0.0)),
-        (LOGISTIC, (0.1, -0.6)),
-        (FACING, (0.0, 0.0)),
-        (FACING, (-0.1, 0.4)),
+        (BEAM, (0.0, 0.0), (1.2,), 0.05),
+        (BEAM, (0.0, 0.0), HEIGHTS, 0.05),
+        (BEAM, (0.1, -0.6), HEIGHTS, 0.1),
+        (BEAM, (-0.2, 0.5), HEIGHTS, 0.1),
+        (LOGISTIC, (0.0, 0.0), HEIGHTS, 0.1),
+        (LOGISTIC, (0.1, -0.6), HEIGHTS, 0.1),
+        (FACING, (0.0, 0.0), HEIGHTS, 0.1),
+        (FACING, (-0.1, 0.4), HEIGHTS, 0.1),
     ],
 )
-def test_models_that_are_adjusted_or_use_facings_are_looked_at_anywhere_as_well(detection, parameters):
-    plain, looks, near, anywhere = scene((0.4, 1.2, 2.0), 0.7, detection)
+def test_poses_anywhere_are_as_likely_as_when_looked_at_alone(detection, parameters, heights, bound):
+    """With models as the rig says, adjusted ones, and those that use facings."""
+    plain, looks, near, anywhere = scene(heights, 0.7, detection)
     likelihood = plain.adjusted(np.array((*parameters, *plain.parameters[2:])))
     poses = np.concatenate((near, anywhere))
     together = likelihood.log_likelihood(poses, looks)
     exact = -likelihood.score(poses, looks).nll
+    # cells of 5 cm; the likelihoods differ by hundreds
     assert np.ptp(exact) > 50.0
-    assert np.mean(together - exact) == pytest.approx(0.0, abs=0.1)
-    assert np.std(together - exact) < 0.4
+    assert np.mean(together - exact) == pytest.approx(0.0, abs=bound)
+    assert np.std(together - exact) < (0.25 if bound < 0.1 else 0.4)
 
 
 def test_tables_of_adjusted_models_are_few():

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import started
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import (
@@ -40,18 +41,6 @@ def log():
     streams = cut(log, 0.0, 19.97).streams
     columns = {k: np.append(v, 19.97 if k == "t" else 0.0) for k, v in columns_of(streams["odometry"]).items()}
     return replace(log, streams={**streams, "odometry": replace(streams["odometry"], **columns)})
-
-
-def started(log, name="smoother", prior=None, **options):
-    localizer = fgloc.Localizer(log.rig, log.world, name, **options)
-    start, _ = resolve_prior(log, prior)
-    if start is None:
-        localizer.initialize()
-    elif not start.has_heading:
-        localizer.initialize((*start.pose[:2], math.nan), start.covariance[:2, :2], start.t)
-    else:
-        localizer.initialize(start.pose, start.covariance, start.t)
-    return localizer
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from by_hand import started
 from refusal import refusal
 
 import factorgraph_loc as fgloc
@@ -23,12 +24,6 @@ from factorgraph_loc.sensors.rfid.stream import scan_of
 def log():
     """The rig and map of an office."""
     return fgloc.simulate("office", 3, changes={"drive": {"duration": 1.0}, "world": {"tags": 12, "landmarks": 6}})
-
-
-def started(log, name="smoother", **options):
-    localizer = fgloc.Localizer(log.rig, log.world, name, **options)
-    localizer.initialize(log.start.pose, np.diag(np.square(log.start.sigmas)), log.start.t)
-    return localizer
 
 
 ONE = np.ones(1)

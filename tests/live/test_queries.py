@@ -6,12 +6,12 @@ from dataclasses import fields, is_dataclass, replace
 import camera_world
 import numpy as np
 import pytest
+from by_hand import started
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import BearingRange
-from factorgraph_loc.experiments.preparation import resolve_prior
 
 ASKED = ("estimate", "belief", "learnt", "trajectory", "diagnostics")
 BOTH, SEEN = ("odometry", "rfid", "bearing_range"), ("odometry", "sightings")
@@ -68,14 +68,10 @@ def seen():
     return camera_world.simulate(seconds=2.5)
 
 
-def started(log, case):
+def with_rows(log, case):
+    """A localizer, and what it is to be given."""
     name, sensors, options, prior = case
-    localizer = fgloc.Localizer(log.rig, log.world, name, settings=options, sensors=sensors, seed=5)
-    start, _ = resolve_prior(log, prior)
-    if start is None:
-        localizer.initialize()
-    else:
-        localizer.initialize(start.pose, start.covariance, start.t)
+    localizer = started(log, name, prior, settings=options, sensors=sensors, seed=5)
     rows = list(log.measurements(sensors))
     late = {m.t for i, m in enumerate(m for m in rows if isinstance(m, BearingRange)) if i % 3 == 1}
     return localizer, sorted(rows, key=lambda m: m.t + 0.3 * (isinstance(m, BearingRange) and m.t in late))
@@ -100,7 +96,7 @@ def test_asking_changes_no_answer_of_a_camera(seen, case):
 
 def unchanged(log, case):
     """What is asked on the way changes nothing that is told at the end."""
-    expected, rows = started(log, case)
+    expected, rows = with_rows(log, case)
     for m in rows:
         expected.push(m)
     expected = answers(expected)
@@ -108,7 +104,7 @@ def unchanged(log, case):
     @given(asked=questions)
     @settings(max_examples=5, deadline=None)
     def check(asked):
-        localizer, rows = started(log, case)
+        localizer, rows = with_rows(log, case)
         for i, m in enumerate(rows):
             localizer.push(m)
             for share, what, ahead in asked:
@@ -125,8 +121,8 @@ def unchanged(log, case):
 def test_localizers_share_nothing(log, name):
     """What one is given, and asked, changes nothing that another of the same settings tells."""
     case = CASES[name]
-    first, rows = started(log, case)
-    second, _ = started(log, case)
+    first, rows = with_rows(log, case)
+    second, _ = with_rows(log, case)
     middle = len(rows) // 2
     for m in rows[:middle]:
         first.push(m)
@@ -142,7 +138,7 @@ def test_localizers_share_nothing(log, name):
 @pytest.mark.parametrize("name", ["ekf", "particle_filter", "smoother"])
 def test_looking_ahead_drops_nothing(log, name):
     """An estimate for a second and a half ahead, each second, leaves what is measured until then in time."""
-    localizer, rows = started(log, (name, BOTH, {"particles": 60} if name == "particle_filter" else {}, None))
+    localizer, rows = with_rows(log, (name, BOTH, {"particles": 60} if name == "particle_filter" else {}, None))
     asked = 0.0
     for m in rows:
         localizer.push(m)
