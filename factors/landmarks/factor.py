@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from factors import se2
+from factors import positive, se2
 from factors.landmarks import kernels
 from factors.landmarks.model import (
     CONSTANTS,
@@ -82,8 +82,9 @@ class BearingRangeFactor:
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
         """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
         predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
-        contiguous = np.ascontiguousarray(covariance)
-        return int(kernels.beyond(self.model.packed, pose, self.packed, contiguous, limit))
+        error, (by_pose,) = self.whitened([pose])
+        noise = np.eye(2) + by_pose @ covariance @ by_pose.transpose(0, 2, 1)
+        return int(np.count_nonzero(positive.squared(error, noise) > limit))
 
     @property
     def packed(self) -> kernels.Sighting:

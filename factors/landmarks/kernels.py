@@ -132,26 +132,6 @@ def weigh(error: Array, jacobian: Array, robust: float) -> None:
                 jacobian[k, i, j] *= root
 
 
-@compiled(error_model="numpy")
-def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
-    """The number of landmarks whose normalised innovation squared exceeds ``limit``, with pose ``covariance`` (3, 3)."""
-    count = len(packed[0])
-    error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
-    linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
-    for k in range(count):
-        a, b, c = 1.0, 0.0, 1.0
-        for i in range(3):
-            for j in range(3):
-                a += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 0, j]
-                b += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 1, j]
-                c += by_pose[k, 1, i] * covariance[i, j] * by_pose[k, 1, j]
-        x, y = error[k, 0], error[k, 1]
-        # rounding may take all of the difference, which is never less than that
-        determinant = max(a * c - b * b, 0.5 * (a + c))
-        outliers += (c * x * x - 2.0 * b * x * y + a * y * y) / determinant > limit
-    return outliers
-
-
 @compiled
 def linearize_all(
     model: Array,
@@ -261,21 +241,6 @@ def weighted(
             for j in range(wide):
                 by_values[row, j] = root * jacobian[k, i, 3 + j]
     return out, by_pose, by_values
-
-
-@compiled(error_model="numpy")
-def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
-    """Measured less predicted ranges [m] and bearings [rad], of those that were measured, from whitened ``residual`` (K, 2)."""
-    by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
-    r = b = 0
-    for k in range(len(ranges)):
-        if not math.isnan(ranges[k]):
-            by_range[r] = -residual[k, 0] * math.hypot(model[RANGE_SIGMA], model[RELATIVE] * ranges[k])
-            r += 1
-        if not math.isnan(bearings[k]):
-            by_bearing[b] = -residual[k, 1] * model[BEARING_SIGMA]
-            b += 1
-    return by_range[:r], by_bearing[:b]
 
 
 @compiled(error_model="numpy")

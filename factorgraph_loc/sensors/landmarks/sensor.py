@@ -20,8 +20,7 @@ from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingR
 from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
-from factors.landmarks.kernels import innovations
-from factors.landmarks.model import PARAMETERS, TIME_OFFSET
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET, sigmas
 from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction
@@ -333,9 +332,9 @@ class LandmarkSensor(Sensor):
     def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
         factor = observation.measured
         self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
-        ranges, bearings = innovations(factor.model.packed, correction.residual, factor.ranges, factor.bearings)
-        self._diagnostics.add_residuals(f"{self.name}.range", ranges.tolist())
-        self._diagnostics.add_residuals(f"{self.name}.bearing", bearings.tolist())
+        errors = -correction.residual * sigmas(factor.model, factor.ranges)
+        self._diagnostics.add_residuals(f"{self.name}.range", errors[~np.isnan(factor.ranges), 0].tolist())
+        self._diagnostics.add_residuals(f"{self.name}.bearing", errors[~np.isnan(factor.bearings), 1].tolist())
         return True
 
     @property
