@@ -8,5 +8,4 @@ __all__ = [
     "point",
     "ray_pairs",
     "triangulation_kernels",
-    "update_kernels",
 ]

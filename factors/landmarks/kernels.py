@@ -222,28 +222,6 @@ def updated(
 
 
 @compiled(error_model="numpy")
-def weighted(
-    model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
-) -> tuple[Array, Array, Array]:
-    """Whitened, robustly weighted residual (2K,) and its Jacobians by the pose (2K, 3) and by the constants (2K, P); arguments as
-    of :func:`updated`."""
-    count, wide = len(packed[0]), len(indices)
-    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
-    _linearized(model, packed, pose, values, indices, residual, jacobian)
-    out, by_pose, by_values = np.empty(2 * count), np.empty((2 * count, 3)), np.empty((2 * count, wide))
-    for k in range(count):
-        root = math.sqrt(geman_mcclure_weight(residual[k, 0] ** 2 + residual[k, 1] ** 2, model[ROBUST]))
-        for i in range(2):
-            row = 2 * k + i
-            out[row] = root * residual[k, i]
-            for j in range(3):
-                by_pose[row, j] = root * jacobian[k, i, j]
-            for j in range(wide):
-                by_values[row, j] = root * jacobian[k, i, 3 + j]
-    return out, by_pose, by_values
-
-
-@compiled(error_model="numpy")
 def _linearized(
     model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers, residual: Array, jacobian: Array
 ) -> None:
