@@ -56,25 +56,15 @@ class RunErrors:
         return self.status.count(status) / len(self.status)
 
 
-@dataclass(frozen=True)
-class EnsembleJob:
-    """A simulated log, ``change`` (if any) applied to it and its seed, and the runs on it by label."""
-
-    settings: SimulationSettings
-    seed: int
-    configs: Mapping[str, RunConfig]
-    change: Callable[[Log, int], Log] | None = None
-
-
-def run_ensemble(job: EnsembleJob) -> dict[str, RunErrors]:
-    """The errors of each run of a job; jobs can be sent to other processes."""
-    return {label: run_errors(run(log, config), log) for log in [job_log(job)] for label, config in job.configs.items()}
-
-
-def job_log(job: EnsembleJob) -> Log:
-    """The log of a job."""
-    log = simulate(job.settings, job.seed)
-    return log if job.change is None else job.change(log, job.seed)
+def run_ensemble(
+    settings: SimulationSettings,
+    seed: int,
+    configs: Mapping[str, RunConfig],
+    change: Callable[[Log, int], Log] = lambda log, _: log,
+) -> dict[str, RunErrors]:
+    """The errors of each run, by label, on a simulated log; ``change`` is applied to the log and its seed."""
+    log = change(simulate(settings, seed), seed)
+    return {label: run_errors(run(log, config), log) for label, config in configs.items()}
 
 
 def run_errors(result: RunResult, log: Log) -> RunErrors:

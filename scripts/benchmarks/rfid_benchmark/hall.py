@@ -17,7 +17,6 @@ from factorgraph_loc.simulation.settings import SimulationSettings, preset
 from rfid_benchmark.simulated_trials import (
     Clock,
     SimulatedTrial,
-    SimulatedTrialJob,
     held,
     lasting,
     started,
@@ -114,7 +113,7 @@ def measured(job: Job) -> dict[str, SimulatedTrial | Returns | float]:
     for name in ESTIMATORS:
         rehearse(name)
         if job.what == "start":
-            found[name] = started(log, SimulatedTrialJob("unknown start", hall(job.tags), (), name, START), job.seed)
+            found[name] = started(log, name, job.seed)
         else:
             found[name] = returns(log, moved, name, job.seed) if moved else scan_ms(log, name, job.seed)
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarking.ensemble import EnsembleJob, RunErrors, run_ensemble
+from benchmarking.ensemble import RunErrors, run_ensemble
 from benchmarking.report import ACCURACY, KINDS, Options, Report, accuracy_cells, ratio_cells
 
 from factorgraph_loc.experiments.run import RunConfig
@@ -21,7 +21,7 @@ def section(options: Options) -> Report:
     report = Report("office", options)
     found: dict[str, Found] = {}
     for name, (usual, configs) in PRESETS.items():
-        jobs = {(name, seed): (EnsembleJob(preset(name), seed, configs),) for seed in range(options.count(usual))}
+        jobs = {(name, seed): (preset(name), seed, configs) for seed in range(options.count(usual))}
         outcomes = report.collect(run_ensemble, jobs).values()
         if outcomes:
             found[name] = {label: [outcome[label] for outcome in outcomes] for label in configs}

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from benchmarking.ensemble import EnsembleJob, Series, job_log, run_ensemble, run_errors, series
+from benchmarking.ensemble import Series, run_ensemble, run_errors, series
 from benchmarking.report import Options, Report, pooled, ratio_cells
 
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import preset
 from rfid_benchmark.optimal import optimal_filter, without_constants
 
@@ -32,7 +33,7 @@ def section(options: Options) -> Report:
         "Causal estimates at the scans, against the grid filter (5 cm, 3 degrees), which is optimal."
     )
     table(report, {label: [outcome[label] for outcome in outcomes] for label in FILTERS}, "grid filter")
-    jobs = {("office", seed): (EnsembleJob(preset("office"), seed, SMOOTHERS),) for seed in range(offices)}
+    jobs = {("office", seed): (preset("office"), seed, SMOOTHERS) for seed in range(offices)}
     outcomes = report.collect(run_ensemble, jobs).values()
     report.say(
         f"`office`, {len(outcomes)} worlds, final estimates, against a particle smoother of 5,000 particles "
@@ -56,7 +57,7 @@ def table(report: Report, found: dict[str, list[Series]], optimal: str) -> None:
 
 def in_room(seed: int) -> dict[str, Series]:
     """Causal errors of all filters at the scans."""
-    log = job_log(EnsembleJob(preset("office", ROOM), seed, {}, without_constants))
+    log = without_constants(simulate(preset("office", ROOM), seed), seed)
     best = series(optimal_filter(log), log)
     found = {"grid filter": best}
     for label, config in FILTERS.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import process_time
 from typing import Literal
@@ -41,17 +42,6 @@ class SimulatedTrial:
     busy_ms: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True)
-class SimulatedTrialJob:
-    """Trials of a ``kind``, one with each of the ``seeds``; ``deadline`` [s]."""
-
-    kind: Kind
-    simulation: SimulationSettings
-    seeds: tuple[int, ...]
-    estimator: str
-    deadline: float
-
-
 class Clock:
     """Processor time between the ticks of a run."""
 
@@ -65,21 +55,23 @@ class Clock:
         self._last = now
 
 
-def run_simulated_trials(job: SimulatedTrialJob) -> list[SimulatedTrial]:
-    """The trials of a job; jobs can be sent to other processes."""
-    trial = start_trial if job.kind == "unknown start" else kidnapping_trial
-    return [trial(job, seed) for seed in job.seeds]
+def run_simulated_trials(
+    kind: Kind, simulation: SimulationSettings, estimator: str, deadline: float, seeds: Sequence[int]
+) -> list[SimulatedTrial]:
+    """Trials of a kind, one with each of the seeds; ``deadline`` [s]."""
+    trial = start_trial if kind == "unknown start" else kidnapping_trial
+    return [trial(simulation, estimator, deadline, seed) for seed in seeds]
 
 
-def start_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
+def start_trial(simulation: SimulationSettings, estimator: str, deadline: float, seed: int) -> SimulatedTrial:
     """The beginning of a drive, from an unknown start, long enough to hold a correct estimate at three deadlines."""
-    return started(simulate(lasting(job.simulation, 3.0 * job.deadline + HOLD + 1.0), seed), job, seed)
+    return started(simulate(lasting(simulation, 3.0 * deadline + HOLD + 1.0), seed), estimator, seed)
 
 
-def started(log: Log, job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
+def started(log: Log, estimator: str, seed: int) -> SimulatedTrial:
     """The trial on the log of such a drive."""
     clock = Clock()
-    result = run(log, RunConfig(job.estimator, prior="unknown", seed=seed), watch=clock)
+    result = run(log, RunConfig(estimator, prior="unknown", seed=seed), watch=clock)
     first = float(log.streams["rfid"].t[0])
     good = is_right(result, log)
     claims = np.flatnonzero(np.array(result.status) == "localized")
@@ -90,11 +82,11 @@ def started(log: Log, job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     return SimulatedTrial(seed, held(result, good, first), claimed, false, doubt, tuple(clock.busy_ms[1:]))
 
 
-def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
+def kidnapping_trial(simulation: SimulationSettings, estimator: str, deadline: float, seed: int) -> SimulatedTrial:
     """A robot that drives from a known start and is then moved to its position a minute later, or the first one after that which
     is 3 m away."""
-    after = 3.0 * job.deadline + HOLD + 1.0
-    log = simulate(lasting(job.simulation, BEFORE + 2.0 * APART + after), seed)
+    after = 3.0 * deadline + HOLD + 1.0
+    log = simulate(lasting(simulation, BEFORE + 2.0 * APART + after), seed)
     assert log.reference is not None
     here = log.reference.at(np.array([BEFORE]))[0]
     later = (log.reference.t >= BEFORE + APART) & (log.reference.t <= BEFORE + 2.0 * APART)
@@ -102,14 +94,14 @@ def kidnapping_trial(job: SimulatedTrialJob, seed: int) -> SimulatedTrial:
     other = float(log.reference.t[np.argmax(away if away.any() else later)])
     before = cut(log, 0.0, BEFORE)
     carried = join(before, cut(log, other, other + after), gap=JUMP)
-    result = run(carried, RunConfig(job.estimator, prior="reference", seed=seed))
+    result = run(carried, RunConfig(estimator, prior="reference", seed=seed))
     stamps = carried.streams["rfid"].t
     first = float(stamps[stamps > max(before.streams["rfid"].t)][0])
     good = is_right(result, carried)
     seconds = held(result, good, first)
     localized = np.array(result.status) == "localized"
-    at_deadline = int(np.searchsorted(result.t, first + job.deadline).clip(max=len(result.t) - 1))
-    late = not seconds <= job.deadline
+    at_deadline = int(np.searchsorted(result.t, first + deadline).clip(max=len(result.t) - 1))
+    late = not seconds <= deadline
     false = late and bool(localized[at_deadline]) and not bool(good[at_deadline])
     return SimulatedTrial(seed, seconds, held(result, good & localized, first), false)
 

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarking.report import Options, Report, share_text
 
 from factorgraph_loc.simulation.settings import preset
-from rfid_benchmark.simulated_trials import Kind, SimulatedTrial, SimulatedTrialJob, run_simulated_trials
+from rfid_benchmark.simulated_trials import Kind, SimulatedTrial, run_simulated_trials
 
 SEEDS = 100
 CHUNK = 10  # trials per process
@@ -25,9 +25,7 @@ def section(options: Options) -> Report:
     seeds = range(FIRST, FIRST + options.count(SEEDS))
     chunks = [tuple(seeds[i : i + CHUNK]) for i in range(0, len(seeds), CHUNK)]
     jobs = {
-        (kind, name, estimator, deadline, chunk[0]): (
-            SimulatedTrialJob(kind, preset(name), chunk, estimator, deadline),
-        )
+        (kind, name, estimator, deadline, chunk[0]): (kind, preset(name), estimator, deadline, chunk)
         for kind, name, deadline in KINDS
         for estimator in ("smoother", "particle_filter")
         for chunk in chunks

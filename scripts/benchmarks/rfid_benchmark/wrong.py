@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from benchmarking.ensemble import EnsembleJob, run_ensemble
+from benchmarking.ensemble import run_ensemble
 from benchmarking.report import Options, Report, ratio_cells
 
 from factorgraph_loc.experiments.run import RunConfig
@@ -54,10 +54,7 @@ def section(options: Options) -> Report:
     report = Report("wrong", options)
     seeds = range(FIRST, FIRST + options.count(SEEDS))
     jobs = {
-        (case.what, knows, seed): (job(case, knows, seed),)
-        for case in CASES
-        for knows in (False, True)
-        for seed in seeds
+        (case.what, knows, seed): job(case, knows, seed) for case in CASES for knows in (False, True) for seed in seeds
     }
     outcomes = report.collect(run_ensemble, jobs)
     rows = []
@@ -80,7 +77,8 @@ def section(options: Options) -> Report:
     return report
 
 
-def job(case: Case, knows: bool, seed: int) -> EnsembleJob:
+def job(case: Case, knows: bool, seed: int) -> tuple[Any, ...]:
+    """The arguments of :func:`~benchmarking.ensemble.run_ensemble`."""
     faults: dict[str, Any] = {"fading": BURSTS} if case.bursts else {}
     if not knows:
         faults["misplaced"] = case.misplaced
@@ -88,7 +86,7 @@ def job(case: Case, knows: bool, seed: int) -> EnsembleJob:
     if case.bursts and knows:
         beam["tempering"] = 1.0 / TOGETHER
     changes = {"drive": {"duration": DURATION}, "faults": faults, "rig": {"rfid": beam}}
-    return EnsembleJob(preset("office", changes), seed, CONFIGS, None if knows else partial(told, given=case.given))
+    return preset("office", changes), seed, CONFIGS, partial(told, given={} if knows else case.given)
 
 
 def told(log: Log, _: int, given: Mapping[str, float]) -> Log:
