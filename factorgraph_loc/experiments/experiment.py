@@ -167,6 +167,8 @@ def run_experiment(
     For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The table is written also after an error or interrupt.
     Raises StoreError if the store cannot be written.
     """
+    from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
+
     if scheduler is not None and jobs is not None:
         raise InputError("--jobs applies to this machine, but --scheduler names a cluster: expected one of them")
     todo = prepared.todo(again=again)
@@ -191,7 +193,8 @@ def run_experiment(
             if states[run.key] not in ("ok", "failed"):
                 states[run.key] = prepared.store.state(run.key, thorough=True)
         finished = [run for run in prepared.runs if states[run.key] in ("ok", "failed")]
-        rows = _write_rows(finished, prepared)
+        rows = collect(finished, prepared.store)
+        write_index(rows, prepared.folder)
     by_run = rows.to_dicts()
     failures = [
         f"{run.shown}: {row['reason']}" for run, row in zip(finished, by_run, strict=True) if row["status"] == "failed"
@@ -209,11 +212,3 @@ def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
             if (seconds := row.get("timing.run_seconds")) is not None and row["duration"] > 0.0:
                 paces.setdefault(row["label"], []).append(seconds / row["duration"])
     return sum(run.duration * median(paces.get(run.label, [1.0 / PACE])) for run in runs)
-
-
-def _write_rows(runs: Sequence[PlannedRun], prepared: Prepared) -> pl.DataFrame:
-    from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
-
-    rows = collect(runs, prepared.store)
-    write_index(rows, prepared.folder)
-    return rows

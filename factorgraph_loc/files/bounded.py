@@ -94,16 +94,12 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 def read_bytes(path: Path, limit: int) -> bytes:
     """The content of a regular file of at most ``limit`` bytes; InputError as in :func:`opened`."""
     with opened(path, limit) as file:
-        parts, count, step = [], 0, os.fstat(file.fileno()).st_size + 1  # read the expected size in one step
         try:
-            while count <= limit and (part := file.read(step)):
-                parts.append(part)
-                count += len(part)
-                step = 2**16  # the file has grown, or its size is unknown, as in /proc
+            content = file.read()
         except OSError as error:
             raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
-    require_size(path, "its size in bytes", count, limit)
-    return b"".join(parts)
+    require_size(path, "its size in bytes", len(content), limit)  # it may have grown
+    return content
 
 
 def copy_file(source: Path, target: Path) -> None:
