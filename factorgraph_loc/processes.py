@@ -105,14 +105,13 @@ def run_each(
     jobs: Sequence[Job],
     workers: int,
     *,
-    lasting: bool = False,
     beat: Callable[[], None] | None = None,
 ) -> Iterator[tuple[int, Value | Exception]]:
     """Call ``function`` on each job in at most ``workers`` processes. Yields (index, value or exception) as jobs finish.
 
-    Each job runs in a process of its own, so a crash affects that job only and peak memory is measured per job; with ``lasting``
-    a process runs several jobs. ``beat`` is called every :data:`BEAT` seconds. Closing the iterator ends the processes. Function,
-    jobs and values must be picklable, and of modules that can be imported.
+    Each job runs in a process of its own, so a crash affects that job only and peak memory is measured per job. ``beat`` is
+    called every :data:`BEAT` seconds. Closing the iterator ends the processes. Function, jobs and values must be picklable, and of
+    modules that can be imported.
     """
     waiting = deque(range(len(jobs)))
     team: list[Worker] = []
@@ -128,7 +127,7 @@ def run_each(
                 if isinstance(answer, ProcessDiedError) and worker.job is None and waiting:  # died before its first job
                     worker.job = waiting.popleft()
                 at, worker.job = worker.job, None
-                if isinstance(answer, ProcessDiedError) or (at is not None and not lasting):
+                if isinstance(answer, ProcessDiedError) or at is not None:
                     team.remove(worker)
                     worker.end()
                 elif waiting:

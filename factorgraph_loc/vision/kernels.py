@@ -1,6 +1,6 @@
 """Compiled loops of the colour features, which avoid numpy's temporary images.
 
-Everything is ``float32``, to halve memory traffic.
+Everything is ``float32``, to halve memory traffic. Threads run the loops in parallel, as these do not use Python objects.
 """
 
 import math
@@ -22,7 +22,7 @@ MAX_SHIFT = 0.7  # px: larger shifts from the largest pixel do not fit the parab
 FAST = {"contract", "reassoc"}
 
 
-@compiled(fastmath=FAST)
+@compiled(nogil=True, fastmath=FAST)
 def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
     """Sum over the channels of the products of first derivatives: ``intensity`` (H, W) and ``colours`` (C, H, W) to ``products``
     (3, H, W): xx, xy, yy.
@@ -48,7 +48,7 @@ def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
                 yy[y, x] += dy * dy
 
 
-@compiled(fastmath=FAST)
+@compiled(nogil=True, fastmath=FAST)
 def corner_strength(products: Float, scale: np.float32, strength: Float) -> None:
     """Half the harmonic mean of the eigenvalues of the second moment matrix, times ``scale``: determinant over trace.
 
@@ -62,7 +62,7 @@ def corner_strength(products: Float, scale: np.float32, strength: Float) -> None
             strength[y, x] = scale * (a * c - b * b) / (a + c + TINY)
 
 
-@compiled
+@compiled(nogil=True)
 def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
     """The largest absolute Laplacian, times ``weight``, at a pixel and its eight neighbours."""
     largest = 0.0
@@ -73,7 +73,7 @@ def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
     return largest * weight
 
 
-@compiled
+@compiled(nogil=True)
 def refined_peaks(
     strength: Float, threshold: float, planes: Float, variances: Array, pixels: Int32, peaks: Array
 ) -> int:
@@ -115,7 +115,7 @@ def refined_peaks(
     return count
 
 
-@compiled
+@compiled(nogil=True)
 def lonely(points: Float, scales: Float, reach: float, alike: float, most: int) -> Truths:
     """Which of the points (N, 2), sorted by descending strength, have no stronger one nearby: the first ones, at ``most`` so many.
 
@@ -137,7 +137,7 @@ def lonely(points: Float, scales: Float, reach: float, alike: float, most: int) 
     return alone
 
 
-@compiled(fastmath=FAST)
+@compiled(nogil=True, fastmath=FAST)
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
     """Bilinear samples of patches around points, each in its own frame and plane.
 
@@ -160,7 +160,7 @@ def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, o
             patches[n, m] = top + fy * (low - top)
 
 
-@compiled
+@compiled(nogil=True)
 def orientation_histograms(patches: Float, side: int, weights: Float, histograms: Float) -> None:
     """Histograms of gradient directions in patches (N, side * side), weighted by gradient magnitude and ``weights`` (side - 2,
     side - 2), linearly distributed over two bins. Added to ``histograms`` (N, bins), bin 0 at direction 0."""

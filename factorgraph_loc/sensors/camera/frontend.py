@@ -7,21 +7,21 @@ images in two logs are computed once.
 import hashlib
 import json
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from importlib import resources
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from factorgraph_loc.errors import InputError, RunFailedError
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.maps.markers import MarkerFamily, corner_names
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.processes import ProcessDiedError, run_each
 from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.feature_cache import FeatureCache, ImageFeatures, cache_folder, decode, encode
@@ -49,8 +49,6 @@ FEATURE_CODE = (
     "weights.npz",
 )
 TRACK_CODE = ("matching.py", "tracks.py")
-PART = 8  # images per task
-FEW = 64  # images below which starting processes takes longer than the work
 
 Size = tuple[int, int]  # width, height
 
@@ -74,7 +72,7 @@ def with_features(
     An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without features.
     ``progress`` is called with the completed share. A log without images is returned unchanged.
 
-    InputError if the rig has no camera, or is calibrated for another size than all images have; RunFailedError if a process dies.
+    InputError if the rig has no camera, or is calibrated for another size than all images have.
     """
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
@@ -132,28 +130,8 @@ def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
 
 def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iterator[bytes | _ImageFile]:
     """The features of each file as bytes, or its fault, in the order of the files."""
-    processes = min(os.cpu_count() or 1, len(files) // FEW)
-    if processes < 2:
-        yield from (_find(file, settings, size) for file in files)
-        return
-    parts = [files[i : i + PART] for i in range(0, len(files), PART)]
-    early: dict[int, list[bytes | _ImageFile]] = {}  # results of tasks that finished out of order
-    due = 0
-    for at, result in run_each(partial(_find_all, settings, size), parts, processes, lasting=True):
-        if isinstance(result, ProcessDiedError):
-            raise RunFailedError("a process died during feature detection")
-        if isinstance(result, Exception):
-            raise result
-        early[at] = result
-        while due in early:
-            yield from early.pop(due)
-            due += 1
-
-
-def _find_all(settings: FrontendSettings, size: Size, files: list[Path]) -> list[bytes | _ImageFile]:
-    """The features of some files; runs in a worker process."""
-    cv2.setNumThreads(1)
-    return [_find(file, settings, size) for file in files]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(lambda file: _find(file, settings, size), files)
 
 
 def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _ImageFile:
@@ -168,10 +146,16 @@ def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _ImageF
     return encode(*_extractor(settings).detectAndCompute(image))
 
 
-@cache
+_thread = threading.local()
+
+
 def _extractor(settings: FrontendSettings) -> Extractor:
-    """The extractor, one per process because it reuses its memory."""
-    return extractor(settings.feature, settings.count, everywhere=settings.everywhere)
+    """The extractor of this thread, which reuses its memory."""
+    if getattr(_thread, "settings", None) != settings:
+        _thread.settings = settings
+        _thread.extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
+    kept: Extractor = _thread.extractor
+    return kept
 
 
 def _nothing(settings: FrontendSettings) -> ImageFeatures:

@@ -158,11 +158,10 @@ def test_the_cache_does_not_grow_without_end(log, cache, monkeypatch):
     assert sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) < 1.1 * size
 
 
-def test_processes_find_the_same(log, monkeypatch):
+def test_threads_find_the_same(log, monkeypatch):
     first, _ = frames(log)
     monkeypatch.setenv("FGLOC_CACHE", str(log.streams["camera"].file[0].parent / "other"))
-    monkeypatch.setattr(frontend, "FEW", 4)
-    monkeypatch.setattr(frontend.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(frontend.os, "cpu_count", lambda: 4)
     shares = []
     found, _ = with_features(log, ORB, shares.append)
     assert all(same(a, b) for a, b in zip(first, found.streams["camera"].frame, strict=True))
