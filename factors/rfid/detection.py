@@ -24,9 +24,6 @@ from factors.rfid.places import Places, RobotTables, antennas_of, in_reach, is_w
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
 
-ROUNDING = 0.02, 0.05, 0.05  # of the parameters of a detection model, and of the others, in tables of places
-KEPT = 3  # such tables, those of the rig among them
-
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
@@ -166,7 +163,6 @@ class RfidLikelihood:
     tags: TagArray
     parameters: Array = field(init=False, repr=False)
     _unadjusted: RfidLikelihood = field(init=False, repr=False)
-    _of_parameters: dict[tuple[float, ...], Places] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", np.zeros(2 * len(self.model.models) + len(self.model.antennas) + 2))
@@ -241,8 +237,8 @@ class RfidLikelihood:
         the velocity of the first.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        if parameters is None and not counts.offsets.any() and is_wide(poses, self.reach):
-            return self._places.log_likelihood(poses, counts.packed, self.model.tempering)
+        if parameters is None and not (self.parameters.any() or counts.offsets.any()) and is_wide(poses, self.reach):
+            return self._unadjusted._places.log_likelihood(poses, counts.packed, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
         return weighing.log_likelihood(*self._tabled, counts.packed, poses, float(self.model.tempering), parameters)
 
@@ -273,20 +269,9 @@ class RfidLikelihood:
         """How many tags are in reach of a pose among them, on average."""
         return in_reach(self.tags.points[:, :2], self._unadjusted.reach)
 
-    @property
+    @cached_property
     def _places(self) -> Places:
-        """Those of the parameters, which are rounded."""
-        steps = np.full(len(self.parameters), ROUNDING[2])
-        steps[: 2 * len(self.model.models)] = np.tile(ROUNDING[:2], len(self.model.models))
-        rounded = np.rint(self.parameters / steps)
-        kept, key = self._unadjusted._of_parameters, tuple(rounded.tolist())
-        if key not in kept:
-            if len(kept) >= KEPT:
-                del kept[next(k for k in kept if any(k))]
-            packed = adjusted(self._unadjusted.packed, steps * rounded)
-            antennas = antennas_of(packed, self._unadjusted._tables)
-            kept[key] = Places.of(antennas, self._unadjusted._map, uses_facing=self.uses_facing)
-        return kept[key]
+        return Places.of(antennas_of(self.packed, self._tables), self._map, uses_facing=self.uses_facing)
 
     @property
     def uses_facing(self) -> bool:

@@ -65,17 +65,6 @@ def test_poses_anywhere_are_as_likely_as_when_looked_at_alone(detection, paramet
     assert np.std(together - exact) < (0.25 if bound < 0.1 else 0.4)
 
 
-def test_tables_of_adjusted_models_are_few():
-    plain, looks, _, anywhere = scene((1.2,))
-    first = plain.log_likelihood(anywhere, looks)
-    for shift in np.linspace(-1.0, 1.0, 9):
-        plain.adjusted(np.array((0.0, shift, *plain.parameters[2:]))).log_likelihood(anywhere, looks)
-    assert len(plain._of_parameters) == 3
-    tables = plain._places
-    np.testing.assert_array_equal(plain.log_likelihood(anywhere, looks), first)
-    assert plain._places is tables
-
-
 def test_what_is_out_of_reach_tells_what_silence_and_false_reads_tell():
     likelihood, looks, near, _ = scene((1.2,))
     away = np.concatenate((near, near + np.array((500.0, 0.0, 0.0))))

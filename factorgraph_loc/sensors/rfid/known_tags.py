@@ -138,14 +138,12 @@ class KnownTags:
         self._rounds = {}
         return self.antennas[antenna]
 
-    def temper(self, tempering: float) -> bool:
-        """Use this exponent of the likelihood where it is less than that of the rig; whether it is another one."""
+    def temper(self, tempering: float) -> None:
+        """Use this exponent of the likelihood where it is less than that of the rig."""
         assert self.likelihood is not None
         new = min(self._tempering, tempering) * self.trust
-        if new == self.likelihood.model.tempering:
-            return False
-        self.likelihood = self.likelihood.tempered(new)
-        return True
+        if new != self.likelihood.model.tempering:
+            self.likelihood = self.likelihood.tempered(new)
 
     def looks(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
         """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time, with the robot's

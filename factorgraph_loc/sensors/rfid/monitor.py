@@ -17,7 +17,6 @@ DURATION = 5.0  # s of scans that are tested jointly
 KEPT = 60.0  # s
 SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; thresholds at which a suspicion begins and ends
 SCANS = 4  # minimum number
-CHANGED = 0.05  # of a parameter of a detection model
 BLOCK, POSSIBLE = 10.0, 0.01  # s of counting; least probability of a counted read
 INDEPENDENT = 1.5  # largest ratio of variances of independent reads
 PRIOR = 50.0  # variance of independent reads that is believed beforehand
@@ -169,31 +168,6 @@ def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
     return squares, variances
 
 
-class SettledParameters:
-    """The estimated parameters (P,) of detection models some seconds ago, because a wrong track spoils them before it is
-    detected. They are constant until they have changed clearly, as each value needs tables of its own in a search."""
-
-    def __init__(self, count: int) -> None:
-        self._waiting: deque[tuple[float, Array]] = deque()
-        self.values: Array = np.zeros(count)  # as in the rig
-
-    def add(self, t: float, estimated: Array) -> bool:
-        """Add an estimate of the time ``t`` [s], later ones are discarded; whether the parameters changed."""
-        self.forget(t)
-        self._waiting.append((t, estimated))
-        changed = False
-        while self._waiting[0][0] < t - DURATION:
-            _, settled = self._waiting.popleft()
-            if np.max(np.abs(settled - self.values), initial=0.0) > CHANGED:
-                self.values, changed = settled, True
-        return changed
-
-    def forget(self, since: float) -> None:
-        """Forget the estimates from the time ``since`` on."""
-        while self._waiting and self._waiting[-1][0] >= since:
-            self._waiting.pop()
-
-
 BAND, BANDS = 1.0, 50  # m of distance, and how many bands; the last one has no end
 FEWEST = 30.0  # least predicted reads of a reported group
 SHOWN = 4  # groups that are named
@@ -244,8 +218,6 @@ class ConsistencyMonitor:
     The bands of distance and the antennas have a chi-square each, where ``together`` rounds count as one; groups with
     few predicted reads are merged, far bands with nearer ones: there are the reads if a range is too short. The model is
     doubted while one of them is beyond chance, and more than :data:`DIFFERENT` of the predicted reads are missing or too many.
-    That may come of a wrong pose: ``suspicious_since`` is the time [s] since which they were not as by chance; None without doubts,
-    and once the pose is accepted.
     """
 
     EVENT = "reads are not as the detection models predict"
@@ -253,9 +225,7 @@ class ConsistencyMonitor:
     def __init__(self, antennas: Sequence[str]) -> None:
         self._groups = ReadGroups(antennas)
         self._last = -math.inf
-        self._odd_since: float | None = None
         self.doubted = False
-        self.suspicious_since: float | None = None
 
     def add(
         self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], together: float
@@ -270,13 +240,7 @@ class ConsistencyMonitor:
         _add(self._groups.sums, measured.antennas, measured.rounds, reads.hits, reads.p, reads.distance, counts)
         by_distance, by_antenna = self._chance(slice(0, BANDS), together), self._chance(slice(BANDS, None), together)
         chance = min(by_distance, by_antenna)
-        if chance >= TRUSTED:
-            self._odd_since = None
-        elif self._odd_since is None:
-            self._odd_since = t
-        was_doubted, self.doubted = self.doubted, chance < (TRUSTED if self.doubted else DOUBTED)
-        if self.doubted != was_doubted:
-            self.suspicious_since = self._odd_since if self.doubted else None
+        self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
 
     def _chance(self, groups: slice, together: float) -> float:
         """The probability of counts that are so far off with a right model; 1 if they are not off by much."""
@@ -299,15 +263,10 @@ class ConsistencyMonitor:
         observed, predicted, _ = self._groups.sums[:, BANDS:]
         return np.flatnonzero((predicted > MANY * together) & (observed < NEARLY_NONE * predicted)).tolist()
 
-    def accept(self) -> None:
-        """Accept the pose: the model is wrong instead."""
-        self.suspicious_since = None
-
     def clear(self) -> None:
         """Forget everything: the track was wrong, or the model changes."""
         self._groups.sums[:] = 0.0
-        self.doubted, self._odd_since = False, None
-        self.accept()
+        self.doubted = False
 
 
 @compiled

@@ -22,7 +22,6 @@ from factorgraph_loc.sensors.rfid.monitor import (
     BurstMonitor,
     ConsistencyMonitor,
     ScanMonitor,
-    SettledParameters,
     SilenceMonitor,
 )
 from factorgraph_loc.sensors.rfid.stream import RfidScan
@@ -49,9 +48,6 @@ class TagObservation:
     rounds: int = 0  # antenna rounds, for reads and misses
     blocks: tuple[str, ...] = ()
     told: TagEvidence | None = None  # of the states of tags
-    settled: RfidLikelihood | None = (
-        None  # with the detection models for a search, where these are not as in the factor
-    )
     iterations: ClassVar[int] = ITERATIONS
 
     @property
@@ -70,11 +66,13 @@ class TagObservation:
         return frozenset(reads.read_tags.tolist()) if isinstance(reads, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
-        """The reads and misses at their own time; None for strength and phase, whose likelihoods are multimodal."""
-        if self.here is None:
+        """The reads and misses at their own time, with the models of the rig, because a wrong track spoils what is learnt of them;
+        None for strength and phase, whose likelihoods are multimodal."""
+        likelihood = self.factor.likelihood
+        if self.here is None or not isinstance(likelihood, RfidLikelihood):
             return None
-        likelihood = self.factor.likelihood if self.settled is None else self.settled
-        return replace(self, factor=replace(self.factor, likelihood=likelihood, reads=self.here))
+        of_rig = likelihood.adjusted(np.zeros_like(likelihood.parameters))
+        return replace(self, factor=replace(self.factor, likelihood=of_rig, reads=self.here))
 
     @property
     def terms(self) -> tuple[Term, ...]:
@@ -141,8 +139,6 @@ class TagSensor(Sensor):
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
         self._bursts = BurstMonitor(len(self.tags.antennas), len(self.tags.map.names))
         self._consistency = ConsistencyMonitor(self.tags.antennas)
-        self._settled = SettledParameters(0 if self.tags.likelihood is None else len(self.tags.likelihood.parameters))
-        self._for_search = self.tags.likelihood
         self._heard = -math.inf  # last scan that was checked for silence
         self._confirmed = -math.inf  # time [s] after which a new track is accepted and models are learnt
 
@@ -154,15 +150,11 @@ class TagSensor(Sensor):
             return
         relative = counts if view.offset is None else counts.moved(view.offset.delta)
         evidence = None
-        if view.localized:
-            estimated = self._estimated(view)
-            if view.newest and self.suspicious_since is None and self._settled.add(m.t, estimated):
-                self._for_search = likelihood.adjusted(self._settled.values)
-            if np.trace(view.covariance[:2, :2]) < PLACED**2:
-                evidence = self.tags.told(relative, view.pose, view.covariance, estimated)
-                counts = self.tags.with_states(counts, evidence)
-                relative = counts if view.offset is None else counts.moved(view.offset.delta)
-        observation = replace(self._detection(m, relative, counts), told=evidence, settled=self._for_search)
+        if view.localized and np.trace(view.covariance[:2, :2]) < PLACED**2:
+            evidence = self.tags.told(relative, view.pose, view.covariance, self._estimated(view))
+            counts = self.tags.with_states(counts, evidence)
+            relative = counts if view.offset is None else counts.moved(view.offset.delta)
+        observation = replace(self._detection(m, relative, counts), told=evidence)
         yield observation if not view.localized or self._learns(m.t) else observation.on_pose(self._values(view), {})
         if self._silence.lasts and view.newest:
             return
@@ -212,8 +204,7 @@ class TagSensor(Sensor):
         reads = self.tags.likelihood.expected(view.pose, looks, self._estimated(view))
         surveyed = states.odds[reads.tags] <= 0.0
         self._bursts.add(t, looks, reads, surveyed)
-        if self.tags.temper(1.0 / self._bursts.together):
-            self._for_search = self.tags.likelihood.adjusted(self._settled.values)
+        self.tags.temper(1.0 / self._bursts.together)
         if np.trace(view.covariance[:2, :2]) < KNOWN**2:
             # not without those that are believed to have moved: with a wrong model most tags seem to
             counts = (reads.p > POSSIBLE) & (surveyed | states.were_read(reads.tags))
@@ -259,10 +250,7 @@ class TagSensor(Sensor):
 
     @property
     def suspicious_since(self) -> float | None:
-        scans, counts = self._monitor.suspicious_since, self._consistency.suspicious_since
-        if scans is None or counts is None:
-            return counts if scans is None else scans
-        return min(scans, counts)
+        return self._monitor.suspicious_since
 
     @property
     def silent(self) -> bool:
@@ -274,7 +262,6 @@ class TagSensor(Sensor):
 
     def accept(self) -> None:
         self._monitor.accept()
-        self._consistency.accept()
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
         """Merge all reads and misses into one factor."""
@@ -306,11 +293,9 @@ class TagSensor(Sensor):
 
     def rewind(self, t: float) -> None:
         self.tags.forget(math.nextafter(t, math.inf))
-        self._settled.forget(math.nextafter(t, math.inf))
 
     def restart(self, t: float) -> None:
         self._confirmed = max(t, self._heard) + DURATION
-        self._settled.forget(t)
         self._monitor.clear()
         self._bursts.clear()
         self._consistency.clear()

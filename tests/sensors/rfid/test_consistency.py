@@ -55,24 +55,6 @@ def test_what_is_wrong_is_doubted_and_named_until_it_is_right_again(share, named
     assert not later[120:].any()
 
 
-def test_doubts_are_a_suspicion_of_the_pose_until_it_is_accepted():
-    one = monitor()
-    scans(one, 1, 40, RIGHT)
-    assert one.suspicious_since is None
-    found = scans(one, 2, 40, 0.5 * RIGHT, begin=20.0)
-    began = 20.0 + STEP * int(np.argmax(found))
-    assert found.any()
-    assert 20.0 <= one.suspicious_since <= began
-    one.accept()
-    scans(one, 3, 10, 0.5 * RIGHT, begin=40.0)
-    assert one.doubted
-    assert one.suspicious_since is None
-    scans(one, 4, 200, RIGHT, begin=45.0)
-    assert not one.doubted
-    scans(one, 5, 40, 0.5 * RIGHT, begin=145.0)
-    assert one.suspicious_since >= 145.0
-
-
 def test_reads_from_where_hardly_any_are_predicted():
     """Far tags are read that should not be, and so few of the others that no band and no antenna has 30 predicted reads."""
     few = 0.05 * RIGHT

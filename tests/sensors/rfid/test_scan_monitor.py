@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from factorgraph_loc.sensors.rfid.monitor import ScanMonitor, SettledParameters
+from factorgraph_loc.sensors.rfid.monitor import ScanMonitor
 
 VARIANCE = 4.0
 
@@ -59,15 +59,3 @@ def test_scans_without_variance_are_no_suspicion():
     for i in range(20):
         monitor.add(0.5 * i, 0.0, 0.0)
     assert monitor.suspicious_since is None
-
-
-def test_parameters_settle_seconds_later_and_change_clearly_or_not_at_all():
-    settled = SettledParameters(2)
-    for t in range(20):
-        value = np.array((0.0, -0.5 if t < 10 else -1.5))  # what a wrong track does to them
-        assert settled.add(float(t), value) == (t in (6, 16))
-        assert settled.values[-1] == (0.0 if t < 6 else -0.5 if t < 16 else -1.5)
-    assert not settled.add(20.0, np.array((0.0, -1.54)))
-    settled.forget(5.0)
-    assert not settled.add(25.0, np.array((1.0, 1.0)))
-    assert settled.values[-1] == -1.5
