@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drives import driven
 
 from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World, YawRateStream
 from factorgraph_loc.evaluation.inspect import inspect
@@ -23,9 +24,7 @@ def log():
     t = np.arange(0.0, 120.0, 0.05)
     v = np.where(t % 20.0 < 14.0, 0.4 + 0.1 * np.sin(t), 0.0)
     w = 0.4 * np.sin(0.7 * t) * (v > 0.0)
-    poses = np.zeros((len(t), 3))
-    for i in range(1, len(t)):
-        poses[i] = se2.compose(poses[i - 1], se2.exp(0.05 * np.array((v[i - 1], 0.0, w[i - 1]))))
+    poses = driven(se2.exp(0.05 * np.column_stack((v, 0.0 * v, w))[:-1]))
     seen = np.repeat(np.arange(0, len(t), 5), len(PLACES))
     marks = np.tile(list(PLACES.values()), (len(seen) // len(PLACES), 1))
     ranges, bearings = bearing_range.predict(SETTINGS.model(), poses[seen], marks)

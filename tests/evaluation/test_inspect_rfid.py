@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from by_hand import reads
 
 from factorgraph_loc import Log, RfidStream, Rig, Tag, VelocityStream, World
 from factorgraph_loc.evaluation.inspect import inspect
@@ -16,17 +17,12 @@ ANTENNAS = ("left", "right")
 
 def make_log(**changes) -> Log:
     """A minute with two rounds per second of two antennas that end together; left reads A and B, right nothing in every other."""
-    t, number, antenna, epc = [], [], [], []
-    for k in range(120):
-        for a, name in enumerate(ANTENNAS):
-            tags = ("A", "B") if name == "left" else (("A",) if k % 2 == 0 else ("",))
-            for tag in tags:
-                t.append(0.5 * k)
-                number.append(a)
-                antenna.append(name)
-                epc.append(tag)
-    nothing = np.full(len(t), np.nan)
-    stream = RfidStream(np.array(t), np.array(number), antenna, epc, np.zeros(len(t)), nothing, nothing, nothing)
+    rows = [
+        (0.5 * k, a, name, tag, 0.0)
+        for k in range(120)
+        for a, name in enumerate(ANTENNAS)
+        for tag in ("AB" if name == "left" else ("" if k % 2 else "A",))
+    ]
     wheels = np.arange(600) * 0.1
     settings = RfidSettings(antennas={name: AntennaSettings() for name in ANTENNAS})
     return Log(
@@ -35,7 +31,7 @@ def make_log(**changes) -> Log:
         world=World(tags={name: Tag(x=0.0, y=0.0) for name in "AB"}),
         streams={
             "odometry": VelocityStream(wheels, wheels, wheels),
-            "rfid": dataclasses.replace(stream, **changes),
+            "rfid": dataclasses.replace(reads(*rows), **changes),
         },
     )
 

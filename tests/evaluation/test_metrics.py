@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drives import driven
 from evo.core import metrics as evo
 from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
@@ -26,11 +27,9 @@ def drive(n=600, dt=0.1, speed=0.4):
     rng = np.random.default_rng(1)
     t = np.arange(n) * dt
     twists = np.stack((np.full(n, speed * dt), np.zeros(n), 0.04 * np.sin(t / 7.0)), axis=1)
-    truth, estimate = [np.array((1.0, 2.0, 3.0))], [np.array((1.02, 1.97, 3.05))]
-    for twist in twists[1:]:
-        truth.append(se2.compose(truth[-1], se2.exp(twist)))
-        estimate.append(se2.compose(estimate[-1], se2.exp(twist + 0.005 * rng.standard_normal(3))))
-    return t, np.array(truth), np.array(estimate)
+    off = 0.005 * rng.standard_normal((n - 1, 3))
+    truth = driven(se2.exp(twists[1:]), (1.0, 2.0, 3.0))
+    return t, truth, driven(se2.exp(twists[1:] + off), (1.02, 1.97, 3.05))
 
 
 def result_of(t, poses, status, diagnostics=NOTHING, learnt=NOTHING_LEARNT, config=NO_CONFIG):

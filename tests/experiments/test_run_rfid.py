@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import reads
 
-from factorgraph_loc import InputError, RfidStream, Tag
+from factorgraph_loc import InputError, Tag
 from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.registry import settings_of
@@ -19,17 +20,7 @@ ALL = ("odometry", "rfid", "rssi", "phase")
 @pytest.fixture
 def reading(log):
     """The short log with reads of tag a and of an unknown one; RSSI is known of the first read, phase of none."""
-    nothing = np.full(2, np.nan)
-    stream = RfidStream(
-        np.array((0.5, 1.0)),
-        np.arange(2),
-        ["1", "1"],
-        ["a", "x"],
-        np.zeros(2),
-        np.array((-60.0, np.nan)),
-        nothing,
-        nothing,
-    )
+    stream = replace(reads((0.5, 0, "1", "a", 0.0), (1.0, 1, "1", "x", 0.0)), rssi=np.array((-60.0, np.nan)))
     world = log.world.model_copy(update={"tags": {name: Tag(x=1.0, y=1.0) for name in ("a", "b", "c")}})
     return replace(log, streams=dict(log.streams) | {"rfid": stream}, world=world)
 

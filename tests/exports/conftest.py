@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import polars as pl
 import pytest
+from by_hand import reads
+from drives import driven
 
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -18,7 +20,6 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.rfid.map import Tag
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2
 
 T0_NS = 1_700_000_000_000_000_000
@@ -30,9 +31,7 @@ def log(tmp_path_factory):
     """A robot on an arc for 6 s; it sees two landmarks, reads two tags, one at 1.0 s, and takes three images."""
     t = np.arange(STEPS + 1) * 0.1
     steps = np.tile((0.05, 0.0, 0.01), (STEPS, 1))
-    poses = np.zeros((STEPS + 1, 3))
-    for i, step in enumerate(steps):
-        poses[i + 1] = se2.compose(poses[i], step)
+    poses = driven(steps)
     marks = {"door": (2.0, 1.0), "post": (1.0, -2.0)}
     rows = [(i, name) for i in range(5, STEPS, 10) for name in marks]
     local = np.array([se2.transform_to(poses[i], np.array(marks[name])) for i, name in rows])
@@ -42,10 +41,8 @@ def log(tmp_path_factory):
         np.hypot(*local.T),
         np.arctan2(local[:, 1], local[:, 0]),
     )
-    reads = [(1.0, "A", 0.0), (2.0, "A", 0.2), (2.0, "B", 0.0), (3.0, "", 0.0)]
-    stamps, epcs, ages = (list(column) for column in zip(*reads, strict=True))
-    none = np.full(len(reads), np.nan)
-    rfid = RfidStream(np.array(stamps), np.array((0, 0, 0, 0)), ["1"] * 4, epcs, np.array(ages), none, none, none)
+    read = [(1.0, "A", 0.0), (2.0, "A", 0.2), (2.0, "B", 0.0), (3.0, "", 0.0)]
+    rfid = reads(*((stamp, 0, "1", epc, age) for stamp, epc, age in read))
     folder = tmp_path_factory.mktemp("pictures")
     files = [folder / f"{i}.png" for i in range(3)]
     for i, file in enumerate(files):

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.fusion.graph.solver import unaware
-from factors import se2
-from factors.graph import constants_key, frame_motions, is_place, landmark_key, point_key, pose_key, retract
+from factors.graph import constants_key, frame_motions, is_place, landmark_key, point_key, pose_key
 
 VALUES = {
     pose_key(3): np.array((4.0, -2.0, 2.1)),
@@ -11,19 +10,6 @@ VALUES = {
     point_key(5): np.array((-1.0, 6.0, 0.8)),
     landmark_key(1): np.array((7.0, 3.0)),
 }
-
-
-@pytest.mark.parametrize("column", range(3))
-def test_places_move_with_the_frame(column):
-    step, (motions, ends) = 1e-6 * np.eye(3)[column], frame_motions(VALUES)
-    for (key, value), part in zip(VALUES.items(), np.split(motions[:, column], ends[:-1]), strict=True):
-        there = retract(key, value, 1e-6 * part)
-        expected = value.copy()
-        if key != constants_key(0):
-            expected[:2] = se2.transform_from(step, value[:2])
-        if key == pose_key(3):
-            expected[2] += step[2]
-        assert np.allclose(there, expected, rtol=0.0, atol=1e-11)
 
 
 @pytest.mark.parametrize("away", [0.0, 1e6], ids=["near the origin", "far from the origin"])

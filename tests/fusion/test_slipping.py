@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from drives import driven
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
@@ -19,10 +20,7 @@ def drive(*, slips=False, blocked=False):
     t = np.arange(0.0, 25.0, STEP)
     stands = slips & (t >= BEGIN) & (t < END)
     moves = np.where(stands[:, None], 0.0, (SPEED * STEP, 0.0, 0.2 * STEP))
-    poses = [np.array((4.0, 2.0, 0.3))]
-    for move in moves[:-1]:
-        poses.append(se2.compose(poses[-1], se2.exp(move)))
-    poses, seen = np.array(poses), np.arange(0, len(t), 2)
+    poses, seen = driven(se2.exp(moves[:-1]), (4.0, 2.0, 0.3)), np.arange(0, len(t), 2)
     names = [list(ANCHORS)[i % len(ANCHORS)] for i in range(len(seen))]
     ranges = np.hypot(*(poses[seen, :2] - [ANCHORS[name] for name in names]).T) + rng.normal(0.0, SIGMA, len(seen))
     if blocked:

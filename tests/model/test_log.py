@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import reads
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.native.world_file import read_world
@@ -26,7 +27,6 @@ from factorgraph_loc.sensors.odometry.measurement import (
     YawRate,
     YawRateStream,
 )
-from factorgraph_loc.sensors.rfid.stream import RfidStream
 
 
 def column(*values):
@@ -152,13 +152,6 @@ def test_a_kidnapped_robot_keeps_its_velocity_and_feels_no_increment():
     log = drive("velocity")
     odometry = join(cut(log, 0.0, 5.0), cut(log, 2.0, 4.0)).streams["odometry"]
     assert (odometry.v == 1.0).all()
-
-
-def reads(*rows):
-    """Rows of (t, round, antenna, EPC, age); RSSI and the like unknown."""
-    t, number, antenna, epc, age = zip(*rows, strict=True)
-    nothing = np.full(len(t), np.nan)
-    return RfidStream(column(*t), np.array(number), antenna, epc, column(*age), nothing, nothing, nothing)
 
 
 READS = reads(

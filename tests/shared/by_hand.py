@@ -1,10 +1,10 @@
-"""What tests need to feed an estimator by hand: one for a rig and a map, a localizer that has begun, and scans of tags."""
+"""What tests need to feed an estimator by hand: one for a rig and a map, a localizer that has begun, and reads of tags."""
 
 import math
 
 import numpy as np
 
-from factorgraph_loc import Localizer, RfidScan
+from factorgraph_loc import Localizer, RfidScan, RfidStream
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.fusion.registry import create, settings_of
 from factorgraph_loc.model.setup import Setup
@@ -32,3 +32,12 @@ def scan(t, *tags, antennas=("ahead",), ages=0.0, rssi=np.nan, phase=np.nan, fre
     """A scan of which the first antenna read all ``tags``."""
     full, none = np.ones(len(tags)), np.zeros(len(tags), np.int64)
     return RfidScan(t, antennas, none, tags, ages * full, rssi * full, phase * full, frequency * full)
+
+
+def reads(*rows):
+    """Rows of (t, round, antenna, EPC, age); RSSI and the like unknown."""
+    t, number, antenna, epc, age = zip(*rows, strict=True)
+    nothing = np.full(len(t), np.nan)
+    return RfidStream(
+        np.array(t), np.array(number), list(antenna), list(epc), np.array(age, float), nothing, nothing, nothing
+    )

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from drives import driven, slipped
 
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log
@@ -14,7 +15,6 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factorgraph_loc.vision.frame import CameraFrame
-from factors import se2
 from factors.camera import model as reprojection
 
 ODOMETRY_STEP = 0.05  # s
@@ -54,16 +54,8 @@ def drive(seconds, rng, speeds=circle):
     """The robot slips off what the wheels report by the noise of the rig."""
     t = np.arange(round(seconds / ODOMETRY_STEP) + 1) * ODOMETRY_STEP
     v, w = speeds(t)
-    reported = se2.exp(np.column_stack((v, 0.0 * v, w)) * ODOMETRY_STEP)
-    growth = [g.model() for g in (NOISE.along, NOISE.lateral, NOISE.heading)]
-    ways, turns = np.abs(v) * ODOMETRY_STEP, np.abs(w) * ODOMETRY_STEP
-    sigma = np.sqrt([[g.variance(d, r, ODOMETRY_STEP) for g in growth] for d, r in zip(ways, turns, strict=True)])
-    steps = se2.compose(reported, se2.exp(rng.standard_normal((len(t), 3)) * sigma))
-    poses = np.zeros((len(t), 3))
-    poses[0] = (1.0, -1.0, 0.0)
-    for i in range(1, len(t)):
-        poses[i] = se2.compose(poses[i - 1], steps[i - 1])
-    return VelocityStream(t, v, w), Trajectory(t, poses)
+    moves = slipped(v, w, ODOMETRY_STEP, NOISE, rng)[:-1]
+    return VelocityStream(t, v, w), Trajectory(t, driven(moves, (1.0, -1.0, 0.0)))
 
 
 def sightings(truth, points, t, rng, camera=CAMERA, limit=20):

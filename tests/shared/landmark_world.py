@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from drives import driven, slipped
 
 from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
 from factorgraph_loc.model.log import cut, join
@@ -68,18 +69,7 @@ def simulate(seed=1, seconds=60.0, rate=4.0, speeds=_loop) -> Log:
     rng = np.random.default_rng(seed)
     t = np.arange(round(seconds / ODOMETRY_STEP) + 1) * ODOMETRY_STEP
     v, w = speeds(t)
-    reported = se2.exp(np.column_stack((v, 0.0 * v, w)) * ODOMETRY_STEP)
-    noise = RIG.odometry.noise
-    distance, rotation = np.abs(v) * ODOMETRY_STEP, np.abs(w) * ODOMETRY_STEP
-    variance = [
-        [g.model().variance(d, r, ODOMETRY_STEP) for g in (noise.along, noise.lateral, noise.heading)]
-        for d, r in zip(distance, rotation, strict=True)
-    ]
-    steps = se2.compose(reported, se2.exp(rng.standard_normal((len(t), 3)) * np.sqrt(variance)))
-    poses = np.zeros((len(t), 3))
-    for i in range(1, len(t)):
-        poses[i] = se2.compose(poses[i - 1], steps[i - 1])
-    truth = Trajectory(t, poses)
+    truth = Trajectory(t, driven(slipped(v, w, ODOMETRY_STEP, RIG.odometry.noise, rng)[:-1]))
     return Log(
         name="simulated",
         rig=RIG,
@@ -105,12 +95,12 @@ def _sightings(truth, t, rng):
     )
 
 
-def miscalibrated(log, truth, *, depth=False, seed=0):
+def miscalibrated(log, truth, *, depth=False):
     """The log of a robot whose constants differ by ``truth`` from those of its rig.
 
     A sensor of depths sees 60 degrees to each side.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     odometry = log.streams["odometry"]
     v = odometry.v / (1.0 + truth.get("scale_distance", 0.0))
     w = odometry.w + truth.get("heading_rate_bias", 0.0)

@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from by_hand import reads
+from drives import driven
 
-from factorgraph_loc import IncrementStream, Log, RfidStream, Rig, Tag, Trajectory, World
+from factorgraph_loc import IncrementStream, Log, Rig, Tag, Trajectory, World
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray
@@ -32,9 +34,7 @@ def read_tags() -> Callable[..., Log]:
         rng = np.random.default_rng(seed)
         t = np.arange(round(seconds / 0.1)) * 0.1
         speed, turn = 0.5, 0.25 * np.sin(0.11 * t) + 0.25
-        poses = np.zeros((len(t), 3))
-        for i in range(1, len(t)):
-            poses[i] = se2.compose(poses[i - 1], se2.exp(np.array((speed, 0.0, turn[i])) * 0.1))
+        poses = driven(se2.exp(np.column_stack((np.full(len(t), speed), 0.0 * t, turn))[1:] * 0.1))
         middle, spread = np.mean(poses[:, :2], axis=0), np.ptp(poses[:, :2], axis=0) / 2.0 + 1.5
         places = np.column_stack(
             (middle + rng.uniform(-spread, spread, (30, 2)), 1.0 + height * rng.uniform(-1, 1, 30))
@@ -48,16 +48,7 @@ def read_tags() -> Callable[..., Log]:
         rows = []
         for k, (stamp, pose) in enumerate(zip(rounds, truth.at(rounds), strict=True)):
             read = np.flatnonzero(rng.random(30) < likelihood.probabilities(pose[None], k % 2)[0])
-            rows += [(stamp, k, names[k % 2], f"tag{i}") for i in read] or [(stamp, k, names[k % 2], "")]
-        nothing = np.full(len(rows), np.nan)
-        stream = RfidStream(
-            np.array([row[0] for row in rows]),
-            np.array([row[1] for row in rows]),
-            [row[2] for row in rows],
-            [row[3] for row in rows],
-            np.zeros(len(rows)),
-            *(nothing,) * 3,
-        )
+            rows += [(stamp, k, names[k % 2], name, 0.0) for name in [f"tag{i}" for i in read] or [""]]
         surveyed = se2.transform_to(survey.transform(), places[:, :2])
         angle = rng.uniform(-np.pi, np.pi, misplaced)
         surveyed[:misplaced] += np.column_stack((np.cos(angle), np.sin(angle)))
@@ -68,6 +59,6 @@ def read_tags() -> Callable[..., Log]:
         motion = se2.between(poses[:-1], poses[1:]) + rng.normal(0.0, (0.002, 0.001, 0.003), (len(t) - 1, 3))
         odometry = IncrementStream(t, *np.vstack((np.zeros(3), motion)).T)
         rig = Rig(name="reader", sensors=("odometry", "rfid"), rfid=RfidSettings(antennas=ANTENNAS))
-        return Log(f"reads-{seed}", rig, World(tags=tags), {"odometry": odometry, "rfid": stream}, truth)
+        return Log(f"reads-{seed}", rig, World(tags=tags), {"odometry": odometry, "rfid": reads(*rows)}, truth)
 
     return make

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from drives import driven
 
 from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
@@ -62,10 +63,7 @@ def simulate() -> Callable[..., Log]:
             np.column_stack((moved_v * np.cos(robot.direction), moved_v * np.sin(robot.direction), moved_w)) * STEP
             + noise
         )
-        poses = np.zeros((len(t), 3))
-        for i in range(1, len(t)):
-            poses[i] = se2.compose(poses[i - 1], se2.exp(twists[i - 1]))
-        truth = Trajectory(t, poses)
+        truth = Trajectory(t, driven(se2.exp(twists[:-1])))
         odometry = VelocityStream(t, v / robot.scale_distance + robot.speed_bias, w / robot.scale_rotation)
         streams = {"odometry": odometry, "bearing_range": _sightings(truth, robot, rng)}
         return Log(f"simulated-{seed}", UNKNOWING, WORLD, streams, truth)

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from drives import driven
 from mapped_hall import HEAD, VELOCITIES
 from refusal import refusal
 
@@ -119,9 +120,7 @@ def hall(tmp_path_factory):
     rows = [f'"tag36h11-{k}" = {{ {", ".join(f"{key} = {v}" for key, v in m)} }}\n' for k, m in MARKERS.items()]
     (folder / "hall.world.toml").write_text("[markers]\n" + "".join(rows))
     (folder / "hall.toml").write_text(MANIFEST)
-    poses = [np.zeros(3)]
-    for _ in range(20):
-        poses.append(se2.compose(poses[-1], se2.exp(STEP)))
+    poses = driven(np.tile(se2.exp(STEP), (20, 1)))
     t = np.arange(len(poses)) / 10.0
     (run / "truth.csv").write_text(
         "t,x,y,heading\n" + "".join(f"{a},{x},{y},{h}\n" for a, (x, y, h) in zip(t, poses, strict=True))

@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from camera_world import CAMERA, RIG, room, sightings, weave, with_sightings
+from drives import driven
 
 from factorgraph_loc import Log, Trajectory, VelocityStream, World
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -29,10 +30,7 @@ def drive(seed, speeds=weave, seconds=SECONDS):
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, STEP)
     v, w = speeds(t)
-    poses = [np.array((1.0, -1.0, 0.0))]
-    for step in se2.exp(np.column_stack((v, 0.0 * v, w))[:-1] * STEP):
-        poses.append(se2.compose(poses[-1], step))
-    truth = Trajectory(t, np.array(poses))
+    truth = Trajectory(t, driven(se2.exp(np.column_stack((v, 0.0 * v, w))[:-1] * STEP), (1.0, -1.0, 0.0)))
     seen = sightings(truth, POINTS, np.arange(0.5, seconds - 0.5, 0.2), rng, RIGHT_LENS, limit=60)
     v, w = np.array((v, w)) + NOISE[:, None] * rng.standard_normal((2, len(t)))
     return Log("room", RIG, World(), {"odometry": VelocityStream(t, v, w), "sightings": seen}, truth)

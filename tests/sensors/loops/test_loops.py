@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drives import driven
 from mapped_hall import VELOCITIES, write_mapped
 
 from factorgraph_loc.errors import InputError
@@ -34,10 +35,8 @@ def drive(with_pose=False):
     w = np.pi / 2.0 / quarter
     one_side = [(SPEED, 0.0)] * round(SIDE / SPEED / STEP) + [(0.0, w)] * round(quarter / STEP)
     speeds = np.array(one_side * 4 * ROUNDS)
-    poses = [np.zeros(3)]
-    for v, turn in speeds:
-        poses.append(se2.compose(poses[-1], se2.exp(STEP * np.array((v, 0.0, turn)))))
-    t, truth = STEP * np.arange(len(poses)), np.array(poses)
+    truth = driven(se2.exp(STEP * np.insert(speeds, 1, 0.0, axis=1)))
+    t = STEP * np.arange(len(truth))
     measured = speeds + rng.normal(size=speeds.shape) * (0.01 / np.sqrt(STEP))
     measured = np.vstack((measured, np.zeros(2)))
     lap = len(one_side) * 4
