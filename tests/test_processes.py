@@ -55,13 +55,11 @@ def test_a_job_that_fails_or_dies_takes_nothing_with_it(monkeypatch):
     assert outcomes[3] == "1"
 
 
-def test_each_job_has_a_process_of_its_own_unless_they_last():
+def test_each_job_has_a_process_of_its_own():
     jobs = ["__import__('os').getpid()"] * 4
-    assert len(dict(run_each(eval, jobs, workers=2)).values()) == 4
     assert len(set(dict(run_each(eval, jobs, workers=2)).values())) == 4
-    assert len(set(dict(run_each(eval, jobs, workers=1, lasting=True)).values())) == 1
     dying = ["__import__('os')._exit(3)", "1"]
-    outcomes = dict(run_each(eval, dying, workers=1, lasting=True))
+    outcomes = dict(run_each(eval, dying, workers=1))
     assert isinstance(outcomes[0], ProcessDiedError)
     assert outcomes[1] == 1
 
