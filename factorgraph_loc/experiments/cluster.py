@@ -21,8 +21,9 @@ from uuid import uuid4
 from factorgraph_loc.errors import FglocError, InputError, RunFailedError
 from factorgraph_loc.experiments.execute import Executor, Files, Planned, Take, compute, failure
 from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions
-from factorgraph_loc.experiments.log_source import GivenSource, LogSource, SimulatedSource
+from factorgraph_loc.experiments.log_source import RecordedSource
 from factorgraph_loc.experiments.plan import PlannedRun
+from factorgraph_loc.files.data_root import DATA_ROOT
 from factorgraph_loc.text import error_text, quoted
 
 if TYPE_CHECKING:
@@ -82,9 +83,8 @@ class Cluster(Executor):
     def submit(self, take: Take, left: int) -> None:
         room = QUEUED * max(1, sum(self._client.nthreads().values()))
         while len(self._sent) < min(room, left) and (run := take()) is not None:
-            findable = replace(run, source=_absolute(run.source)) if isinstance(run, PlannedRun) else run
             key = f"fgloc-{run.key}-{self._session}"
-            future = self._client.submit(make, findable, version_here(), self._seconds, key=key, pure=False)
+            future = self._client.submit(make, _findable(run), version_here(), self._seconds, key=key, pure=False)
             self._sent[future] = run
 
     def finished(self) -> Iterator[tuple[str, Files]]:
@@ -155,24 +155,12 @@ def version_here() -> str:
     return digest_of([code_version(), library_versions()])
 
 
-def _absolute(source: LogSource) -> LogSource:
-    """The source with absolute paths, independent of the worker's working folder."""
-
-    def path(name: str) -> str:
-        return str(Path(name).resolve()) if Path(name).exists() else name
-
-    if isinstance(source, SimulatedSource):
-        return replace(source, preset=path(source.preset))
-    if isinstance(source, GivenSource):
-        return source
-    root = source.data_root or os.environ.get("FGLOC_DATA")
-    return replace(
-        source,
-        log=path(source.log),
-        rig=None if source.rig is None else path(source.rig),
-        world=None if source.world is None else path(source.world),
-        data_root=None if not root else str(Path(root).resolve()),
-    )
+def _findable(run: Planned) -> Planned:
+    """The run with the data folder of this machine, whose path does not depend on folder and environment of the worker."""
+    if not isinstance(run, PlannedRun) or not isinstance(run.source, RecordedSource):
+        return run
+    root = run.source.data_root or os.environ.get(DATA_ROOT)
+    return replace(run, source=replace(run.source, data_root=str(Path(root).resolve()) if root else None))
 
 
 def _import() -> ModuleType:
