@@ -2,27 +2,16 @@
 
 from dataclasses import replace
 
+import mounted_camera
 import numpy as np
 import pytest
 
 from factors import se2
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
-from factors.camera.model import PLANAR, CameraModel, camera_pose, mounting, predict
+from factors.camera.model import PLANAR, camera_pose, predict
 
-MODEL = CameraModel(
-    500.0,
-    510.0,
-    320.0,
-    240.0,
-    640,
-    480,
-    (0.05, -0.01, 0.001, 0.002),
-    np.array((0.1, 0.02, 0.5)),
-    mounting(0.05, 0.1, -0.2),
-    sigma=1.3,
-    tempering=0.6,
-)
+MODEL = replace(mounted_camera.MODEL, sigma=1.3, tempering=0.6)
 OFFSET, NOISE = np.array((0.2, -0.05, 0.3)), np.diag((1e-4, 2e-4, 1e-5))
 
 

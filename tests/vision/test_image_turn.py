@@ -2,24 +2,13 @@
 
 import numpy as np
 import pytest
+from mounted_camera import MODEL
 from scipy import stats
 
 from factorgraph_loc.vision.image_turn import measure_turn
 from factors.camera.model import CameraModel, mounting, predict
 from factors.se2 import Array
 
-MODEL = CameraModel(
-    500.0,
-    500.0,
-    319.5,
-    239.5,
-    640,
-    480,
-    distortion=(-0.05, 0.01, 0.0005, -0.0005),
-    position=np.array((0.2, 0.0, 0.9)),
-    rotation=mounting(0.0, -0.05, 0.1),
-    sigma=0.8,
-)
 SIDEWAYS = CameraModel(500.0, 500.0, 319.5, 239.5, 640, 480, rotation=mounting(0.0, 0.0, np.pi / 2), sigma=0.8)
 
 
