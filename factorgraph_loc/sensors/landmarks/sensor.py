@@ -25,6 +25,8 @@ from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction
 
+NamedFactor = tuple[str, BearingRangeFactor]
+
 
 class KnownLandmarks:
     """Turns measurements into factors. Landmarks that map or rig lack are counted as ignored.
@@ -55,93 +57,63 @@ class KnownLandmarks:
         self._estimated = estimated
         self._diagnostics = diagnostics
 
-    def factor(
+    def factor(self, m: BearingRange) -> BearingRangeFactor | None:
+        """The factor of the landmarks that are not estimated, on the pose at the measurement's time; None without any."""
+        return self.factors(m)[0]
+
+    def factors(
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
-    ) -> BearingRangeFactor | None:
-        """The factor of the known landmarks, on the pose at the measurement's time or on one that lies ``offset`` before it.
+    ) -> tuple[BearingRangeFactor | None, list[NamedFactor], list[NamedFactor]]:
+        """:meth:`factor`, on the pose at the measurement's time or on one that lies ``offset`` before it. Further factors depend
+        on the pose and, as the last value, on the position of a landmark. They have names, and are of landmarks with an inexact
+        survey, then of those without one.
 
         ``twist`` (3,): the robot's velocity at that time, needed if the sensor's time offset is estimated.
         """
-        known = [i for i, name in enumerate(m.landmarks) if name in self._positions]
-        measured = _measured(m)
-        rows = [i for i in known if measured[i]]
-        if len(known) < len(m.landmarks) and not self._maps_others:
-            self._diagnostics.ignore("landmark not in the map", len(m.landmarks) - len(known))
-        if len(rows) < len(known):
-            self._diagnostics.ignore("neither range nor bearing", len(known) - len(rows))
-        if self._carries and self._surveys:
-            rows = [i for i in rows if m.landmarks[i] not in self._surveys]
-        if not rows:
-            return None
-        points = np.array([self._positions[m.landmarks[i]] for i in rows])
-        factor = self._of_rows(m, rows, points, offset, twist)
-        if self._surveys and any(m.landmarks[i] in self._surveys for i in rows):
-            surveys = np.array([self._surveys.get(m.landmarks[i], np.zeros((2, 2))) for i in rows])
-            factor = replace(factor, point_covariances=surveys)
-        return factor
+        fixed, surveyed, unknown = list[int](), list[int](), list[int]()
+        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
+        for i, (name, no_range, no_bearing) in enumerate(lacks):
+            if name not in self._positions:
+                if not self._maps_others:
+                    self._diagnostics.ignore("landmark not in the map")
+                elif no_range or no_bearing:
+                    self._diagnostics.ignore("unknown landmark without range and bearing")
+                else:
+                    unknown.append(i)
+            elif no_range and no_bearing:
+                self._diagnostics.ignore("neither range nor bearing")
+            else:
+                (surveyed if self._carries and name in self._surveys else fixed).append(i)
 
-    def surveyed(
-        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
-    ) -> list[tuple[str, BearingRangeFactor]]:
-        """The landmarks with an inexact survey by name, each with a factor on the pose and its position."""
-        if not self._carries or not self._surveys:
-            return []
-        measured = _measured(m)
-        rows = [i for i, name in enumerate(m.landmarks) if name in self._surveys and measured[i]]
-        return [(m.landmarks[i], self._free(m, i, offset, twist)) for i in rows]
+        def of_rows(rows: list[int], points: Array) -> BearingRangeFactor:
+            return BearingRangeFactor(
+                self._model,
+                points,
+                m.range[rows],
+                m.bearing[rows],
+                None if offset is None else offset.delta,
+                None if offset is None else offset.covariance,
+                estimated=self._estimated,
+                twist=twist,
+                in_look=None if offset is None else len(fixed) + len(surveyed) + len(unknown),
+            )
+
+        of_surveyed, of_unknown = (
+            [(m.landmarks[i], replace(of_rows([i], np.zeros((1, 2))), free=True)) for i in rows]
+            for rows in (surveyed, unknown)
+        )
+        if not fixed:
+            return None, of_surveyed, of_unknown
+        names = [m.landmarks[i] for i in fixed]
+        factor = of_rows(fixed, np.array([self._positions[name] for name in names]))
+        if any(name in self._surveys for name in names):
+            surveys = np.array([self._surveys.get(name, np.zeros((2, 2))) for name in names])
+            factor = replace(factor, point_covariances=surveys)
+        return factor, of_surveyed, of_unknown
 
     def survey(self, name: str) -> tuple[Array, Array]:
         """Position (2,) and covariance (2, 2) of a landmark in the map."""
         return self._positions[name], self._surveys[name]
-
-    def others(
-        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
-    ) -> list[tuple[str, BearingRangeFactor]]:
-        """The landmarks to be estimated by name, each with a factor on the pose and its position (the last value)."""
-        free = []
-        for i, name in enumerate(m.landmarks) if self._maps_others else ():
-            if name in self._positions:
-                continue
-            if np.isnan(m.range[i]) or np.isnan(m.bearing[i]):
-                self._diagnostics.ignore("unknown landmark without range and bearing")
-            else:
-                free.append((name, self._free(m, i, offset, twist)))
-        return free
-
-    def _free(self, m: BearingRange, row: int, offset: Increment | None, twist: Array | None) -> BearingRangeFactor:
-        """The factor of one landmark on the pose and its position."""
-        return replace(self._of_rows(m, [row], np.zeros((1, 2)), offset, twist), free=True)
-
-    def _of_rows(
-        self, m: BearingRange, rows: list[int], points: Array, offset: Increment | None, twist: Array | None
-    ) -> BearingRangeFactor:
-        everything = len(rows) == len(m.landmarks)
-        return BearingRangeFactor(
-            self._model,
-            points,
-            m.range if everything else m.range[rows],
-            m.bearing if everything else m.bearing[rows],
-            None if offset is None else offset.delta,
-            None if offset is None else offset.covariance,
-            estimated=self._estimated,
-            twist=twist,
-            in_look=None if offset is None else self._count(m),
-        )
-
-    def _count(self, m: BearingRange) -> int:
-        """Number of usable landmarks: those of the map with either value, others with both."""
-        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
-        return sum(
-            not (no_range and no_bearing)
-            if name in self._positions
-            else self._maps_others and not (no_range or no_bearing)
-            for name, no_range, no_bearing in lacks
-        )
-
-
-def _measured(m: BearingRange) -> list[bool]:
-    """Whether the range or the bearing of each landmark was measured."""
-    return [r == r or b == b for r, b in zip(m.range.tolist(), m.bearing.tolist(), strict=True)]  # noqa: PLR0124 - not NaN
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
@@ -289,9 +261,9 @@ class LandmarkSensor(Sensor):
 
     def observe(self, m: BearingRange, view: View) -> Iterator[LandmarkObservation | NewVariable]:
         twist = self._motion.twist(m.t) if TIME_OFFSET in self.constants.indices else None
-        known = self._landmarks.factor(m, view.offset, twist)
+        known, inexact, unknown = self._landmarks.factors(m, view.offset, twist)
         terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
-        for name, factor in self._landmarks.surveyed(m, view.offset, twist):
+        for name, factor in inexact:
             block, (position, spread) = f"{self.name}/{name}", self._landmarks.survey(name)
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
@@ -302,7 +274,7 @@ class LandmarkSensor(Sensor):
                 terms.append(Term(factor, (*self._shared, block), 2))
         surveyed = any(term.blocks != self._shared for term in terms)
         met: list[tuple[str, Term]] = []
-        for name, factor in self._landmarks.others(m, view.offset, twist):
+        for name, factor in unknown:
             block = f"{self.name}/{name}"
             term = Term(factor, (*self._shared, block), 2)
             if view.value(block) is None:

@@ -25,7 +25,7 @@ from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SL
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream
 from factors import se2
 from factors.landmarks import model as bearing_range
-from factors.landmarks.model import located, sigmas
+from factors.landmarks.factor import BearingRangeFactor
 from factors.se2 import Array
 
 MIN_SIGHTINGS = 10  # minimum for a statement about a landmark
@@ -259,9 +259,6 @@ def require_mappable(log: Log) -> None:
         )
 
 
-DELTA = 1e-6  # m or rad; of numerical derivatives
-
-
 class LocatedLandmark(NamedTuple):
     """A ``landmark`` seen at ``t`` [s of the log] at ``point`` (2,) [m] with ``covariance`` (2, 2) [m^2], in the robot frame."""
 
@@ -280,12 +277,8 @@ def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]
     model = settings.model()
     whole = np.flatnonzero(np.isfinite(stream.range) & np.isfinite(stream.bearing))
     rows = [i for i in whole.tolist() if stream.landmark[i] in names]
-    ranges, bearings = stream.range[rows], stream.bearing[rows]
-    points = located(model, ranges, bearings)
-    deviations = sigmas(model, ranges)
     t = (stream.t[rows] + log.rig.time_offset("bearing_range")).tolist()
-    by_range = (located(model, ranges + DELTA, bearings) - points) / DELTA
-    by_bearing = (located(model, ranges, bearings + DELTA) - points) / DELTA
-    jacobians = np.stack((by_range, by_bearing), axis=-1) * deviations[:, None, :]
-    covariances = jacobians @ np.swapaxes(jacobians, 1, 2)
-    return [LocatedLandmark(t[k], stream.landmark[i], points[k], covariances[k]) for k, i in enumerate(rows)]
+    measured = zip(stream.range[rows], stream.bearing[rows], strict=True)
+    factors = [BearingRangeFactor(model, np.zeros((1, 2)), np.array([r]), np.array([b])) for r, b in measured]
+    points = [(point, covariance) for point, _, covariance in (factor.locate([np.zeros(3)]) for factor in factors)]
+    return [LocatedLandmark(t[k], stream.landmark[i], *points[k]) for k, i in enumerate(rows)]
