@@ -1,19 +1,15 @@
 """A robot that stands: the odometry tells so, and no estimator is lost over it."""
 
+import camera_world
 import numpy as np
 import pytest
+from drives import even_noise
 
 from factorgraph_loc import Log, Rig, VelocityStream, World
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.settings import OdometryNoise, OdometrySettings
 
-NONE = GrowthSettings()
-BY_DISTANCE = OdometryNoise(
-    along=GrowthSettings(per_distance=0.05),
-    lateral=GrowthSettings(per_distance=0.02),
-    heading=GrowthSettings(per_distance=0.05, per_rotation=0.05),
-)
-PERFECT = OdometryNoise(along=NONE, lateral=NONE, heading=NONE)
+PERFECT = even_noise()
 DRIVEN = 30.0  # s
 
 
@@ -33,7 +29,7 @@ def wheels(noise, stood):
         ("ekf", PERFECT),
         ("smoother", PERFECT),
         ("batch", OdometryNoise()),
-        ("smoother", BY_DISTANCE),
+        ("smoother", camera_world.NOISE),
         ("particle_filter", PERFECT),
     ],
 )

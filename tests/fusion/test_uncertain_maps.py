@@ -6,6 +6,7 @@ import camera_world
 import numpy as np
 import pytest
 from by_hand import made
+from drives import even_noise
 from scipy.stats import chi2
 
 from factorgraph_loc import BearingRange, Localizer, PixelSightings, Rig, VelocityOdometry, World
@@ -13,14 +14,13 @@ from factorgraph_loc.fusion.ekf import MOST
 from factorgraph_loc.maps.markers import Marker, corner_names, corner_points
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factorgraph_loc.sensors.rfid.known_tags import trust
 from factors.camera.model import predict
 
-STILL = GrowthSettings(per_time=1e-4)
 RIG = Rig(
     sensors=("odometry", "bearing_range"),
-    odometry=OdometrySettings(noise=OdometryNoise(along=STILL, lateral=STILL, heading=STILL)),
+    odometry=OdometrySettings(noise=even_noise(per_time=1e-4)),
     bearing_range=BearingRangeSettings(range_sigma=0.05, bearing_sigma=0.02, robust=100.0),
 )
 MARK, PRIOR = np.array((4.0, 1.0)), np.array((1.0, 1.0, 0.05))

@@ -6,13 +6,13 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from drives import even_noise
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import BearingRangeStream, IncrementStream, InputError, Landmark, Log, RunFailedError, StartPose
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.measurement import Stream, columns_of
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
 from factors import se2
 
 SECONDS = 4.0
@@ -293,8 +293,7 @@ def no_odometry(log, rng):
 
 @fault
 def no_noise_of_odometry(log, rng):
-    none = GrowthSettings(per_distance=0.0, per_rotation=0.0, per_time=0.0)
-    log = with_rig(log, "odometry", noise=OdometryNoise(along=none, lateral=none, heading=none))
+    log = with_rig(log, "odometry", noise=even_noise())
     still = IncrementStream(log.streams["odometry"].t, *np.zeros((3, len(log.streams["odometry"].t))))
     return replace(log, streams={**log.streams, "odometry": still}) if rng.random() < 0.5 else log
 

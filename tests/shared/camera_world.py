@@ -30,14 +30,23 @@ CAMERA = CameraSettings(
 RIG = Rig(sensors=("odometry", "sightings"), odometry=OdometrySettings(noise=NOISE), camera=CAMERA)
 
 
-def room(count=160, seed=0):
-    """Points on the four walls."""
-    rng = np.random.default_rng(seed)
+def on_walls(rng, count):
+    """Places (N, 3) on the four walls."""
     along, height = rng.uniform(-HALF, HALF, count), rng.uniform(0.3, 2.4, count)
     wall = np.arange(count) % 4
     x = np.choose(wall, (along, along, HALF, -HALF))
     y = np.choose(wall, (HALF, -HALF, along, along))
-    return PointMap.of(tuple(f"p{i}" for i in range(count)), np.column_stack((x, y, height)))
+    return np.column_stack((x, y, height))
+
+
+def pointed(places):
+    """A map of points at these places (N, 3)."""
+    return PointMap.of(tuple(f"p{i}" for i in range(len(places))), places)
+
+
+def room(count=160, seed=0):
+    """Points on the four walls."""
+    return pointed(on_walls(np.random.default_rng(seed), count))
 
 
 def circle(t):
@@ -104,17 +113,28 @@ def with_camera(log, **changes):
     return replace(log, rig=log.rig.model_copy(update={"camera": camera}))
 
 
-def with_views(points, seed=0, size=64, views=3):
+def _descriptors(rng, count, binary):
+    return rng.integers(0, 256, (count, 32), dtype=np.uint8) if binary else rng.standard_normal((count, 64))
+
+
+def _again(descriptors, rng):
+    """The same descriptors with noise: in binary ones a few bits change."""
+    if descriptors.dtype == np.uint8:
+        return descriptors ^ (rng.random(descriptors.shape) < 0.1).astype(np.uint8)
+    return (descriptors + 0.2 * rng.standard_normal(descriptors.shape)).astype(np.float32)
+
+
+def with_views(points, views=3, *, binary=False):
     """The same points with descriptors: each was seen from about the middle of the room, and looks nearly the same each time."""
-    rng = np.random.default_rng(seed)
-    looks = rng.standard_normal((len(points), size))
+    rng = np.random.default_rng(0)
+    looks = _descriptors(rng, len(points), binary)
     owners = np.repeat(np.arange(len(points)), views)
     middle = np.append(rng.uniform(-1.5, 1.5, (len(owners), 2)), np.full((len(owners), 1), 0.9), axis=1)
     return replace(
         points,
-        feature="colour",
+        feature="orb" if binary else "colour",
         owners=owners,
-        descriptors=(looks[owners] + 0.2 * rng.standard_normal((len(owners), size))).astype(np.float32),
+        descriptors=_again(looks[owners], rng),
         seen_from=middle,
         sizes=np.full(len(owners), 5.0),
     )
@@ -128,20 +148,18 @@ def frame(points, pose, t, rng, camera=CAMERA, clutter=100, wrong=0.0, limit=400
     looks = points.descriptors[np.searchsorted(points.owners, rows)].copy()
     swapped = rng.permutation(len(rows))[: int(wrong * len(rows))]
     looks[swapped] = looks[np.roll(swapped, 1)]
-    size = looks.shape[1]
     pixels = seen[rows] + camera.pixel_sigma * rng.standard_normal((len(rows), 2))
     pixels = np.concatenate((pixels, rng.uniform((0, 0), (camera.width, camera.height), (clutter, 2))))
-    looks = np.concatenate((looks, rng.standard_normal((clutter, size)))) + 0.2 * rng.standard_normal(
-        (len(rows) + clutter, size)
-    )
+    others = _descriptors(rng, clutter, looks.dtype == np.uint8)
+    looks = _again(np.concatenate((looks, others)), rng)
     order = rng.permutation(len(pixels))
     shown = np.concatenate((rows, np.full(clutter, -1)))[order]
     found = CameraFrame(
         t,
-        "colour",
+        points.feature,
         pixels[order],
         np.full(len(pixels), 5.0),
-        looks[order].astype(np.float32),
+        looks[order],
         np.arange(len(pixels)),
     )
     return found, shown

@@ -1,8 +1,14 @@
-"""Where a robot gets to."""
+"""Poses of a robot that drives, and noise of its wheels."""
 
 import numpy as np
 
+from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise
 from factors import se2
+
+
+def even_noise(**growth):
+    """The same growth along the way, across it, and of the heading."""
+    return OdometryNoise(**dict.fromkeys(("along", "lateral", "heading"), GrowthSettings(**growth)))
 
 
 def driven(steps, start=(0.0, 0.0, 0.0)):

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from by_hand import made
+from drives import even_noise
 from scipy.stats import chi2
 
 from factorgraph_loc import IncrementOdometry, PixelSightings, PointMap, Rig, World
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.belief import PosePrior
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.slam.monoslam_state import Innovation
 from factors.camera import model as reprojection
@@ -74,13 +75,7 @@ def test_its_covariance_is_that_of_its_errors(drive):
 
 
 CAMERA = preset("office", {}).rig.camera
-EXACT_WHEELS = OdometrySettings(
-    noise=OdometryNoise(
-        along=GrowthSettings(per_distance=1e-3),
-        lateral=GrowthSettings(per_distance=1e-3),
-        heading=GrowthSettings(per_distance=1e-3),
-    )
-)
+EXACT_WHEELS = OdometrySettings(noise=even_noise(per_distance=1e-3))
 RIG = Rig(sensors=SENSORS, odometry=EXACT_WHEELS, camera=CAMERA.model_copy(update={"pixel_sigma": 0.5}))
 FAR_POINT = np.array((4.0, 2.5, 1.4))
 

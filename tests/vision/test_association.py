@@ -5,70 +5,17 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from camera_world import CAMERA, frame, on_walls, pointed, room, with_views
 
-from factorgraph_loc import CameraFrame, PointMap
-from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import CameraPose, agreeing, are_compatible
 from factorgraph_loc.vision.relocalization import found_on_floor, located
 from factors import se2
 from factors.camera import model as reprojection
 
-CAMERA = CameraSettings(
-    fx=500.0, fy=500.0, cx=319.5, cy=239.5, distortion=(-0.1, 0.01, 0.001, -0.001), x=0.15, z=0.9, pitch=-0.05
-)
 MODEL = CAMERA.model()
 POSE = np.array((0.4, -0.3, 0.5))
 HERE = reprojection.camera_pose(MODEL, POSE)
-
-
-def wall_points(rng, count=400):
-    """On the walls of a room of 8 by 8 m."""
-    along, height = rng.uniform(-4.0, 4.0, count), rng.uniform(0.2, 2.5, count)
-    wall = np.arange(count) % 4
-    x = np.choose(wall, (along, along, np.full(count, 4.0), np.full(count, -4.0)))
-    y = np.choose(wall, (np.full(count, 4.0), np.full(count, -4.0), along, along))
-    return np.column_stack((x, y, height))
-
-
-def mapped(rng, positions, binary=False, views=3):
-    """Each seen from about the middle of the room; its views differ in a few bits, or by some noise."""
-    owners = np.repeat(np.arange(len(positions)), views)
-    seen_from = np.column_stack((rng.uniform(-1.0, 1.0, (len(owners), 2)), np.full(len(owners), 0.9)))
-    if binary:
-        looks = rng.integers(0, 256, (len(positions), 32), dtype=np.uint8)[owners]
-        descriptors = looks ^ (rng.random(looks.shape) < 0.1).astype(np.uint8)
-    else:
-        looks = rng.standard_normal((len(positions), 64))[owners]
-        descriptors = (looks + 0.2 * rng.standard_normal(looks.shape)).astype(np.float32)
-    return PointMap(
-        tuple(f"p{i}" for i in range(len(positions))),
-        positions,
-        np.zeros((len(positions), 3, 3)),
-        "orb" if binary else "colour",
-        owners,
-        descriptors,
-        seen_from,
-        np.full(len(owners), 5.0),
-    )
-
-
-def picture(rng, points, pose=POSE, wrong=0.0, clutter=60):
-    """A frame from ``pose``, and which point each feature shows (-1: none); a share look like other points in view."""
-    pixels, depths = reprojection.predict(MODEL, pose, points.positions)
-    rows = rng.permutation(np.flatnonzero(MODEL.contains(pixels) & (depths > 0.3)))
-    pixels = pixels[rows] + rng.standard_normal((len(rows), 2))
-    looks = points.descriptors[np.searchsorted(points.owners, rows)].copy()
-    swapped = np.arange(int(wrong * len(rows)))
-    looks[swapped] = looks[np.roll(swapped, 1)]
-    shown = np.concatenate((rows, np.full(clutter, -1)))
-    pixels = np.concatenate((pixels, rng.uniform((0, 0), (CAMERA.width, CAMERA.height), (clutter, 2))))
-    if points.feature == "orb":
-        looks = np.concatenate((looks, rng.integers(0, 256, (clutter, 32), dtype=np.uint8)))
-    else:
-        looks = np.concatenate((looks, rng.standard_normal((clutter, 64)).astype(np.float32)))
-    tracks = np.arange(len(shown))
-    return CameraFrame(0.0, points.feature, pixels, np.full(len(shown), 5.0), looks, tracks), shown
 
 
 def spread(turn, shift):
@@ -87,11 +34,11 @@ def predicted(rng, covariance):
 @pytest.mark.parametrize(("turn", "shift"), [(0.01, 0.03), (0.05, 0.15)])
 def test_what_is_seen_is_found_near_its_prediction_and_what_looks_like_others_is_left_out(binary, wrong, turn, shift):
     rng = np.random.default_rng(1)
-    points = mapped(rng, wall_points(rng), binary)
+    points = with_views(room(400), binary=binary)
     associator, covariance = Associator(points, MODEL), spread(turn, shift)
     for _ in range(5):
-        frame, shown = picture(rng, points, wrong=wrong)
-        found = associator.guided(frame, *predicted(rng, covariance), covariance)
+        image, shown = frame(points, POSE, 0.0, rng, wrong=wrong)
+        found = associator.guided(image, *predicted(rng, covariance), covariance)
         assert np.mean(shown[found.features] == found.points) >= (0.98 if wrong else 1.0)
         assert len(found) > (0.5 if wrong else 0.85) * np.count_nonzero(shown >= 0)
         assert wrong or found.expected >= len(found)
@@ -100,52 +47,52 @@ def test_what_is_seen_is_found_near_its_prediction_and_what_looks_like_others_is
 def test_points_that_were_seen_from_elsewhere_are_not_looked_for():
     """Those of the next room lie in the image too, but the wall hides them: no view of them comes from here."""
     rng = np.random.default_rng(3)
-    here, there = wall_points(rng), wall_points(rng) + np.array((8.5, 0.0, 0.0))
-    points = mapped(rng, np.concatenate((here, there)))
+    here, there = on_walls(rng, 400), on_walls(rng, 400) + np.array((8.5, 0.0, 0.0))
+    points = with_views(pointed(np.concatenate((here, there))))
     beyond = points.owners >= len(here)
     # there they were seen from the middle of that room, and from the side that looks away from here
     seen_from = np.where(beyond[:, None], points.seen_from + np.array((11.0, 0.0, 0.0)), points.seen_from)
     points = replace(points, seen_from=seen_from)
-    frame, shown = picture(rng, points)
-    frame = replace(frame, pixels=frame.pixels[shown < len(here)], descriptors=frame.descriptors[shown < len(here)])
-    found = Associator(points, MODEL).guided(frame, *HERE, spread(0.01, 0.03))
+    image, shown = frame(points, POSE, 0.0, rng)
+    image = replace(image, pixels=image.pixels[shown < len(here)], descriptors=image.descriptors[shown < len(here)])
+    found = Associator(points, MODEL).guided(image, *HERE, spread(0.01, 0.03))
     assert len(found) > 20
     assert np.all(found.points < len(here))
-    near = Associator(mapped(np.random.default_rng(3), here), MODEL).guided(frame, *HERE, spread(0.01, 0.03))
+    near = Associator(with_views(pointed(here)), MODEL).guided(image, *HERE, spread(0.01, 0.03))
     assert found.expected < 1.3 * near.expected
 
 
 def test_nothing_in_an_image_or_of_another_kind_is_nothing():
     rng = np.random.default_rng(4)
-    points = mapped(rng, wall_points(rng))
+    points = with_views(room(400))
     associator = Associator(points, MODEL)
-    frame, _ = picture(rng, points)
-    empty = replace(frame, pixels=np.empty((0, 2)), descriptors=np.empty((0, 64), np.float32))
+    image, _ = frame(points, POSE, 0.0, rng)
+    empty = replace(image, pixels=np.empty((0, 2)), descriptors=np.empty((0, 64), np.float32))
     assert len(associator.guided(empty, *HERE, spread(0.01, 0.03))) == 0
     assert associator.relocalized(empty) is None
-    assert len(associator.guided(replace(frame, feature="sift"), *HERE, spread(0.01, 0.03))) == 0
+    assert len(associator.guided(replace(image, feature="sift"), *HERE, spread(0.01, 0.03))) == 0
     # far from the room, and looking away
-    assert len(associator.guided(frame, np.array((100.0, 0.0, 1.0)), HERE[1], spread(0.01, 0.03))) == 0
+    assert len(associator.guided(image, np.array((100.0, 0.0, 1.0)), HERE[1], spread(0.01, 0.03))) == 0
 
 
 def test_clutter_alone_matches_nothing():
     rng = np.random.default_rng(5)
-    points = mapped(rng, wall_points(rng))
+    points = with_views(room(400))
     associator = Associator(points, MODEL)
-    frame, shown = picture(rng, points, clutter=300)
+    image, shown = frame(points, POSE, 0.0, rng, clutter=300)
     only = shown < 0
-    frame = replace(frame, pixels=frame.pixels[only], descriptors=frame.descriptors[only])
-    assert len(associator.guided(frame, *HERE, spread(0.02, 0.05))) <= 3
-    assert associator.relocalized(frame) is None
+    image = replace(image, pixels=image.pixels[only], descriptors=image.descriptors[only])
+    assert len(associator.guided(image, *HERE, spread(0.02, 0.05))) <= 3
+    assert associator.relocalized(image) is None
 
 
 @pytest.mark.parametrize("binary", [False, True])
 @pytest.mark.parametrize("wrong", [0.0, 0.4])
 def test_a_camera_is_found_in_the_map_without_a_prediction(binary, wrong):
     rng = np.random.default_rng(6)
-    points = mapped(rng, wall_points(rng), binary)
-    frame, shown = picture(rng, points, wrong=wrong)
-    position, rotation, covariance, seen = Associator(points, MODEL).relocalized(frame)
+    points = with_views(room(400), binary=binary)
+    image, shown = frame(points, POSE, 0.0, rng, wrong=wrong)
+    position, rotation, covariance, seen = Associator(points, MODEL).relocalized(image)
     assert np.mean(shown[seen.features] == seen.points) > 0.98
     turn = gtsam.Rot3.Logmap(gtsam.Rot3(HERE[1].T @ rotation))
     error = np.concatenate((turn, HERE[1].T @ (position - HERE[0])))
@@ -155,7 +102,7 @@ def test_a_camera_is_found_in_the_map_without_a_prediction(binary, wrong):
 
 def named(rng, count, wrong):
     """Points in view from POSE, with a share of them at pixels that mean nothing."""
-    positions = wall_points(rng, 40 * count)
+    positions = on_walls(rng, 40 * count)
     pixels, depths = reprojection.predict(MODEL, POSE, positions)
     rows = np.flatnonzero(MODEL.contains(pixels) & (depths > 0.3))[:count]
     pixels = pixels[rows] + rng.standard_normal((len(rows), 2))
@@ -230,13 +177,13 @@ def test_garbage_agrees_on_nothing():
 def test_few_that_agree_of_many_expected_are_not_believed(kept, believed):
     """As in a place that the map does not know, where a few agree by chance."""
     rng = np.random.default_rng(8)
-    points = mapped(rng, wall_points(rng, 3000))
+    points = with_views(room(3000))
     covariance = spread(0.01, 0.03)
-    frame, shown = picture(rng, points, clutter=0)
+    image, shown = frame(points, POSE, 0.0, rng, clutter=0, limit=1000)
     strange = np.arange(len(shown)) >= max(4, int(kept * len(shown)))
-    descriptors = np.where(strange[:, None], rng.standard_normal(frame.descriptors.shape), frame.descriptors)
-    frame = replace(frame, descriptors=descriptors.astype(np.float32))
-    found = Associator(points, MODEL).guided(frame, *predicted(rng, covariance), covariance)
+    descriptors = np.where(strange[:, None], rng.standard_normal(image.descriptors.shape), image.descriptors)
+    image = replace(image, descriptors=descriptors.astype(np.float32))
+    found = Associator(points, MODEL).guided(image, *predicted(rng, covariance), covariance)
     assert found.expected > 400
     assert (len(found) > 0) == believed
     assert found.rejected >= 4 or believed

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import driven
+from drives import driven, even_noise
 from mapped_hall import VELOCITIES, write_mapped
 
 from factorgraph_loc.errors import InputError
@@ -17,15 +17,16 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.loops.measurement import Loops, LoopSettings, LoopStream
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
+from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factorgraph_loc.sensors.tables import checked
 from factors import se2
 
 SIDE, SPEED, STEP, ROUNDS = 12.0, 0.5, 0.5, 3  # m, m/s, s
-NOISE = OdometryNoise(
-    along=GrowthSettings(per_time=0.01), lateral=GrowthSettings(per_time=0.01), heading=GrowthSettings(per_time=0.01)
+RIG = Rig(
+    sensors=("odometry", "loops"),
+    odometry=OdometrySettings(noise=even_noise(per_time=0.01)),
+    loops=LoopSettings(sigma_place=0.3),
 )
-RIG = Rig(sensors=("odometry", "loops"), odometry=OdometrySettings(noise=NOISE), loops=LoopSettings(sigma_place=0.3))
 
 
 def drive(with_pose=False):
