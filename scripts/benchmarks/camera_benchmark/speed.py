@@ -18,11 +18,11 @@ from camera_benchmark.drives import COUNT, FEATURE, RATE, Drive, log_of, map_of,
 from factorgraph_loc.experiments.preparation import use_of
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion import registry
-from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.use import prepare
 from factorgraph_loc.simulation import film, preset, simulate, with_images
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.feature_cache import VARIABLE
+from factorgraph_loc.vision.tracks import FeatureTracker
 
 POINTS = 3000  # enough for 20 in view nearly always
 SEED = 0
@@ -87,7 +87,7 @@ def chain(report: Report, options: Options) -> None:
     for links in report.collect(chained, {"chain": (options.drives,)}, workers=1).values():
         report.say(
             f"{links.images} files of 640 x 480 px, at most {COUNT} features (`{links.feature}`) in each, in a map of "
-            f"{links.points} points. {os.cpu_count()} processes find features, the rest has one. *Smooth*: the smoother "
+            f"{links.points} points. {os.cpu_count()} threads find features, the rest has one. *Smooth*: the smoother "
             "without the association of features with points of the map. Targets: 15 images/s, 10 % of the time to smooth."
         )
         whole = links.find + links.follow + links.associate + links.smooth
@@ -130,7 +130,7 @@ def chained(kept: Path) -> Links:
         settings = drive.settings()
         log = with_map(with_images(simulate(settings, drive.seed), settings, drive.seed, folder), points)
         with (
-            spent(frontend, "follow") as follow,
+            spent(FeatureTracker, "follow") as follow,
             spent(Associator, "guided") as guided,
             spent(Associator, "relocalized") as relocalized,
         ):
