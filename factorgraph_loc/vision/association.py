@@ -29,8 +29,6 @@ from factors.camera.model import CameraModel
 from factors.compiled import compiled
 from factors.se2 import Array
 
-NOWHERE = -1
-
 BITS = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
 
 RATIO, GLOBAL_RATIO = 0.85, 0.8
@@ -309,42 +307,21 @@ def bit_distances(
     return out
 
 
-@compiled
 def clear_pairs(
     pairs: Integers, costs: Array, predicted: Array, features: Array, ratio: float, apart: float
 ) -> Integers:
     """Indices of the mutually nearest pairs that pass the ratio test: a cost below ``ratio`` times that of the best other match
     at least ``apart`` pixels away.
     """
-    count, amount = len(predicted), len(features)
-    of_point, of_feature = np.full(count, NOWHERE), np.full(amount, NOWHERE)
-    for i in range(len(pairs)):
-        c, f = pairs[i]
-        if of_point[c] == NOWHERE or costs[i] < costs[of_point[c]]:
-            of_point[c] = i
-        if of_feature[f] == NOWHERE or costs[i] < costs[of_feature[f]]:
-            of_feature[f] = i
-    clear = np.ones(len(pairs), np.bool_)
-    square = apart * apart
-    for i in range(len(pairs)):
-        c, f = pairs[i]
-        best = of_feature[f]
-        if best != i and costs[best] >= ratio * costs[i]:
-            b = pairs[best, 0]
-            du, dv = predicted[b, 0] - predicted[c, 0], predicted[b, 1] - predicted[c, 1]
-            if du * du + dv * dv > square:
-                clear[best] = False
-        best = of_point[c]
-        if best != i and costs[best] >= ratio * costs[i]:
-            b = pairs[best, 1]
-            du, dv = features[b, 0] - features[f, 0], features[b, 1] - features[f, 1]
-            if du * du + dv * dv > square:
-                clear[best] = False
-    out = np.empty(min(count, amount), np.int64)
-    n = 0
-    for c in range(count):
-        i = of_point[c]
-        if i != NOWHERE and of_feature[pairs[i, 1]] == i and clear[i]:
-            out[n] = i
-            n += 1
-    return out[:n]
+    every = np.arange(len(pairs))
+    kept = np.ones(len(pairs), dtype=bool)
+    for side, places in ((0, features), (1, predicted)):
+        owners, partners = pairs[:, side], pairs[:, 1 - side]
+        order = np.lexsort((costs, owners))
+        _, first, group_of = np.unique(owners[order], return_index=True, return_inverse=True)
+        best = np.empty(len(pairs), dtype=np.int64)
+        best[order] = order[first][group_of]
+        away = np.sum((places[partners[best]] - places[partners]) ** 2, axis=1) > apart**2
+        kept &= best == every
+        kept[best[(best != every) & (costs[best] >= ratio * costs) & away]] = False
+    return np.flatnonzero(kept)
