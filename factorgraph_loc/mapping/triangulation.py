@@ -109,10 +109,10 @@ def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangu
     for i, rows in enumerate(np.split(order, np.cumsum(tracks.lengths())[:-1])):
         frames = tracks.frame[rows]
         observed = cameras.positions[frames], cameras.rotations[frames], rays[rows], tracks.pixels[rows], sigmas[rows]
-        ended, points[i], covariances[i], _ = kernels.triangulated(
+        is_determined, points[i], covariances[i], squared = kernels.triangulated(
             lens, *observed, ANY_SPREAD, 0.0, NEAREST, model.robust
         )
-        determined[i] = ended == kernels.FOUND
+        determined[i] = is_determined and np.isfinite(squared[0])
     error, _, _, depth = reproject(model, cameras, points, tracks)
     return Triangulated(points, covariances, error, depth, np.where(determined, parallax(cameras, points, tracks), 0.0))
 

@@ -24,7 +24,7 @@ FEWEST, MAX_WAITING = 3, 10  # sightings of one point
 MAX_SPREAD = 0.15  # standard deviation of an initial point, relative to its least depth
 GATE = 0.999  # probability of the chi-square test of the residuals
 PATIENCE = 20  # keyframes after which a point not seen again is dropped
-ORIGIN, NO_ROTATION, UPRIGHT = np.zeros(3), np.eye(3), np.zeros(2)
+UPRIGHT = np.zeros(2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,15 +148,13 @@ def agreed(
     Sightings that contradict the point are removed one by one, such that the remaining ones agree best.
     """
     sightings, places = list(sightings), list(places)
-    point = _triangulate(model, sightings, places, MAX_SPREAD)
+    point = triangulate(model, sightings, places)
     while point is not None and not _fits(point, sightings):
         if len(sightings) <= FEWEST:
             return None
         best: tuple[float, int, TriangulatedPoint] | None = None
         for i in range(len(sightings)):
-            without_one = _triangulate(
-                model, sightings[:i] + sightings[i + 1 :], places[:i] + places[i + 1 :], MAX_SPREAD
-            )
+            without_one = triangulate(model, sightings[:i] + sightings[i + 1 :], places[:i] + places[i + 1 :])
             if without_one is not None and (best is None or without_one.squared.sum() < best[0]):
                 best = float(without_one.squared.sum()), i, without_one
         if best is None:
@@ -172,35 +170,23 @@ def _fits(point: TriangulatedPoint, sightings: Sequence[PointSighting]) -> bool:
 
 
 def triangulate(
-    model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera], most: float = MAX_SPREAD
+    model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> TriangulatedPoint | None:
     """Triangulate the point of M ``sightings`` from ``places``: minimise the squared residuals in the images.
 
-    The initial value is the point nearest to the rays.
-
-    None if the rays are nearly parallel, do not intersect in front of the camera, or do not determine the point to ``most``
-    times its least depth.
+    The residuals are infinite where the rays do not intersect in front of the camera. None if the rays are nearly parallel, or do
+    not determine the point to :data:`MAX_SPREAD` times its least depth.
     """
-    point = _triangulate(model, sightings, places, most)
-    return None if point is None or not math.isfinite(point.squared.sum()) else point
-
-
-def _triangulate(
-    model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera], most: float
-) -> TriangulatedPoint | None:
-    """As :func:`triangulate`, with infinite residuals where the rays do not intersect in front of the camera."""
-    ended, *result = kernels.triangulated(
+    is_determined, *result = kernels.triangulated(
         reprojection.lens_of(model),
         np.array([p.centre for p in places]),
         np.array([p.rotation for p in places]),
         np.array([s.ray for s in sightings]),
         np.array([s.pixel for s in sightings], dtype=float),
         np.array([math.hypot(model.sigma, p.slack) for p in places]),
-        most,
+        MAX_SPREAD,
         MIN_PARALLAX,
         kernels.NEAREST,
         math.inf,
     )
-    if ended == kernels.BEHIND:
-        return TriangulatedPoint(ORIGIN, NO_ROTATION, np.full(len(sightings), np.inf))
-    return TriangulatedPoint(*result) if ended == kernels.FOUND else None
+    return TriangulatedPoint(*result) if is_determined else None

@@ -90,14 +90,12 @@ def match_guided(
     return match(first, second, binary=binary, allowed=gates(predicted, covariances, points))
 
 
-def gates(predicted: Array, covariances: Array, points: Array, probability: float = GATE) -> Truths:
-    """Whether ``points`` (M, 2) lie in the ellipses (N, M), of the given ``probability``, of Gaussians.
+def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
+    """Whether ``points`` (M, 2) lie in the ellipses (N, M), of the probability :data:`GATE`, of Gaussians.
 
     ``predicted`` (N, 2): means; ``covariances`` (N, 2, 2). NaN predictions have empty gates. Raises InputError if a covariance is
     not positive definite.
     """
-    if not 0.0 < probability < 1.0:
-        raise InputError(f"matching: probability of a gate is {probability}, expected between 0 and 1")
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     determinant = a * c - b * b
     finite = np.isfinite(predicted).all(axis=1)
@@ -106,7 +104,7 @@ def gates(predicted: Array, covariances: Array, points: Array, probability: floa
     dx, dy = (points[None, :, axis] - predicted[:, axis, None] for axis in (0, 1))
     scaled = c[:, None] * dx * dx - 2.0 * b[:, None] * dx * dy + a[:, None] * dy * dy
     # quantile of the chi-squared distribution with two degrees of freedom
-    return np.asarray(scaled <= -2.0 * math.log1p(-probability) * determinant[:, None])
+    return np.asarray(scaled <= -2.0 * math.log1p(-GATE) * determinant[:, None])
 
 
 @dataclass(frozen=True, eq=False)

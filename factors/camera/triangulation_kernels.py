@@ -12,8 +12,6 @@ from factors.se2 import Array
 MIN_PARALLAX = 0.03  # rad, between the outermost rays
 NEAREST = 0.3  # m of depth
 ITERATIONS, SETTLED = 4, 1e-3  # m: step below which the solution has converged
-# how it ends: as a point, as none, or with rays that do not intersect in front of the camera
-FOUND, NONE, BEHIND = 0, 1, 2
 
 
 @compiled(error_model="numpy")
@@ -28,9 +26,9 @@ def triangulated(
     parallax: float,
     nearest: float,
     robust: float,
-) -> tuple[int, Array, Array, Array]:
-    """How it ends, a point (3,), its covariance (3, 3) and squared whitened residuals (M,), seen by cameras at ``centres`` (M, 3)
-    with rotations ``turns`` (M, 3, 3).
+) -> tuple[bool, Array, Array, Array]:
+    """Whether cameras at ``centres`` (M, 3) with rotations ``turns`` (M, 3, 3) determine a point; the point (3,), its covariance
+    (3, 3) and squared whitened residuals (M,), infinite where the rays do not intersect in front of the cameras.
 
     ``rays`` (M, 3): its directions in their frames; ``pixels`` (M, 2) with standard deviations ``sigmas`` (M,) of each coordinate.
     ``largest_sigma``: the largest allowed standard deviation of the point, relative to its least depth. ``parallax`` [rad]: the
@@ -47,22 +45,23 @@ def triangulated(
     covariance, squared = np.zeros((3, 3)), np.full(len(rays), np.inf)
     point = np.zeros(3)
     if product_by_transpose(directions, directions).min() > math.cos(parallax):
-        return NONE, point, covariance, squared
+        return False, point, covariance, squared
     point = _nearest(centres, directions)
     for iteration in range(ITERATIONS + 1):
         information, pull, depth = _inform(k, centres, turns, pixels, sigmas, point, robust, squared)
         if not depth > nearest:
-            return BEHIND, point, covariance, squared
+            squared[:] = np.inf
+            return True, point, covariance, squared
         covariance = inverse(information)
         # the initial point may be less accurate
         if not _is_below(covariance, ((2.0 if iteration == 0 else 1.0) * largest_sigma * depth) ** 2):
-            return NONE, point, covariance, squared
+            return False, point, covariance, squared
         if iteration < ITERATIONS:
             step = product(covariance, pull).reshape(3)
             point += step
             if np.abs(step).max() < SETTLED:
                 break
-    return FOUND, point, covariance, squared
+    return True, point, covariance, squared
 
 
 @compiled(error_model="numpy")

@@ -34,7 +34,8 @@ def pixels_of(poses: Array, point: Array = POINT) -> Array:
 def located(poses: Array, pixels: Array, model: CameraModel = MODEL) -> TriangulatedPoint | None:
     """The point seen from poses (M, 3) at pixels (M, 2)."""
     seen = [sightings_of(model, k, pixel[None])[0] for k, pixel in enumerate(pixels)]
-    return triangulate(model, seen, [KeyframeCamera.of(model, pose, 0.0) for pose in poses])
+    found = triangulate(model, seen, [KeyframeCamera.of(model, pose, 0.0) for pose in poses])
+    return None if found is None or np.isinf(found.squared).any() else found
 
 
 def seen_at(keyframe: int, pixel: Array) -> PointSighting:

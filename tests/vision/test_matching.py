@@ -88,9 +88,9 @@ def test_a_gate_holds_its_probability() -> None:
     rng = np.random.default_rng(4)
     mean, covariance = np.array([30.0, 40.0]), np.array([[9.0, 3.0], [3.0, 4.0]])
     points = rng.multivariate_normal(mean, covariance, 20_000)
-    inside = gates(mean[None], covariance[None], points, 0.9)
+    inside = gates(mean[None], covariance[None], points)
     # five standard deviations of a binomial: wrong once in two million runs
-    assert abs(inside.mean() - 0.9) < 5.0 * np.sqrt(0.9 * 0.1 / 20_000)
+    assert abs(inside.mean() - 0.99) < 5.0 * np.sqrt(0.99 * 0.01 / 20_000)
 
 
 def test_guided_matching_looks_only_inside_the_gates() -> None:
@@ -131,5 +131,3 @@ def test_bad_input_is_an_error() -> None:
         match(floats, floats, binary=False, allowed=np.ones((1, 2), dtype=bool))
     with pytest.raises(InputError, match=r"covariance 1 is .* expected positive definite"):
         gates(np.zeros((2, 2)), np.array([np.eye(2), -np.eye(2)]), np.zeros((1, 2)))
-    with pytest.raises(InputError, match=r"probability of a gate is 1.0"):
-        gates(np.zeros((1, 2)), np.eye(2)[None], np.zeros((1, 2)), 1.0)
