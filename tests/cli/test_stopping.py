@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -18,20 +17,8 @@ def compare(processes, out, short_log, **options):
     endless = ("--set", "particle_filter.particles=1000000")
     line = ("compare", short_log, "-e", "dead_reckoning,particle_filter", "-o", out, "--jobs", 1, *endless)
     running = processes.start(*COMMAND, *line, **options)
-    processes.wait_until(lambda: list(out.glob("store/*/*/metrics.json")) and children(running.pid))
+    processes.wait_until(lambda: list(out.glob("store/*/*/metrics.json")) and len(processes.of_group(running.pid)) > 1)
     return running
-
-
-def children(pid):
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parent = int(path.read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-        if parent == pid:
-            found.append(int(path.parent.name))
-    return found
 
 
 def temporary(folder):

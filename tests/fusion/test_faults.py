@@ -1,6 +1,7 @@
 """Every estimator on a simulated run with what goes wrong on real ones."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,14 +30,7 @@ def log():
 @pytest.fixture(scope="module")
 def clean(log):
     """``clean(name)``: the result on the undisturbed log, computed once."""
-    known = {}
-
-    def of(name):
-        if name not in known:
-            known[name] = run(log, DEAD_RECKONING if name == "dead_reckoning" else CONFIGS[name])
-        return known[name]
-
-    return of
+    return cache(lambda name: run(log, DEAD_RECKONING if name == "dead_reckoning" else CONFIGS[name]))
 
 
 def rows_of(stream, rows):

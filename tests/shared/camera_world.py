@@ -178,7 +178,7 @@ def with_frames(log, seed=2, rate=5.0, wrong=0.0, clutter=100):
     return replace(log, rig=rig, world=World(points=points), streams=streams)
 
 
-def with_tracks(log, lifetime, seed=5, points=None, begin=0.13, every=0.3):
+def with_tracks(log, lifetime, seed=5, points=None, begin=0.13, every=0.3, clutter=60):
     """The log with features in place of named points, in an image ``every`` so many seconds, and no map; each is followed for
     ``lifetime`` [s]."""
     rng = np.random.default_rng(seed)
@@ -186,7 +186,7 @@ def with_tracks(log, lifetime, seed=5, points=None, begin=0.13, every=0.3):
     t = np.arange(begin, log.reference.t[-1], every)
     frames = []
     for k, (stamp, pose) in enumerate(zip(t.tolist(), log.reference.at(t), strict=True)):
-        found, shown = frame(points, pose, stamp, rng, clutter=60)
+        found, shown = frame(points, pose, stamp, rng, clutter=clutter)
         alone = 10**6 + 1000 * k + np.arange(len(shown))
         frames.append(replace(found, tracks=np.where(shown < 0, alone, shown + 1000 * int(stamp / lifetime))))
     streams = {"odometry": log.streams["odometry"], "camera": FeatureStream(t, frames)}

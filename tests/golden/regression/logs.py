@@ -17,7 +17,7 @@ from absurd_logs import rows, with_stream
 from camera_world import with_camera, with_frames, with_sightings
 from recorded_logs import recorded_log
 
-from factorgraph_loc import FeatureStream, Log, PointMap, World
+from factorgraph_loc import Log, PointMap, World
 from factorgraph_loc.maps.markers import Marker, corner_points
 from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
@@ -43,14 +43,8 @@ def frames() -> Log:
 
 def followed_frames() -> Log:
     """The same, whose features are followed from image to image as long as they show one point."""
-    log, rng = room(), np.random.default_rng(2)
-    points = camera_world.with_views(log.world.points)
-    t, found = np.arange(0.13, log.reference.t[-1], 0.2), []
-    for k, (stamp, pose) in enumerate(zip(t, log.reference.at(t), strict=True)):
-        frame, shown = camera_world.frame(points, pose, stamp, rng, clutter=30)
-        alone = len(points) + 1000 * k + np.arange(len(shown))
-        found.append(replace(frame, tracks=np.where(shown >= 0, shown, alone)))
-    return replace(frames(), streams={"odometry": log.streams["odometry"], "camera": FeatureStream(t, found)})
+    followed = camera_world.with_tracks(room(), np.inf, seed=2, every=0.2, clutter=30)
+    return replace(frames(), streams=followed.streams)
 
 
 def _silent(log: Log, sensor: str, start: float, end: float) -> Log:
