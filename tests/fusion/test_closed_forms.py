@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 from by_hand import made
+from on_a_line import STEP, WHEELS, drive, kalman
 
-from factorgraph_loc import BearingRange, IncrementOdometry, Landmark, Rig, Tick, World
+from factorgraph_loc import BearingRange, IncrementOdometry, Landmark, Rig, World
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeUncertainty
 from factorgraph_loc.sensors.odometry.settings import (
-    GrowthSettings,
-    OdometryNoise,
-    OdometrySettings,
     OdometryUncertainty,
 )
 from factors import se2
@@ -18,50 +16,19 @@ from factors.landmarks.model import log_likelihood
 
 # Landmarks so far ahead that range measures x and bearing measures heading: the problem along x is linear and Gaussian.
 FAR = World(landmarks={"far": Landmark(x=1e4, y=0.0)})
-ALONG = GrowthSettings(per_distance=0.1)
-STIFF = GrowthSettings(per_distance=1e-6)
-WHEELS = OdometrySettings(noise=OdometryNoise(along=ALONG, lateral=STIFF, heading=STIFF))
 SENSOR = BearingRangeSettings(range_sigma=0.3, bearing_sigma=0.5, robust=100.0)
 LINEAR = Rig(odometry=WHEELS, bearing_range=SENSOR)
 STEPS, SENSORS = 30, ("odometry", "bearing_range")
 PRIOR_SIGMAS = np.array((0.2, 1e-4, 1e-5))
-SCALE, AHEAD = (
-    0.1,
-    0.4,
-)  # standard deviations of the wheels' scale, and of the sensor's place ahead of the robot's centre [m]
+SCALE, AHEAD = 0.1, 0.4  # standard deviations of the wheels' scale, and of how far ahead the sensor sits [m]
 
 
-def drive(estimator, ranges):
-    """Steps of 0.5 m in 0.5 s along x, a range after each; causal x and variance of x at each step."""
-    estimator.initialize(PosePrior(0.0, np.zeros(3), np.diag(PRIOR_SIGMAS**2)))
-    estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
-    causal = []
-    for i, measured in enumerate(ranges, start=1):
-        t = 0.5 * i
-        estimator.process(IncrementOdometry(t, 0.5, 0.0, 0.0))
-        estimator.process(BearingRange(t, ("far",), np.array([measured]), np.array([np.nan])))
-        estimator.process(Tick(t))
-        estimate = estimator.estimate()
-        causal.append((estimate.pose[0], estimate.covariance[0, 0]))
-    return np.array(causal)
-
-
-def kalman(ranges):
-    """The Kalman filter and the Rauch-Tung-Striebel smoother of the scalar problem: rows of (mean, variance)."""
-    mean, variance = 0.0, PRIOR_SIGMAS[0] ** 2
-    predicted, filtered = [], []
-    for measured in ranges:
-        mean, variance = mean + 0.5, variance + 0.1**2 * 0.5
-        predicted.append((mean, variance))
-        gain = variance / (variance + 0.3**2)
-        mean, variance = mean + gain * (1e4 - measured - mean), (1.0 - gain) * variance
-        filtered.append((mean, variance))
-    smoothed = [filtered[-1]]
-    for (m, v), (pm, pv) in zip(filtered[-2::-1], predicted[:0:-1], strict=True):
-        gain = v / pv
-        after_m, after_v = smoothed[0]
-        smoothed.insert(0, (m + gain * (after_m - pm), v + gain**2 * (after_v - pv)))
-    return np.array(filtered), np.array(smoothed)
+def ranged(estimator, ranges):
+    """The causal x and its variance, by steps of half a metre with a range after each."""
+    measurements = (
+        BearingRange(STEP * i, ("far",), np.array([r]), np.array([np.nan])) for i, r in enumerate(ranges, start=1)
+    )
+    return drive(estimator, PRIOR_SIGMAS, 0.5, measurements)
 
 
 def measured(seed, step=0.5):
@@ -78,9 +45,9 @@ def ranges():
 
 @pytest.mark.parametrize("name", ["ekf", "smoother", "smoother with a long window", "batch"])
 def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name, ranges):
-    filtered, smoothed = kalman(ranges)
+    filtered, smoothed = kalman(1e4 - ranges, PRIOR_SIGMAS, 0.5, 0.3**2)
     estimator = made(name.split()[0], LINEAR, FAR, SENSORS, **({"lag": 100.0} if "window" in name else {}))
-    causal = drive(estimator, ranges)
+    causal = ranged(estimator, ranges)
     if name != "batch":  # which has no causal result
         np.testing.assert_allclose(causal[:, 0], filtered[:, 0], atol=2e-3)
         np.testing.assert_allclose(causal[:, 1], filtered[:, 1], rtol=2e-2)
@@ -91,7 +58,7 @@ def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name, r
 
 def test_a_particle_filter_comes_near_the_kalman_filter_and_smoother(ranges):
     ranges = ranges[:15]
-    filtered, smoothed = kalman(ranges)
+    filtered, smoothed = kalman(1e4 - ranges, PRIOR_SIGMAS, 0.5, 0.3**2)
     estimator = made(
         "particle_filter",
         LINEAR,
@@ -102,7 +69,7 @@ def test_a_particle_filter_comes_near_the_kalman_filter_and_smoother(ranges):
         smoothing_interval=0.5,
         smoothing_trajectories=1000,
     )
-    causal = drive(estimator, ranges)
+    causal = ranged(estimator, ranges)
     # the mean of N particles of spread s is off by s / sqrt(N_eff): 6 sigma of 2,000 effective ones, below 1e-7 of false alarms
     bound = 6.0 * np.sqrt(filtered[:, 1] / 2000.0)
     assert np.all(np.abs(causal[:, 0] - filtered[:, 0]) < bound)
@@ -133,7 +100,7 @@ def test_constants_that_are_estimated_on_the_way_are_those_of_least_squares(name
     wheels = WHEELS.model_copy(update={"uncertainty": OdometryUncertainty(scale_distance=SCALE)})
     sensor = SENSOR.model_copy(update={"uncertainty": BearingRangeUncertainty(x=AHEAD)})
     estimator = made(name, Rig(odometry=wheels, bearing_range=sensor), FAR, SENSORS)
-    drive(estimator, ranges)
+    ranged(estimator, ranges)
     final, learnt = estimator.trajectory(), estimator.learnt().values
     np.testing.assert_allclose(final.poses[:, 0], mean[3:], atol=2e-3)
     np.testing.assert_allclose(final.covariances[:, 0, 0], np.diag(covariance)[3:], rtol=2e-2)

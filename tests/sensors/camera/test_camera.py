@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from by_hand import made
 from camera_world import CAMERA, frame, room, simulate, with_views
+from on_a_line import GROWTH, STEP, WHEELS, drive, kalman
 
-from factorgraph_loc import CameraFrame, IncrementOdometry, PixelSightings, PointMap, Rig, Tick, World
+from factorgraph_loc import CameraFrame, PixelSightings, PointMap, Rig, Tick, World
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, KnownPoints, Predicted
-from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
 from factors import se2
 from factors.camera import model as reprojection
 from factors.camera.factor import image_update
@@ -26,7 +26,6 @@ def log():
 
 # A camera that looks along y at points 5 m away on a robot that moves along x: u measures x, linearly.
 FAR = np.column_stack((np.linspace(-3.0, 3.0, 9), np.full(9, 5.0), np.zeros(9)))
-STIFF = GrowthSettings(per_distance=1e-6)
 SIGMAS = np.array((0.2, 1e-5, 1e-6))
 
 
@@ -43,8 +42,7 @@ def side_camera():
             "robust": 100.0,
         }
     )
-    noise = OdometryNoise(along=GrowthSettings(per_distance=0.1), lateral=STIFF, heading=STIFF)
-    return Rig(sensors=("odometry", "sightings"), odometry=OdometrySettings(noise=noise), camera=settings)
+    return Rig(sensors=("odometry", "sightings"), odometry=WHEELS, camera=settings)
 
 
 @pytest.mark.parametrize("name", ["ekf", "smoother", "batch", "particle_filter"])
@@ -54,31 +52,16 @@ def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name):
     many = {"particles": 5000, "smoothing_interval": 0.5, "smoothing_trajectories": 300}
     settings = many if name == "particle_filter" else {}
     estimator = made(name, rig, World(points=points), rig.sensors, 7, **settings)
-    estimator.initialize(PosePrior(0.0, np.zeros(3), np.diag(SIGMAS**2)))
-    estimator.process(IncrementOdometry(0.0, 0.0, 0.0, 0.0))
-    x, mean, variance = 0.1, 0.0, SIGMAS[0] ** 2
-    noise = (model.sigma * 5.0 / model.fx) ** 2 / 9.0  # of x from all points
-    predicted, filtered, causal = [], [], []
+    x, images = 0.1, []
     for i in range(1, 16):
-        x += 0.1 + 0.1 * np.sqrt(0.1) * rng.standard_normal()
+        x += 0.1 + np.sqrt(0.1 * GROWTH) * rng.standard_normal()
         pixels = reprojection.predict(model, np.array((x, 0.0, 0.0)), FAR)[0]
         pixels += model.sigma * rng.standard_normal(pixels.shape)
-        estimator.process(IncrementOdometry(0.5 * i, 0.1, 0.0, 0.0))
-        estimator.process(PixelSightings(0.5 * i, points.names, pixels))
-        estimator.process(Tick(0.5 * i))
-        estimate = estimator.estimate()
-        causal.append((estimate.pose[0], estimate.covariance[0, 0]))
-        measured = np.mean(FAR[:, 0] - (pixels[:, 0] - model.cx) * 5.0 / model.fx)
-        mean, variance = mean + 0.1, variance + 0.1**2 * 0.1
-        predicted.append((mean, variance))
-        gain = variance / (variance + noise)
-        mean, variance = mean + gain * (measured - mean), (1.0 - gain) * variance
-        filtered.append((mean, variance))
-    smoothed = [filtered[-1]]
-    for (m, v), (pm, pv) in zip(filtered[-2::-1], predicted[:0:-1], strict=True):
-        gain = v / pv
-        smoothed.insert(0, (m + gain * (smoothed[0][0] - pm), v + gain**2 * (smoothed[0][1] - pv)))
-    filtered, smoothed, causal = np.array(filtered), np.array(smoothed), np.array(causal)
+        images.append(PixelSightings(STEP * i, points.names, pixels))
+    causal = drive(estimator, SIGMAS, 0.1, images)
+    places = [np.mean(FAR[:, 0] - (m.pixels[:, 0] - model.cx) * 5.0 / model.fx) for m in images]
+    noise = (model.sigma * 5.0 / model.fx) ** 2 / 9.0  # of x from all points
+    filtered, smoothed = kalman(places, SIGMAS, 0.1, noise)
     final = estimator.trajectory()
     if name == "particle_filter":
         # the mean of particles of spread s is off by s / sqrt(N_eff): 6 sigma of 500 effective ones, below 1e-7 of false alarms
