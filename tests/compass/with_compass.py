@@ -87,7 +87,7 @@ def test_a_topic_of_a_bag_by_a_mapping(tmp_path):
             t = UNIX + i * 10**9
             made.odometry("/odom", t, (0.1 * i, 0.0, 0.0))
             vector = made.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=heading)
-            made.write("/kvh", t, "geometry_msgs/msg/Vector3Stamped", header=made.header(t), vector=vector)
+            made.stamped("/kvh", t, "geometry_msgs/msg/Vector3Stamped", vector=vector)
     (tmp_path / "arc.toml").write_text(
         'title = "arc"\nreader = "rosbag"\nlicence = "none"\norigin = "made"\npath = "arc.bag"\n'
         '[options.odometry]\ntopic = "/odom"\n'

@@ -13,11 +13,11 @@ from factors.camera.model import mounting
 def add_image(made, t_ns, pixels, encoding, padding=0, kind=np.uint8, topic="/camera/image_raw"):
     rows = np.ascontiguousarray(pixels.astype(kind)).reshape(len(pixels), -1).view(np.uint8)
     rows = np.pad(rows, ((0, 0), (0, padding)))
-    made.write(
+    made.stamped(
         topic,
         t_ns,
         "sensor_msgs/msg/Image",
-        header=made.header(t_ns, "camera"),
+        frame="camera",
         height=pixels.shape[0],
         width=pixels.shape[1],
         encoding=encoding,
@@ -63,11 +63,10 @@ def test_a_bayer_pattern_becomes_colour(maker, read_drive):
 
 def test_an_image_with_too_few_bytes(maker, refuse_drive, tmp_path):
     pixels = np.zeros((4, 4, 1))
-    maker.write(
+    maker.stamped(
         "/camera/image_raw",
         T0,
         "sensor_msgs/msg/Image",
-        header=maker.header(T0),
         height=5,
         width=4,
         encoding="mono8",
@@ -83,11 +82,11 @@ def add_info(made, **changes):
     upper = str.upper if made.ros1 else str
     lens = {"d": np.array((0.1, 0.02, 0.003, 0.004, 0.0)), "k": np.array((500.0, 0, 320, 0, 510, 240, 0, 0, 1))}
     lens |= {"r": np.eye(3).ravel(), "p": np.zeros(12)} | changes
-    made.write(
+    made.stamped(
         "/camera/camera_info",
         T0,
         "sensor_msgs/msg/CameraInfo",
-        header=made.header(T0, "lens"),
+        frame="lens",
         height=480,
         width=640,
         distortion_model="plumb_bob",

@@ -74,7 +74,7 @@ def test_what_is_measured_comes_before_frames(maker, read_drive):
     add_tree(maker, world="vicon")
     made = maker
     t = T0
-    made.write("/mocap/pose", t, "geometry_msgs/msg/PoseStamped", header=made.header(t), pose=made.pose(1.0, 2.0, 0.0))
+    made.stamped("/mocap/pose", t, "geometry_msgs/msg/PoseStamped", pose=made.pose(1.0, 2.0, 0.0))
     read_drive(maker)
     found = proposed(maker.path)
     assert found.options == {"odometry": {"topic": "/odom"}, "reference": {"topic": "/mocap/pose"}}

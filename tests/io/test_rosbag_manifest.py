@@ -30,7 +30,7 @@ def proposal(tmp_path, bag_maker):
 
 
 def pose_of(made, topic, kind="geometry_msgs/msg/PoseStamped"):
-    made.write(topic, T0, kind, header=made.header(T0), pose=made.pose(0.0, 0.0, 0.0))
+    made.stamped(topic, T0, kind, pose=made.pose(0.0, 0.0, 0.0))
 
 
 def test_odometry_and_truth_are_told_apart_by_their_names(proposal):
@@ -130,7 +130,7 @@ def test_images_and_what_tells_of_their_camera(proposal):
         made.odometry("/odom", T0, (0.0, 0.0, 0.0))
         for topic in ("/front/image_raw/compressed", "/front/depth/compressed"):
             kind = "sensor_msgs/msg/CompressedImage"
-            made.write(topic, T0, kind, header=made.header(T0), format="jpeg", data=np.zeros(3, dtype=np.uint8))
+            made.stamped(topic, T0, kind, format="jpeg", data=np.zeros(3, dtype=np.uint8))
 
     found, _, text = proposal(fill)
     assert found.options["camera"] == {"topic": "/front/image_raw/compressed"}

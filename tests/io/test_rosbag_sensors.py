@@ -82,13 +82,9 @@ def test_a_gyro_that_is_mounted_otherwise(maker, read_drive, options, axis):
 def add_poses(maker, poses):
     """Poses in space, of positions and quaternions (N, 7)."""
     for i, (x, y, z, *q) in enumerate(poses):
-        pose = maker.make(
-            "geometry_msgs/msg/Pose",
-            position=maker.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-            orientation=maker.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q, strict=True))),
+        maker.stamped(
+            "/truth", T0 + 100 * MS * i, "geometry_msgs/msg/PoseStamped", pose=maker.pose_in_space((x, y, z), q)
         )
-        t = T0 + 100 * MS * i
-        maker.write("/truth", t, "geometry_msgs/msg/PoseStamped", header=maker.header(t), pose=pose)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +163,7 @@ def test_corners_of_tags(maker, read_drive):
     corners = [maker.make("apriltag_msgs/msg/Point", x=10.0 + i, y=20.0 + i) for i in range(4)]
     tag = maker.make("apriltag_msgs/msg/AprilTagDetection", family="tag36h11", id=5, corners=corners)
     kind = "apriltag_msgs/msg/AprilTagDetectionArray"
-    maker.write("/tags", T0, kind, header=maker.header(T0), detections=[tag])
+    maker.stamped("/tags", T0, kind, detections=[tag])
     seen = read_drive(maker, sightings={"topic": "/tags"}).streams["sightings"]
     assert seen.point == [f"tag36h11-5/{i}" for i in (3, 2, 1, 0)]  # from the lower left
     assert seen.u.tolist() == [10.0, 11.0, 12.0, 13.0]
@@ -179,7 +175,7 @@ def test_a_start(maker, read_drive):
     spread[[0, 1, 5], [0, 1, 5]] = 0.01, 0.04, 0.09
     pose = maker.make("geometry_msgs/msg/PoseWithCovariance", pose=maker.pose(1.0, 2.0, 3.0), covariance=spread.ravel())
     kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-    maker.write("/initialpose", T0 + 250 * MS, kind, header=maker.header(T0 + 250 * MS, "map"), pose=pose)
+    maker.stamped("/initialpose", T0 + 250 * MS, kind, frame="map", pose=pose)
     start = read_drive(maker, start={"topic": "/initialpose"}).start
     assert start.t == pytest.approx(0.25)
     np.testing.assert_allclose(start.pose, (1.0, 2.0, 3.0), atol=1e-12)

@@ -12,11 +12,10 @@ import factorgraph_loc as fgloc
 def add_wheels(made, left, right, names=("arm", "l", "r")):
     for i, (a, b) in enumerate(zip(left, right, strict=True)):
         t = T0 + 100 * MS * i
-        made.write(
+        made.stamped(
             "/joints",
             t,
             "sensor_msgs/msg/JointState",
-            header=made.header(t),
             name=list(names),
             position=np.array((9.0, a, b)),
             velocity=np.array((9.0, 2.0 * i, 4.0 * i)),
@@ -41,11 +40,10 @@ def test_wheels_as_a_differential_drive(maker, read_drive, one):
 
 
 def test_wheels_that_tell_their_speed_alone(maker, refuse_drive):
-    maker.write(
+    maker.stamped(
         "/joints",
         T0,
         "sensor_msgs/msg/JointState",
-        header=maker.header(T0),
         name=["l", "r"],
         position=np.zeros(0),
         velocity=np.ones(2),

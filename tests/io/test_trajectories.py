@@ -56,18 +56,11 @@ def test_rows_of_one_stamp_give_a_warning(tmp_path):
 def test_a_topic_of_a_bag(maker):
     for i in range(COUNT):
         t = BAG_T0 + 100 * MS * i
-        maker.write(
-            "/mocap",
-            t,
-            "geometry_msgs/msg/PoseStamped",
-            header=maker.header(t),
-            pose=maker.pose(0.1 * i, 1.0, 0.2, 0.5),
-        )
-        maker.write(
+        maker.stamped("/mocap", t, "geometry_msgs/msg/PoseStamped", pose=maker.pose(0.1 * i, 1.0, 0.2, 0.5))
+        maker.stamped(
             "/gnss",
             t,
             "geometry_msgs/msg/PointStamped",
-            header=maker.header(t),
             point=maker.make("geometry_msgs/msg/Point", x=0.1 * i, y=2.0, z=0.0),
         )
     maker.writer.close()

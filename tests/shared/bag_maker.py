@@ -1,6 +1,7 @@
 """Bags made by hand."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -59,21 +60,29 @@ class BagMaker:
         more = {"seq": 0} if self.ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=self.time(ns), frame_id=frame, **more)
 
+    def vector(self, kind: str, *values: float) -> object:
+        return self.make(f"geometry_msgs/msg/{kind}", **dict(zip("xyzw", values, strict=False)))
+
+    def pose_in_space(self, position: Sequence[float], quaternion: Sequence[float]) -> object:
+        place, turn = self.vector("Point", *position), self.vector("Quaternion", *quaternion)
+        return self.make("geometry_msgs/msg/Pose", position=place, orientation=turn)
+
     def pose(self, x: float, y: float, heading: float, z: float = 0.0) -> object:
-        q = (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
-        position = self.make("geometry_msgs/msg/Point", x=x, y=y, z=z)
-        turn = self.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3])
-        return self.make("geometry_msgs/msg/Pose", position=position, orientation=turn)
+        return self.pose_in_space((x, y, z), (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)))
 
     def twist(self, v: float, w: float) -> object:
-        vectors = [self.make("geometry_msgs/msg/Vector3", x=x, y=0.0, z=z) for x, z in ((v, 0.0), (0.0, w))]
-        return self.make("geometry_msgs/msg/Twist", linear=vectors[0], angular=vectors[1])
+        along, about = self.vector("Vector3", v, 0.0, 0.0), self.vector("Vector3", 0.0, 0.0, w)
+        return self.make("geometry_msgs/msg/Twist", linear=along, angular=about)
 
     def write(self, topic: str, received: int, kind: str, **fields: object) -> None:
         self.topic(topic, kind)
         message = self.make(kind, **fields)
         raw = (self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr)(message, kind)
         self.writer.write(self.connections[topic], received, raw)
+
+    def stamped(self, topic: str, ns: int, kind: str, frame: str = "", **fields: object) -> None:
+        """Write a message with a header, which is received at the time of its stamp."""
+        self.write(topic, ns, kind, header=self.header(ns, frame), **fields)
 
     def odometry(
         self,

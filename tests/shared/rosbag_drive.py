@@ -42,18 +42,14 @@ def refuse_drive(refused):
 
 
 def transform(made, t_ns, parent, child, place, heading=0.0, quaternion=None):
-    z, w = math.sin(heading / 2), math.cos(heading / 2)
-    q = quaternion or (0.0, 0.0, z, w)
-    return made.make(
-        "geometry_msgs/msg/TransformStamped",
-        header=made.header(t_ns, parent),
-        child_frame_id=child,
-        transform=made.make(
-            "geometry_msgs/msg/Transform",
-            translation=made.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", place, strict=True))),
-            rotation=made.make("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q, strict=True))),
-        ),
+    turn = quaternion or (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
+    moved = made.make(
+        "geometry_msgs/msg/Transform",
+        translation=made.vector("Vector3", *place),
+        rotation=made.vector("Quaternion", *turn),
     )
+    header = made.header(t_ns, parent)
+    return made.make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=moved)
 
 
 def add_frames(made, topic, t_ns, *transforms):
@@ -62,13 +58,11 @@ def add_frames(made, topic, t_ns, *transforms):
 
 def add_imu(made, rates, topic="/imu", t_ns=T0):
     """A message of an IMU for each of ``rates`` (N, 3), ten a second."""
-    for i, (x, y, z) in enumerate(rates):
-        t = t_ns + 100 * MS * i
-        vectors = [made.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z) for _ in range(2)]
-        turn = made.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-        told = {"orientation": turn, "angular_velocity": vectors[0], "linear_acceleration": vectors[1]}
+    for i, rate in enumerate(rates):
+        turn, spin = made.vector("Quaternion", 0.0, 0.0, 0.0, 1.0), made.vector("Vector3", *rate)
+        told = {"orientation": turn, "angular_velocity": spin, "linear_acceleration": spin}
         told |= {f"{name}_covariance": np.zeros(9) for name in tuple(told)}
-        made.write(topic, t, "sensor_msgs/msg/Imu", header=made.header(t), **told)
+        made.stamped(topic, t_ns + 100 * MS * i, "sensor_msgs/msg/Imu", **told)
 
 
 def proposed(path):
