@@ -128,6 +128,8 @@ def test_a_run_that_ends_its_workers_is_a_failure_and_the_others_go_on(workers, 
         (outcome,) = execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()))
     assert outcome.status == "failed"
     assert Store(folder).row(runs[0].key)["kind"] == "killed"
+    with distributed.Client(workers) as client:
+        client.wait_for_workers(1)  # the one that died is replaced
     others = list(execute(runs[1:], folder, Cluster(workers.scheduler_address, Limits())))
     assert [other.status for other in others] == ["ok"]
 
