@@ -224,7 +224,6 @@ POINTS = Table(
         *(within(name, LENGTH, FARTHEST, "position in the world") for name in "xyz"),
         *(within(name, {"m^2": 1.0}, 1e8, "of its covariance") for name in ("xx", "xy", "xz", "yy", "yz", "zz")),
         *(within(f"from_{name}", LENGTH, FARTHEST, "position of the camera of a view") for name in "xyz"),
-        number("size", PIXELS, 1e-3, LARGEST_PIXEL, "of the feature in that view"),
         *(
             within(f"cov_{name}", {unit: 1.0}, 1e8, "of the frame of the map there, if it was made without a reference")
             for name, unit in zip(

@@ -182,7 +182,6 @@ def point_map(
         owners=tracks.track[shown],
         descriptors=np.array([posed.frames[i].descriptors[k] for i, k in views_of]),
         seen_from=cameras.positions[tracks.frame[shown]],
-        sizes=np.array([posed.frames[i].sizes[k] for i, k in views_of], dtype=float),
     )
 
 

@@ -82,7 +82,6 @@ def chosen(points: PointMap, which: Integers) -> PointMap:
         place[points.owners[views]],
         points.descriptors[views],
         points.seen_from[views],
-        points.sizes[views],
         None if points.common is None else points.common[views],
     )
 
@@ -108,7 +107,6 @@ def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers
         np.concatenate((first.owners, owners[second.owners])),
         np.concatenate([points.descriptors for points in parts]),
         np.concatenate((first.seen_from, second.seen_from)),
-        np.concatenate((first.sizes, second.sizes)),
         _common(first, second),
     )
 

@@ -23,7 +23,7 @@ from factors.se2 import Array
 
 POINTS_SUFFIX = ".points.parquet"
 COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
-VIEW = ("from_x", "from_y", "from_z", "size")
+VIEW = ("from_x", "from_y", "from_z")
 Feature = Literal["colour", "sift", "orb"]
 KINDS: tuple[str, ...] = get_args(Feature)
 LARGEST_VALUE = 1e6  # largest absolute value of a descriptor
@@ -47,9 +47,9 @@ class PointMap:
 
     ``names``: P, unique; ``positions`` (P, 3) [m] in the world frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
     the views' ``descriptors`` (V, D), empty where points are identified by name only (V = 0). ``owners`` (V,): the point of
-    each view; ``seen_from`` (V, 3) [m]: the camera's position; ``sizes`` (V,) [px]: size of the feature in the image. ``common``
-    (V, 3, 3): for a map that was made without a reference, the covariance of (x, y, heading) of the local frame, about the camera.
-    This is the common error of all points in a view; see :mod:`.common_error`.
+    each view; ``seen_from`` (V, 3) [m]: the camera's position. ``common`` (V, 3, 3): for a map that was made without a reference,
+    the covariance of (x, y, heading) of the local frame, about the camera. This is the common error of all points in a view; see
+    :mod:`.common_error`.
     """
 
     names: tuple[str, ...]
@@ -59,7 +59,6 @@ class PointMap:
     owners: NDArray[np.int64]
     descriptors: NDArray[Any]
     seen_from: Array
-    sizes: Array
     common: Array | None = None
 
     def __len__(self) -> int:
@@ -82,7 +81,6 @@ class PointMap:
     def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
         """Return a map of points that are identified by name only; exact if no covariances are given."""
         spatial = np.zeros((len(names), 3, 3)) if covariances is None else covariances
-        nothing = np.empty(0)
         return cls(
             tuple(names),
             positions,
@@ -91,7 +89,6 @@ class PointMap:
             np.empty(0, dtype=np.int64),
             np.empty((0, 0)),
             np.empty((0, 3)),
-            nothing,
         )
 
     def with_points(self, added: PointMap, source: object) -> PointMap:
@@ -120,9 +117,8 @@ def write_points(points: PointMap, path: Path) -> None:
     columns["feature"] = [points.feature if v >= 0 else "" for v in views.tolist()]
     if len(points.owners):
         shown = views >= 0
-        for axis, name in enumerate(VIEW[:3]):
+        for axis, name in enumerate(VIEW):
             columns[name] = np.where(shown, points.seen_from[views, axis], np.nan)
-        columns["size"] = np.where(shown, points.sizes[views], np.nan)
         if points.common is not None:
             entries = COVARIANCES.items()
             columns |= {name: np.where(shown, points.common[views, i, j], np.nan) for name, (i, j) in entries}
@@ -165,7 +161,6 @@ def read_points(path: Path) -> PointMap:
     if not kinds:
         return PointMap.of(tuple(rows), positions[first], covariances)
     shown = np.flatnonzero([bool(name) for name in features])
-    columns = [_numbers(table, name, shown, path) for name in VIEW]
     common = None
     if any(name in table.columns for name in COVARIANCES):
         common = symmetric([_numbers(table, name, shown, path) for name in COVARIANCES])
@@ -177,8 +172,7 @@ def read_points(path: Path) -> PointMap:
         kinds[0],
         owner[shown],
         _descriptors(table, shown, kinds[0], path),
-        np.column_stack(columns[:3]),
-        columns[3],
+        np.column_stack([_numbers(table, name, shown, path) for name in VIEW]),
         common,
     )
 

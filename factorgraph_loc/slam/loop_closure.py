@@ -181,7 +181,6 @@ def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> 
         np.arange(len(rows)),
         points.descriptors[rows],
         points.seen_from[rows] + positions - points.positions[rows],
-        points.sizes[rows],
     )
 
 

@@ -30,13 +30,12 @@ FARTHEST = 15.0  # m of its depth
 
 @dataclass(frozen=True, slots=True)
 class PointView:
-    """A view of a point: the feature's ``descriptor`` (D,) and ``size`` [px], and the camera position ``seen_from`` (3,).
+    """A view of a point: the feature's ``descriptor`` (D,), and the camera position ``seen_from`` (3,).
 
     ``travelled`` [m]: distance travelled by the robot until the view. ``keyframe``: its key; ``guess``: of its pose.
     """
 
     descriptor: NDArray[Any]
-    size: float
     seen_from: Array
     travelled: float
     keyframe: int
@@ -62,7 +61,7 @@ class PointViews:
         """Store the view of a ``point`` from the feature ``row`` of a frame, taken at a ``keyframe``."""
         self._feature = frame.feature
         seen_from = camera_pose(self._model, guess[0])[0]
-        view = PointView(frame.descriptors[row], float(frame.sizes[row]), seen_from, travelled, keyframe, guess)
+        view = PointView(frame.descriptors[row], seen_from, travelled, keyframe, guess)
         last_view, earlier = self._views.get(point), self._earlier.setdefault(point, [])
         if (
             last_view is not None
@@ -145,5 +144,4 @@ class PointViews:
             owners=np.array([i for i, _ in rows]),
             descriptors=np.array([view.descriptor for _, view in rows]),
             seen_from=np.array([view.seen_from for _, view in rows]),
-            sizes=np.array([view.size for _, view in rows]),
         )

@@ -26,16 +26,15 @@ _FEATURES = struct.Struct("<IIBB")
 
 @dataclass(frozen=True, eq=False)
 class ImageFeatures:
-    """``pixels`` (K, 2) and ``sizes`` (K,) [px], ``descriptors`` (K, D)."""
+    """``pixels`` (K, 2) [px], ``descriptors`` (K, D)."""
 
     pixels: Array
-    sizes: Array
     descriptors: Descriptors
 
 
 def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
-    """Encode pixels and sizes with 24 bits (0.001 px or better), descriptors without loss."""
-    points = np.column_stack((keypoints.points, keypoints.sizes)).astype("<f4")
+    """Encode pixels with 24 bits (0.001 px or better), descriptors without loss."""
+    points = keypoints.points.astype("<f4")
     binary = descriptors.dtype == np.uint8
     narrow = descriptors.astype(np.uint8)
     fits = binary or bool(np.array_equal(narrow, descriptors))  # those of SIFT are integers below 256
@@ -48,13 +47,12 @@ def decode(content: bytes) -> ImageFeatures:
     if len(content) < _FEATURES.size:
         raise ValueError("these bytes are no features")
     count, columns, binary, fits = _FEATURES.unpack_from(content)
-    split = _FEATURES.size + 12 * count
+    split = _FEATURES.size + 8 * count
     if len(content) != split + count * columns * (1 if fits else 4):
         raise ValueError("these bytes are no features")
-    points = np.frombuffer(content[_FEATURES.size : split], dtype="<f4").reshape(count, 3).astype(float)
+    pixels = np.frombuffer(content[_FEATURES.size : split], dtype="<f4").reshape(count, 2).astype(float)
     stored = np.frombuffer(content[split:], dtype=np.uint8 if fits else "<f4").reshape(count, columns)
-    descriptors = stored.astype(np.uint8 if binary else np.float32)
-    return ImageFeatures(np.ascontiguousarray(points[:, :2]), np.ascontiguousarray(points[:, 2]), descriptors)
+    return ImageFeatures(pixels, stored.astype(np.uint8 if binary else np.float32))
 
 
 VARIABLE = "FGLOC_CACHE"  # environment variable: a folder other than the user's

@@ -13,8 +13,8 @@ from factors.se2 import Array
 class CameraFrame:
     """The features of one image, empty if it could not be read.
 
-    ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left pixel; ``sizes`` (K,) [px] and ``descriptors``
-    (K, D) of the kind ``feature``. ``tracks`` (K,): numbers of the tracks that features belong to.
+    ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left pixel; ``descriptors`` (K, D) of the kind
+    ``feature``. ``tracks`` (K,): numbers of the tracks that features belong to.
     """
 
     sensor: ClassVar[str] = "camera"
@@ -24,7 +24,6 @@ class CameraFrame:
     t: float
     feature: str
     pixels: Array
-    sizes: Array
     descriptors: NDArray[Any]
     tracks: NDArray[np.int64]
     source: str = modality

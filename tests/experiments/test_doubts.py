@@ -20,7 +20,7 @@ def blank(log):
     """The short log with a camera whose images show features that no map has, and pixels of an unknown name; no map."""
     nothing = np.zeros((12, 32), dtype=np.uint8)
     frames = [
-        CameraFrame(float(t), "orb", np.full((12, 2), 50.0), np.ones(12), nothing, np.arange(12) + 12 * i)
+        CameraFrame(float(t), "orb", np.full((12, 2), 50.0), nothing, np.arange(12) + 12 * i)
         for i, t in enumerate(STAMPS)
     ]
     streams = {
@@ -41,7 +41,6 @@ def with_points(log, views):
         owners=np.zeros(views, dtype=np.int64),
         descriptors=np.full((views, 32), 255, dtype=np.uint8),
         seen_from=np.zeros((views, 3)),
-        sizes=np.ones(views),
     )
     return replace(log, world=log.world.model_copy(update={"points": points}))
 

@@ -83,9 +83,7 @@ def test_a_rig_without_camera_leaves_images_out_unless_they_are_asked_for(seeing
 def test_the_feature_is_that_of_the_map(seeing):
     assert frontend_of(seeing.rig, seeing.world) == FrontendSettings(feature="orb", count=30, everywhere=True)
     nothing = np.zeros((1, 3))
-    points = PointMap(
-        ("a",), nothing, np.zeros((1, 3, 3)), "sift", np.array([0]), np.zeros((1, 128)), nothing, np.ones(1)
-    )
+    points = PointMap(("a",), nothing, np.zeros((1, 3, 3)), "sift", np.array([0]), np.zeros((1, 128)), nothing)
     world = seeing.world.model_copy(update={"points": points})
     assert frontend_of(seeing.rig, world) == FrontendSettings(feature="sift", count=30)
     named = seeing.world.model_copy(update={"points": PointMap.of(["a"], nothing)})

@@ -49,7 +49,6 @@ def recording(log, results, tmp_path_factory):
         none,
         np.empty((0, 0)),
         np.empty((0, 3)),
-        none,
     )
     world = log.world.model_copy(update={"points": points})
     path = tmp_path_factory.mktemp("rerun") / "arc.rrd"

@@ -41,8 +41,8 @@ SOUND = [
     BearingRange(1.0, ("a",), ONE, ONE),
     RfidScan(1.0, ("left",), np.zeros(1, dtype=np.int64), ("e1",), ONE, -60.0 * ONE, ONE, 9e8 * ONE),
     PixelSightings(1.0, ("a",), np.ones((1, 2))),
-    CameraFrame(1.0, "orb", np.ones((1, 2)), ONE, np.zeros((1, 32), dtype=np.uint8), np.zeros(1, dtype=np.int64)),
-    CameraFrame(1.0, "sift", np.ones((1, 2)), ONE, np.ones((1, 128), dtype=np.float32), np.zeros(1, dtype=np.int64)),
+    CameraFrame(1.0, "orb", np.ones((1, 2)), np.zeros((1, 32), dtype=np.uint8), np.zeros(1, dtype=np.int64)),
+    CameraFrame(1.0, "sift", np.ones((1, 2)), np.ones((1, 128), dtype=np.float32), np.zeros(1, dtype=np.int64)),
 ]
 COLUMNS = {
     VelocityOdometry: VELOCITIES.columns[1:],
@@ -51,7 +51,7 @@ COLUMNS = {
     BearingRange: [column.measured for column in BEARING_RANGE.columns[2:]],
     RfidScan: READS.columns,
     PixelSightings: [PIXELS],
-    CameraFrame: [FEATURES["pixels"], FEATURES["sizes"]],
+    CameraFrame: [FEATURES["pixels"]],
 }
 COLUMNS = {kind: {column.name: column for column in columns} for kind, columns in COLUMNS.items()}
 
@@ -173,7 +173,7 @@ def test_descriptors_of_another_length_are_refused():
     localizer.initialize((1.0, 1.0, 0.0), t=0.0)
     whole = np.zeros(1, dtype=np.int64)
     for width, refused in ((32, False), (16, True), (0, True), (32, False)):
-        frame = CameraFrame(1.0, "orb", np.ones((1, 2)), ONE, np.zeros((1, width), dtype=np.uint8), whole)
+        frame = CameraFrame(1.0, "orb", np.ones((1, 2)), np.zeros((1, width), dtype=np.uint8), whole)
         if refused:
             with pytest.raises(InputError, match=rf"length of descriptors is {width}, expected 32 numbers each"):
                 localizer.push(frame)

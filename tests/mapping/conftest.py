@@ -70,8 +70,7 @@ def look() -> Callable[..., Sight]:
             seen = rng.permutation(np.flatnonzero(model.contains(pixels) & (local[:, 2] > 0.1)))
             descriptors = looks[seen] + 0.1 * rng.standard_normal((len(seen), 16)).astype(np.float32)
             numbers = np.arange(len(seen))
-            sizes = np.full(len(seen), 4.0)
-            frames.append(CameraFrame(0.1 * i, "sift", pixels[seen], sizes, descriptors, numbers))
+            frames.append(CameraFrame(0.1 * i, "sift", pixels[seen], descriptors, numbers))
             shown.append(seen)
         return Sight(model, cloud, cameras, frames, shown)
 

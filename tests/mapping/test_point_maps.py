@@ -22,7 +22,6 @@ def drive(seed, which, noise=SIGMA):
         owners,
         (looks[which][owners] + 0.1 * rng.normal(size=(len(owners), 64))).astype(np.float32),
         rng.normal(size=(len(owners), 3)),
-        np.full(len(owners), 5.0),
     ), places[which]
 
 

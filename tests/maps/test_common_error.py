@@ -27,7 +27,6 @@ def a_map(places, headings, covariances):
         np.arange(len(places)),
         np.zeros((len(places), 4), dtype=np.float32),
         np.column_stack((places, np.full(len(places), 0.9))),
-        np.full(len(places), 5.0),
         covariances,
     )
 

@@ -30,7 +30,6 @@ def a_map(count, views, feature="sift", seed=0, *, common=False):
         np.array(sorted(views), dtype=np.int64),
         descriptors,
         rng.standard_normal((len(views), 3)),
-        rng.uniform(1.0, 9.0, len(views)),
         root[views] @ root[views].transpose(0, 2, 1) if common else None,
     )
 
@@ -39,7 +38,7 @@ def assert_same(found, points):
     """Equal, covariances to what symmetry rounds."""
     for name in ("names", "feature"):
         assert getattr(found, name) == getattr(points, name)
-    for name in ("positions", "owners", "descriptors", "seen_from", "sizes"):
+    for name in ("positions", "owners", "descriptors", "seen_from"):
         np.testing.assert_array_equal(getattr(found, name), getattr(points, name))
     np.testing.assert_allclose(found.covariances, points.covariances, rtol=1e-14)
     assert (found.common is None) == (points.common is None)

@@ -136,7 +136,6 @@ def with_views(points, views=3, *, binary=False):
         owners=owners,
         descriptors=_again(looks[owners], rng),
         seen_from=middle,
-        sizes=np.full(len(owners), 5.0),
     )
 
 
@@ -158,7 +157,6 @@ def frame(points, pose, t, rng, camera=CAMERA, clutter=100, wrong=0.0, limit=400
         t,
         points.feature,
         pixels[order],
-        np.full(len(pixels), 5.0),
         looks[order],
         np.arange(len(pixels)),
     )

@@ -153,7 +153,6 @@ def test_a_track_that_comes_back_meets_the_one_that_took_its_place(log):
         frames[k] = replace(
             frame,
             pixels=frame.pixels[rows],
-            sizes=frame.sizes[rows],
             descriptors=frame.descriptors[rows],
             tracks=np.concatenate((tracks, again)),
         )
@@ -171,7 +170,7 @@ def test_few_features_that_cannot_confirm_each_other_are_not_believed():
             there = np.flatnonzero(frame.tracks < 10**6)
             rows = there[:left] if 4.0 < t < 10.0 else np.arange(len(frame.tracks))
             slipped = 40.0 * (t - 4.0) if 4.0 < t < 10.0 else 0.0
-            parts = {name: getattr(frame, name)[rows] for name in ("sizes", "descriptors", "tracks")}
+            parts = {name: getattr(frame, name)[rows] for name in ("descriptors", "tracks")}
             frames.append(replace(frame, pixels=frame.pixels[rows] + (slipped, 0.0), **parts))
         streams = {**film.streams, "camera": FeatureStream(film.streams["camera"].t, frames)}
         found = run(replace(film, streams=streams), CONFIGS["smoother"])

@@ -95,13 +95,11 @@ def test_features_come_back(count, columns, kind, whole, seed):
     rng = np.random.default_rng(seed)
     values = rng.uniform(0.0, 255.0, (count, columns))
     descriptors = (np.rint(values) if whole else values).astype(kind)
-    points, sizes = rng.uniform(0.0, 4000.0, (count, 2)), rng.uniform(1.0, 200.0, count)
-    nothing = np.zeros(count)
-    found = decode(encode(Keypoints(points, sizes, nothing, nothing, nothing.astype(np.int64)), descriptors))
+    points, nothing = rng.uniform(0.0, 4000.0, (count, 2)), np.zeros(count)
+    found = decode(encode(Keypoints(points, nothing, nothing, nothing, nothing.astype(np.int64)), descriptors))
     assert found.descriptors.dtype == kind
     np.testing.assert_array_equal(found.descriptors, descriptors)
     np.testing.assert_allclose(found.pixels, points, atol=2.5e-4)
-    np.testing.assert_allclose(found.sizes, sizes, rtol=1e-6)
 
 
 @given(hnp.arrays(np.uint8, st.integers(0, 60)))

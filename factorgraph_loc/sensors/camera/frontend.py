@@ -86,7 +86,7 @@ def with_features(
     features = [image.found or _nothing(settings) for image in images]
     tracks = _tracks(stream, images, features, settings, camera, kept)
     frames = [
-        CameraFrame(t, settings.feature, f.pixels, f.sizes, f.descriptors, numbers)
+        CameraFrame(t, settings.feature, f.pixels, f.descriptors, numbers)
         for t, f, numbers in zip(stream.t.tolist(), features, tracks, strict=True)
     ]
     streams = dict(log.streams) | {"camera": FeatureStream(stream.t, frames)}
@@ -302,4 +302,4 @@ class LiveFrontend:
             raise InputError(f"CameraImage at {t:.3f} s: has {width} x {height} px, expected {expected}")
         features = decode(encode(*self._extractor.detectAndCompute(pixels)))
         numbers = self._tracker.follow(features.pixels, features.descriptors)
-        return CameraFrame(t, self._feature, features.pixels, features.sizes, features.descriptors, numbers)
+        return CameraFrame(t, self._feature, features.pixels, features.descriptors, numbers)

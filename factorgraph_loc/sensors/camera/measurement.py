@@ -12,7 +12,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks, values
 from factorgraph_loc.files.bounded import NoFileNameError, copy_file
-from factorgraph_loc.files.columns import LARGEST_PIXEL, PIXELS, PURE, STAMP, Column, Table, named, number, within
+from factorgraph_loc.files.columns import LARGEST_PIXEL, PIXELS, PURE, STAMP, Column, Table, named, within
 from factorgraph_loc.files.models import inside
 from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
@@ -122,7 +122,6 @@ FEATURES = Table(
     (
         STAMP,
         within("pixels", PIXELS, LARGEST_PIXEL, "position of the feature"),
-        number("sizes", PIXELS, 1e-3, LARGEST_PIXEL, "size of the feature"),
         within("descriptors", PURE, 1e6, "descriptor of the feature"),
         Column("tracks", "whole", PURE, -(2.0**53), 2.0**53, False, "number of the track that the feature belongs to"),
     ),
@@ -216,7 +215,6 @@ def check_frame(m: CameraFrame | CameraImage, where: str) -> dict[str, Any]:
     count = len(pixels)
     return {
         "pixels": values.within(where, FEATURES["pixels"], pixels, (count, 2)),
-        "sizes": values.within(where, FEATURES["sizes"], m.sizes, (count,)),
         "descriptors": _descriptors(where, m.descriptors, count, m.feature),
         "tracks": values.integers(where, FEATURES["tracks"], m.tracks, count),
     }

@@ -136,9 +136,7 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
 
 def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
     """Frames without features; their timestamps still define the start and end of the run."""
-    nothing = CameraFrame(
-        0.0, "", np.empty((0, 2)), np.empty(0), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64)
-    )
+    nothing = CameraFrame(0.0, "", np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64))
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
     warning = (f"{log.name}: {estimator} does not use images: all {len(stream.t)} are ignored",)
     by_name = estimator == "dead_reckoning"  # obvious from its name

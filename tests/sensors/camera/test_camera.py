@@ -98,9 +98,7 @@ def test_what_is_not_in_the_map_or_of_another_kind_is_counted(log):
     assert diagnostics.ignored["camera"] == len(found.pixels)
     mapped = World(points=with_views(room()))
     points = KnownPoints(replace(setup, world=mapped, sensors=("odometry", "camera")), diagnostics, NOTHING)
-    other = CameraFrame(
-        0.0, "orb", found.pixels, found.sizes, np.zeros((len(found.pixels), 32), np.uint8), found.tracks
-    )
+    other = CameraFrame(0.0, "orb", found.pixels, np.zeros((len(found.pixels), 32), np.uint8), found.tracks)
     assert points.factor(other, predicted) is None
     assert diagnostics.ignored["camera: features of another kind than the map's"] == len(found.pixels)
 
