@@ -53,12 +53,12 @@ def require(
         raise bad_field(file, field, values[i].tolist(), expected, row=int(rows[i]))
 
 
-def unusable(error: OSError) -> InputError:
-    """The error for a file or folder that cannot be read or written."""
-    return InputError(error_text(error) if error.filename is None else f"{plain(error.filename)}: {error_text(error)}")
-
-
-def unencodable(error: UnicodeEncodeError) -> str:
-    """The problem with a text that cannot be written in the encoding of the system, and what to type."""
-    text = quoted(error.object[error.start : error.end])
-    return f"{text} cannot be written in {error.encoding}, the encoding of this system: set PYTHONUTF8=1"
+def message_of(error: FglocError | OSError | UnicodeEncodeError) -> str:
+    """What is wrong, on one line: for a text that cannot be written in the encoding of the system, also what to type."""
+    if isinstance(error, UnicodeEncodeError):
+        text = quoted(error.object[error.start : error.end])
+        return f"{text} cannot be written in {error.encoding}, the encoding of this system: set PYTHONUTF8=1"
+    if isinstance(error, OSError):
+        text = error_text(error)
+        return one_line(text if error.filename is None else f"{plain(error.filename)}: {text}")
+    return str(error)

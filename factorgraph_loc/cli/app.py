@@ -22,7 +22,7 @@ from factorgraph_loc.cli import (
     viewing,
 )
 from factorgraph_loc.cli.stopping import OutputError, end, standard_streams, unwrapped
-from factorgraph_loc.errors import FglocError, unencodable, unusable
+from factorgraph_loc.errors import FglocError, message_of
 from factorgraph_loc.files.bounded import limit_memory
 from factorgraph_loc.text import MESSAGE, plain
 from factorgraph_loc.threads import use_one_thread
@@ -50,24 +50,14 @@ class Commands(TyperGroup):
         try:
             with unwrapped():
                 return super().invoke(ctx)
-        except FglocError as error:
-            if ctx.params.get("debug"):
+        except (FglocError, OSError, UnicodeEncodeError) as error:
+            if ctx.params.get("debug") or getattr(error, "encoding", "") == "utf-8":
                 raise
-            show.note(f"error: {error}")
-            raise typer.Exit(error.exit_code) from error
+            show.note(f"error: {message_of(error)}")
+            raise typer.Exit(getattr(error, "exit_code", FglocError.exit_code)) from error
         except _UsageError as error:
             error.message = plain(error.message, MESSAGE)
             raise
-        except OSError as error:
-            if ctx.params.get("debug"):
-                raise
-            show.note(f"error: {unusable(error)}")
-            raise typer.Exit(FglocError.exit_code) from error
-        except UnicodeEncodeError as error:
-            if ctx.params.get("debug") or error.encoding == "utf-8":
-                raise
-            show.note(f"error: {unencodable(error)}")
-            raise typer.Exit(FglocError.exit_code) from error
         except KeyboardInterrupt as stop:
             raise typer.Exit(end(stop)) from stop
 

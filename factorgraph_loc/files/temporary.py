@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from factorgraph_loc.errors import InputError, unencodable
+from factorgraph_loc.errors import InputError, message_of
 from factorgraph_loc.text import error_text
 
 MARK = ".fgloc-"
@@ -136,7 +136,7 @@ def writing(path: object) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error_text(error)}") from error
     except UnicodeEncodeError as error:
-        raise InputError(f"{path}: cannot be written: {unencodable(error)}") from error
+        raise InputError(f"{path}: cannot be written: {message_of(error)}") from error
 
 
 def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:
