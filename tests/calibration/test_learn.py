@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from changed_logs import with_stream
 
 from factorgraph_loc.calibration import learn as learning
 from factorgraph_loc.calibration.calibrate import check
@@ -99,8 +100,7 @@ def test_gross_ranges_do_not_widen_the_noise(simulate):
     log = simulate(seconds=120.0)
     sightings, rng = log.streams["bearing_range"], np.random.default_rng(1)
     long = np.where(rng.random(len(sightings.t)) < 0.25, rng.exponential(5.0, len(sightings.t)), 0.0)
-    streams = {**log.streams, "bearing_range": replace(sightings, range=sightings.range + long)}
-    result = learn(replace(log, streams=streams))
+    result = learn(with_stream(log, "bearing_range", range=sightings.range + long))
     (scale,) = (c for c in result.constants if c.name == "range_scale")
     assert scale.fitted == pytest.approx(1.0, abs=4.0 * scale.error + 1e-3)
     assert result.sensors["landmarks"].details.scatter.range_sigma < 0.06

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from changed_logs import rows
 from landmark_world import simulate, with_sightings
 
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -31,12 +32,6 @@ def log():
 def clean(log):
     """``clean(name)``: the result on the undisturbed log, computed once."""
     return cache(lambda name: run(log, DEAD_RECKONING if name == "dead_reckoning" else CONFIGS[name]))
-
-
-def rows_of(stream, rows):
-    """The rows of a landmark stream, in that order."""
-    names = [stream.landmark[i] for i in rows]
-    return {"t": stream.t[rows], "landmark": names, "range": stream.range[rows], "bearing": stream.bearing[rows]}
 
 
 def distance(a, b):
@@ -77,11 +72,6 @@ def test_no_landmarks_is_dead_reckoning(name, how, log, clean):
     np.testing.assert_allclose(se2.between(expected.final.poses[:n], result.final.poses), 0.0, atol=1e-6)
 
 
-def delayed(stream, delay):
-    """The rows in order of arrival, each ``delay`` (N,) [s] after its stamp."""
-    return rows_of(stream, np.argsort(stream.t + delay, kind="stable"))
-
-
 @pytest.fixture(scope="module")
 def frequent():
     return simulate(rate=8.0, seconds=15.0)
@@ -94,9 +84,10 @@ def test_too_late_rows_are_dropped(name, frequent):
     stamps = np.unique(stream.t)
     chosen = stamps[:-20:10]
     slow = np.isin(stream.t, chosen)
-    result = run(with_sightings(frequent, **delayed(stream, np.where(slow, 1.0, 0.0))), CONFIGS[name])
+    arrived = np.argsort(stream.t + slow, kind="stable")
+    result = run(rows(frequent, "bearing_range", arrived), CONFIGS[name])
     assert result.diagnostics.late == {"bearing_range": int(slow.sum())}
-    expected = run(with_sightings(frequent, **rows_of(stream, np.flatnonzero(~slow))), CONFIGS[name])
+    expected = run(with_sightings(frequent, ~slow), CONFIGS[name])
     assert distance(result, expected) < 1e-9
     assert distance(result.final, expected.final) < 1e-9
 
@@ -109,6 +100,6 @@ def test_neither_range_nor_bearing_is_ignored(name, log):
         log, range=np.where(empty, np.nan, stream.range), bearing=np.where(empty, np.nan, stream.bearing)
     )
     result = run(holed, CONFIGS[name])
-    expected = run(with_sightings(log, **rows_of(stream, np.flatnonzero(~empty))), CONFIGS[name])
+    expected = run(with_sightings(log, ~empty), CONFIGS[name])
     assert sum(result.diagnostics.ignored.values()) == empty.sum()
     assert distance(result.final, expected.final) == 0.0

@@ -1,12 +1,11 @@
 """What the solvers make of a robot whose odometry constants are estimated, where nothing but its start ties it to the world."""
 
-from dataclasses import replace
-
 import camera_world
 import gtsam
 import landmark_world
 import numpy as np
 import pytest
+from changed_logs import with_rig, with_stream
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.graph import Node
@@ -30,15 +29,8 @@ def log():
     """The wheels report 7 % too little, and turns of 0.04 rad/s that there are not."""
     made = landmark_world.simulate(seed=1, seconds=20.0)
     wheels = made.streams["odometry"]
-    odometry = made.rig.odometry.model_copy(
-        update={"uncertainty": OdometryUncertainty(scale_distance=0.1, heading_rate_bias=0.05)}
-    )
-    wrong = replace(wheels, v=wheels.v / 1.08, w=wheels.w + 0.04)
-    return replace(
-        made,
-        rig=made.rig.model_copy(update={"odometry": odometry}),
-        streams={**made.streams, "odometry": wrong},
-    )
+    wrong = with_stream(made, "odometry", v=wheels.v / 1.08, w=wheels.w + 0.04)
+    return with_rig(wrong, "odometry", uncertainty=OdometryUncertainty(scale_distance=0.1, heading_rate_bias=0.05))
 
 
 def test_nothing_is_learnt_of_a_start_that_nothing_measures(log):

@@ -6,9 +6,9 @@ from functools import cache
 import camera_world
 import numpy as np
 import pytest
-from landmark_world import simulate
+from landmark_world import simulate, with_sightings
 
-from factorgraph_loc import BearingRangeStream, IncrementOdometry, InputError, Rig, Trajectory
+from factorgraph_loc import IncrementOdometry, InputError, Rig, Trajectory
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.belief import PosePrior
@@ -93,12 +93,7 @@ def test_a_camera_that_sees_the_robot_elsewhere_is_not_believed():
 
 def test_before_anything_is_seen_the_position_is_known_as_far_as_it_can_be(log):
     late = cut(log, 0.0, 20.0)
-    stream = late.streams["bearing_range"]
-    rows = np.flatnonzero(stream.t > 8.0)
-    seen = BearingRangeStream(
-        stream.t[rows], [stream.landmark[i] for i in rows], stream.range[rows], stream.bearing[rows]
-    )
-    late = replace(late, streams={**late.streams, "bearing_range": seen})
+    late = with_sightings(late, late.streams["bearing_range"].t > 8.0)
     for name in ("ekf", "smoother", "particle_filter"):
         result = run(late, replace(CONFIGS[name], prior=position(log)))
         assert result.status[0] == "ambiguous"

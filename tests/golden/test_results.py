@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from absurd_logs import with_rig
+from changed_logs import with_rig
 from regression import commands, logs
 from regression.commands import RESULTS, is_present
 from regression.differences import differences, size_of

@@ -6,13 +6,14 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from changed_logs import rows, with_rig, with_stream
 from drives import even_noise
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import BearingRangeStream, IncrementStream, InputError, Landmark, Log, RunFailedError, StartPose
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.model.measurement import Stream, columns_of
+from factorgraph_loc.model.measurement import Stream
 from factors import se2
 
 SECONDS = 4.0
@@ -76,24 +77,6 @@ def require_sound(poses, covariances) -> None:
     shares = covariances / sigmas[:, :, None] / sigmas[:, None, :]
     assert np.abs(shares - shares.transpose(0, 2, 1)).max(initial=0.0) < 2e-6
     np.linalg.cholesky((shares + shares.transpose(0, 2, 1)) / 2.0)
-
-
-def with_stream(log: Log, name: str, **columns) -> Log:
-    return replace(log, streams={**log.streams, name: replace(log.streams[name], **columns)})
-
-
-def rows(log: Log, name: str, kept) -> Log:
-    """The log with these rows (M,) of a stream."""
-    stream = log.streams[name]
-    columns = columns_of(stream)
-    return with_stream(
-        log, name, **{k: v[kept] if isinstance(v, np.ndarray) else [v[i] for i in kept] for k, v in columns.items()}
-    )
-
-
-def with_rig(log: Log, part: str, **settings) -> Log:
-    changed = getattr(log.rig, part).model_copy(update=settings)
-    return replace(log, rig=log.rig.model_copy(update={part: changed}))
 
 
 def with_landmarks(log: Log, place: Callable[[Landmark], tuple[float, float]]) -> Log:

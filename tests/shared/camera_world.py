@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import changed_logs
 import numpy as np
 from drives import driven, slipped
 
@@ -99,18 +100,13 @@ def simulate(seed=1, seconds=20.0, rate=5.0, limit=20, camera=CAMERA, speeds=cir
 
 def with_sightings(log, keep=None, **columns):
     """The log with other columns of its sightings, or without some rows."""
-    stream = replace(log.streams["sightings"], **columns)
-    if keep is not None:
-        rows = np.flatnonzero(keep)
-        names = [stream.point[i] for i in rows]
-        stream = SightingStream(stream.t[rows], names, stream.u[rows], stream.v[rows])
-    return replace(log, streams={**log.streams, "sightings": stream})
+    log = changed_logs.with_stream(log, "sightings", **columns)
+    return log if keep is None else changed_logs.rows(log, "sightings", np.flatnonzero(keep))
 
 
 def with_camera(log, **changes):
     """The log with another belief about the camera."""
-    camera = log.rig.camera.model_copy(update=changes)
-    return replace(log, rig=log.rig.model_copy(update={"camera": camera}))
+    return changed_logs.with_rig(log, "camera", **changes)
 
 
 def _descriptors(rng, count, binary):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import changed_logs
 import numpy as np
 from drives import driven, slipped
 
@@ -141,10 +142,8 @@ def kidnapped():
 
 def with_sightings(log, keep=None, **columns):
     """The log with other columns of its sightings, or without some rows."""
-    s = replace(log.streams["bearing_range"], **columns)
-    rows = np.arange(len(s.t)) if keep is None else np.flatnonzero(keep)
-    stream = BearingRangeStream(s.t[rows], [s.landmark[i] for i in rows], s.range[rows], s.bearing[rows])
-    return replace(log, streams={**log.streams, "bearing_range": stream})
+    log = changed_logs.with_stream(log, "bearing_range", **columns)
+    return log if keep is None else changed_logs.rows(log, "bearing_range", np.flatnonzero(keep))
 
 
 def swapped(log, one, other):

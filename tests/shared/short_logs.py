@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 from camera_world import simulate as simulate_room
 from camera_world import with_frames
+from changed_logs import rows, with_rig
 
 from factorgraph_loc import YawRateStream, load
 from factorgraph_loc.model.log import cut
-from factorgraph_loc.model.measurement import columns_of
 from factorgraph_loc.sensors.odometry.settings import ImuSettings
 from factorgraph_loc.sensors.rfid.settings import PhaseSettings, RfidUncertainty, RssiSettings
 from factorgraph_loc.simulation import preset
@@ -52,7 +52,7 @@ def mounted_exactly(log):
 
 def with_reader(log, **changes):
     """The log with a rig of which the section of the RFID reader is another one."""
-    return replace(log, rig=log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update=changes)}))
+    return with_rig(log, "rfid", **changes)
 
 
 def late(log, sensor):
@@ -60,9 +60,7 @@ def late(log, sensor):
     stream = log.streams[sensor]
     looks = np.unique(stream.t, return_inverse=True)[1]
     order = np.lexsort((np.arange(len(looks)), looks ^ 1))
-    columns = columns_of(stream)
-    moved = {k: v[order] if isinstance(v, np.ndarray) else [v[i] for i in order] for k, v in columns.items()}
-    return replace(log, streams=log.streams | {sensor: replace(stream, **moved)})
+    return rows(log, sensor, order)
 
 
 def with_gyro(log):

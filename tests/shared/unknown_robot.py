@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from changed_logs import with_stream
 from drives import driven
 
 from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
@@ -95,7 +96,7 @@ def headless() -> Callable[[Log], Log]:
 
     def make(log: Log) -> Log:
         seen = log.streams["bearing_range"]
-        streams = {**log.streams, "bearing_range": replace(seen, bearing=np.full_like(seen.bearing, np.nan))}
-        return replace(log, streams=streams, reference=replace(log.reference, has_heading=False))
+        log = with_stream(log, "bearing_range", bearing=np.full_like(seen.bearing, np.nan))
+        return replace(log, reference=replace(log.reference, has_heading=False))
 
     return make

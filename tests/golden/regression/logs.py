@@ -13,8 +13,8 @@ import camera_world
 import landmark_world
 import numpy as np
 import short_logs
-from absurd_logs import rows, with_stream
 from camera_world import with_camera, with_frames, with_sightings
+from changed_logs import rows, with_stream
 from recorded_logs import recorded_log
 
 from factorgraph_loc import Log, PointMap, World

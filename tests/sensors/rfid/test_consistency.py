@@ -5,12 +5,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from changed_logs import with_rig
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.monitor import ConsistencyMonitor
-from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings, RfidSettings
+from factorgraph_loc.sensors.rfid.settings import BeamSettings, PriorSettings
 from factorgraph_loc.simulation import preset, simulate
 from factors.rfid.detection import ExpectedReads, TagReadCounts
 
@@ -89,9 +90,7 @@ def office() -> Log:
 
 def told(log: Log, **changes: float) -> Log:
     """The log with a rig that is sure of other antennas."""
-    rfid = log.rig.of(RfidSettings)
-    models = {"default": BeamSettings(prior=KNOWN, **changes)}
-    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid.model_copy(update={"models": models})}))
+    return with_rig(log, "rfid", models={"default": BeamSettings(prior=KNOWN, **changes)})
 
 
 def test_antennas_that_are_not_as_the_rig_says_are_a_doubted_model_not_a_doubted_pose():

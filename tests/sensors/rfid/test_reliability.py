@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from changed_logs import with_rig
 
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
@@ -22,10 +23,7 @@ def office(share: float = 0.0) -> Log:
 
 def told(log: Log, **changes: float):
     """The reliability of a run whose rig has other parameters of its beam, which it is sure of, and the run's warnings."""
-    rfid = log.rig.of(RfidSettings)
-    models = {"default": BeamSettings(prior=KNOWN, **changes)}
-    rig = log.rig.model_copy(update={"rfid": rfid.model_copy(update={"models": models})})
-    result = run(replace(log, rig=rig), RunConfig("ekf"))
+    result = run(with_rig(log, "rfid", models={"default": BeamSettings(prior=KNOWN, **changes)}), RunConfig("ekf"))
     return result.reliability["rfid"], [line for line in result.warnings if "reads" in line]
 
 

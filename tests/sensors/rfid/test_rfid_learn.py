@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from changed_logs import with_rig
 
 from factorgraph_loc import InputError, read_rig, write_rig
 from factorgraph_loc.sensors.rfid.calibration import learn as rfid_learn
@@ -46,8 +47,7 @@ def test_a_turned_antenna_is_found(read_tags):
     log = read_tags(seconds=900.0)
     antennas = dict(log.rig.rfid.antennas)
     antennas["left"] = antennas["left"].model_copy(update={"yaw": antennas["left"].yaw + 0.1745})
-    turned = log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"antennas": antennas})})
-    found = placed(replace(log, rig=turned))
+    found = placed(with_rig(log, "rfid", antennas=antennas))
     value, error = found["antennas.left.yaw"]
     assert value == pytest.approx(-0.1745, abs=max(0.0175, 2.0 * error))
     assert error < 0.05

@@ -1,11 +1,11 @@
 """Antennas that are not as the rig says: each estimator learns range, read probability, yaw and time offset on the way."""
 
 import re
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from changed_logs import with_rig
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
@@ -30,12 +30,10 @@ def office() -> Log:
 
 def told(log: Log, prior: PriorSettings | None = None, **changes: float) -> Log:
     """The log with a rig whose antennas have other parameters than those that made its reads."""
-    settings = log.rig.of(RfidSettings)
-    model = settings.models["default"].model_copy(update=changes)
+    model = log.rig.of(RfidSettings).models["default"].model_copy(update=changes)
     if prior is not None:
         model = model.model_copy(update={"prior": prior})
-    rfid = settings.model_copy(update={"models": {"default": model}})
-    return replace(log, rig=log.rig.model_copy(update={"rfid": rfid}))
+    return with_rig(log, "rfid", models={"default": model})
 
 
 @cache
@@ -78,13 +76,8 @@ def test_antennas_that_are_turned_and_a_late_clock_are_found():
     turned = {
         name: a.model_copy(update={"yaw": se2.wrap_scalar(a.yaw + turn)}) for name, a in rfid.all_antennas().items()
     }
-    changes = {
-        "preset": None,
-        "antennas": turned,
-        "time_offset": 0.15,
-        "uncertainty": RfidUncertainty(yaw=0.1, time_offset=0.2),
-    }
-    wrong = replace(log, rig=log.rig.model_copy(update={"rfid": rfid.model_copy(update=changes)}))
+    unsure = RfidUncertainty(yaw=0.1, time_offset=0.2)
+    wrong = with_rig(log, "rfid", preset=None, antennas=turned, time_offset=0.15, uncertainty=unsure)
     result, found = outcome(wrong, estimator)
     _, best = exact(estimator)
     assert found["causal.position_rmse"] < 1.35 * best["causal.position_rmse"]
