@@ -54,7 +54,7 @@ def require(
 
 
 def message_of(error: FglocError | OSError | UnicodeEncodeError) -> str:
-    """What is wrong, on one line: for a text that cannot be written in the encoding of the system, also what to type."""
+    """The message of an error on one line; for a text that the encoding of the system lacks, also the remedy."""
     if isinstance(error, UnicodeEncodeError):
         text = quoted(error.object[error.start : error.end])
         return f"{text} cannot be written in {error.encoding}, the encoding of this system: set PYTHONUTF8=1"
