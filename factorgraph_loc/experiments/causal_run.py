@@ -1,10 +1,12 @@
 """The causal part of a run: measurements and ticks in the order of arrival, the estimates at the ticks, and their times."""
 
 import bisect
+import gc
 import math
 import resource
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby, takewhile
 from operator import attrgetter
@@ -25,6 +27,8 @@ from factorgraph_loc.model.scoring import Ticks
 from factorgraph_loc.sensors.camera.use import PreparedLog
 from factorgraph_loc.text import listed
 from factors.se2 import Array
+
+GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_threshold``
 
 
 @dataclass
@@ -166,6 +170,26 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
     if not stamps:
         raise InputError(f"{log.name}: has no measurements of {listed(sensors)}")
     return min(float(t.min()) for t in stamps), max(float(t.max()) for t in stamps)
+
+
+@contextmanager
+def rare_garbage_collection() -> Iterator[None]:
+    """A context in which Python seldom searches for garbage, and not among the objects that exist already.
+
+    A search through the objects of all loaded modules takes as long as many updates. Nothing changes if the program has called
+    ``gc.freeze``.
+    """
+    if gc.get_freeze_count():
+        yield
+        return
+    thresholds = gc.get_threshold()
+    gc.freeze()
+    gc.set_threshold(*GARBAGE_THRESHOLDS)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.unfreeze()
 
 
 def _peak_memory_mb() -> float:

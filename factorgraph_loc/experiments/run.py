@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
-from factorgraph_loc.experiments.causal_run import CausalRun, span_of
+from factorgraph_loc.experiments.causal_run import CausalRun, rare_garbage_collection, span_of
 from factorgraph_loc.experiments.doubts import in_bent_map, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.preparation import (
     KNOWN,
@@ -88,7 +88,7 @@ def run(
         lambda share: report(prepared_share + (1.0 - prepared_share) * share),
         watch,
     )
-    with guard.quiet():
+    with guard.quiet(), rare_garbage_collection():
         causal.run()
     return _result(use, config, start, prepared, causal, *_ended(guard, estimator, frame))
 

@@ -31,6 +31,7 @@ from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_motion import (
+    PLANAR,
     ROBOT,
     UPRIGHT,
     Origin,
@@ -60,7 +61,7 @@ from factorgraph_loc.slam.monoslam_state import (
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import LARGEST_HEIGHT, LARGEST_TILT
 from factors import se2
-from factors.camera.model import PLANAR, TiltScale, carrier
+from factors.camera.model import TiltScale, carrier
 from factors.robust import huber_weight
 from factors.se2 import Array
 

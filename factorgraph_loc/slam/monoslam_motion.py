@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from factors.camera.model import PLANAR
 from factors.se2 import Array
 
 ROBOT = 12  # values of the error state
 TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-UPRIGHT = [0, 1, 5]  # the components of the pose's error bounded by the floor: roll, pitch, height
+PLANAR = [3, 4, 2]  # indices in the pose's error: x, y and heading of a level robot
+UPRIGHT = [0, 1, 5]  # the components bounded by the floor: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # their velocities
 SETTLING, UNEVEN = 1.0, 3.0  # s, time constant of the return to the floor; where its unevenness is learnt
 SHORTEST = 1e-3  # s, shortest interval for the computation of a velocity

@@ -12,6 +12,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.camera.known_points import DISAGREES, EXACT, MOST
 from factorgraph_loc.sensors.camera.measurement import Pixels
+from factorgraph_loc.slam.monoslam_motion import PLANAR
 from factorgraph_loc.slam.monoslam_search import agreeing
 from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Sights, SlamState
 from factorgraph_loc.slam.slipping import ENOUGH, more_probable
@@ -23,7 +24,6 @@ from factorgraph_loc.vision.keypoints import spread_out
 from factorgraph_loc.vision.matching import match_guided
 from factorgraph_loc.vision.relocalization import located
 from factors.camera import inverse_depth
-from factors.camera.model import PLANAR
 from factors.se2 import Array, Integers
 
 CLEARANCE = 15.0  # px between a new point and all others

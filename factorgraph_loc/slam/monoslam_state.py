@@ -17,6 +17,7 @@ from scipy.linalg import solve_triangular
 
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.slam.monoslam_motion import (
+    PLANAR,
     ROBOT,
     SETTLING,
     SHIFT,
@@ -29,7 +30,7 @@ from factorgraph_loc.slam.monoslam_motion import (
 )
 from factors import positive
 from factors.camera import inverse_depth
-from factors.camera.model import PLANAR, CameraModel, TiltScale, lift, linearize_in_space, mounted, pixel_covariances
+from factors.camera.model import CameraModel, TiltScale, linearize_in_space, mounted
 from factors.motion import ChainState
 from factors.se2 import Array, Integers
 from factors.update import GATE
@@ -178,7 +179,10 @@ class Eye:
 
     @staticmethod
     def of(model: CameraModel) -> Eye:
-        return Eye(model, lift(model))
+        lift = np.zeros((POSE, POSE))
+        lift[:3, :3] = lift[3:, 3:] = model.rotation.T
+        lift[3:, :3] = -model.rotation.T @ cross(model.position)
+        return Eye(model, lift)
 
     def pose(self, robot: RobotState) -> tuple[Array, Array]:
         """Position and rotation of the camera in the world."""
@@ -193,7 +197,9 @@ class Eye:
         position, rotation = self.pose(robot)
         pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]
-        noise = pixel_covariances(self.model, by_point, covariances)
+        noise = np.broadcast_to(self.model.sigma**2 * np.eye(2), (len(points), 2, 2))
+        if covariances is not None:
+            noise = noise + by_point @ covariances @ by_point.transpose(0, 2, 1)
         nothing = np.zeros(len(points), dtype=np.int64)
         by_pose = by_camera @ self.lift
         return Sights(pixels, depths, by_pose, np.zeros_like(by_pose), nothing, nothing, noise)

@@ -30,7 +30,8 @@ from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import spread_out
 from factors import positive, se2
 from factors.camera import model as reprojection
-from factors.camera.factor import ReprojectionFactor, image_update, leaning
+from factors.camera import update_kernels as pixel_kernels
+from factors.camera.factor import ReprojectionFactor, image_update
 from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, TiltScale, recalibrated
 from factors.camera.point import PointFactor, PointPrior
@@ -351,7 +352,8 @@ class UnknownPoints:
                 factor = ReprojectionFactor(
                     model, positions[agrees], pixels[agrees], point_covariances=covariances[agrees]
                 )
-                floor, unlevel = self._floor.learnt(*leaning(factor, *guess), model.tilt)
+                leaning = pixel_kernels.leaning(factor.packed(), *guess)
+                floor, unlevel = self._floor.learnt(*leaning, model.tilt)
                 factor = replace(factor, model=replace(model, tilt=unlevel))
                 update = image_update(factor, *guess, ITERATIONS, SETTLED)
                 pose = se2.compose(guess[0], se2.exp(update.delta))

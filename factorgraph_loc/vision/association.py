@@ -112,7 +112,8 @@ class Associator:
         kept = (np.diff(begins) > 0) & model.contains(predicted, MARGIN)
         if not kept.any():
             return NONE
-        covariances = reprojection.pixel_covariances(model, by_point, self._covariances[ahead])
+        covariances = by_point @ self._covariances[ahead] @ by_point.transpose(0, 2, 1)
+        covariances += model.sigma**2 * np.eye(2)
         if focal > 0.0:
             away = focal * (predicted - (model.cx, model.cy))
             covariances += away[:, :, None] * away[:, None, :]

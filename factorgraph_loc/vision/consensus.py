@@ -13,9 +13,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from factors import positive
+from factors import gaussian, positive
+from factors.camera import kernels as reprojection_kernels
 from factors.camera import model as reprojection
+from factors.camera.kernels import Lens
 from factors.camera.model import CameraModel
+from factors.compiled import compiled
 from factors.se2 import Array
 
 Truths = NDArray[np.bool_]
@@ -45,18 +48,12 @@ class CameraPose:
 def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> bool:
     """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2], are jointly
     compatible with the prediction."""
-    predicted, jacobian, _ = reprojection.linearize_in_space(model, camera.position, camera.rotation, points)
-    error = predicted - pixels
+    arrays = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, covariances))
     try:
-        weighted = np.linalg.solve(covariances, np.concatenate((error[..., None], jacobian), axis=2))
-        pull, information = (
-            np.einsum("kri,kr...->i...", jacobian, part) for part in (weighted[..., 0], weighted[..., 1:])
-        )
-        # by the matrix inversion lemma, in a form that allows a singular covariance
-        explained = pull @ camera.covariance @ np.linalg.solve(np.eye(6) + information @ camera.covariance, pull)
+        joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *arrays)
     except np.linalg.LinAlgError:  # an extreme covariance: each point is tested separately
         return False
-    return bool(np.sum(error * weighted[..., 0]) - explained < _largest(2 * len(points)))
+    return bool(joint < _largest(2 * len(points)))
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
@@ -125,6 +122,36 @@ def _best_of_samples(
 @cache
 def _largest(dof: int) -> float:
     return float(scipy.special.chdtri(dof, 1.0 - JOINT))
+
+
+@compiled(error_model="numpy")
+def _joint(
+    lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, covariances: Array
+) -> float:
+    """Normalised squared innovation of points (K, 3) seen at pixels (K, 2) with noise (K, 2, 2), by a camera with perturbation
+    covariance (6, 6)."""
+    predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
+    information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
+    for i in range(len(points)):
+        a, b, c = covariances[i, 0, 0], covariances[i, 0, 1], covariances[i, 1, 1]
+        determinant = a * c - b * b
+        u, v = predicted[i, 0] - pixels[i, 0], predicted[i, 1] - pixels[i, 1]
+        wu, wv = (c * u - b * v) / determinant, (a * v - b * u) / determinant
+        total += u * wu + v * wv
+        for j in range(6):
+            ju, jv = jacobian[i, 0, j], jacobian[i, 1, j]
+            pull[j, 0] += ju * wu + jv * wv
+            xu, xv = (c * ju - b * jv) / determinant, (a * jv - b * ju) / determinant
+            for m in range(6):
+                information[j, m] += xu * jacobian[i, 0, m] + xv * jacobian[i, 1, m]
+    # by the matrix inversion lemma, in a form that allows a singular covariance
+    both = gaussian.product(information, covariance)
+    for j in range(6):
+        both[j, j] += 1.0
+    drawn = gaussian.product(covariance, gaussian.solved(both, pull)[0])
+    for j in range(6):
+        total -= pull[j, 0] * drawn[j, 0]
+    return total
 
 
 def root_of(camera: CameraPose) -> Array:

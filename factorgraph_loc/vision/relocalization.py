@@ -106,7 +106,10 @@ def _refined(
     for i in range(REFINEMENTS):
         predicted, by_camera, by_point = reprojection.linearize_in_space(model, position, rotation, points)
         residual = predicted - pixels
-        whitener = positive.whitener(reprojection.pixel_covariances(model, by_point, covariances))
+        noise = np.broadcast_to(model.sigma**2 * np.eye(2), (len(points), 2, 2))
+        if covariances is not None:
+            noise = noise + by_point @ covariances @ by_point.transpose(0, 2, 1)
+        whitener = positive.whitener(noise)
         residual = np.einsum("kij,kj->ki", whitener, residual)
         squared = np.sum(residual**2, axis=1)
         # distant outliers would still have an effect under the loss

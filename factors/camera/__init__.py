@@ -8,4 +8,5 @@ __all__ = [
     "point",
     "ray_pairs",
     "triangulation_kernels",
+    "update_kernels",
 ]

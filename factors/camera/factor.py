@@ -139,18 +139,6 @@ class ReprojectionFactor:
         return 2 * len(self.pixels)
 
 
-def leaning(factor: ReprojectionFactor, pose: Array, covariance: Array) -> tuple[Array, Array]:
-    """Roll and pitch (2,) [rad] of a robot at a ``pose`` (3,) with this ``covariance`` (3, 3), as least squares find them in an
-    image, and their covariance (2, 2). The pose is the only variable of the factor."""
-    error, blocks = factor.whitened([pose])
-    residual, jacobian = error.ravel(), np.concatenate(blocks, axis=2).reshape(error.size, -1)
-    information = jacobian.T @ jacobian + np.eye(len(pose) + TILTS)
-    information[: len(pose), : len(pose)] += np.linalg.inv(covariance) - np.eye(len(pose))
-    posterior = np.linalg.inv(information)
-    tilt = -factor.model.tilt * (posterior @ (jacobian.T @ residual))[len(pose) :]
-    return tilt, np.asarray(factor.model.tilt**2 * posterior[len(pose) :, len(pose) :], dtype=float)
-
-
 def image_update(
     factor: ReprojectionFactor,
     pose: Array,

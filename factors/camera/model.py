@@ -34,7 +34,6 @@ WIDEST = 4.0  # of x^2 + y^2 (63 degrees off the axis): maximum for the distorti
 GRID = 33  # rows and columns of pixels at which a lens is checked
 NONE = 1e-9  # tolerance of distorted directions
 
-PLANAR = [3, 4, 2]  # x, y and heading in a perturbation of a robot, rotation first
 # columns: axes of a forward-facing camera in the robot frame (z up)
 FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 
@@ -118,21 +117,6 @@ def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
 def project(model: CameraModel, points: Array) -> Array:
     """Pixels (K, 2) of ``points`` (K, 3) in the camera frame."""
     return np.asarray(reprojection_kernels.project(lens_of(model), np.ascontiguousarray(points, dtype=float))[0])
-
-
-def lift(model: CameraModel) -> Array:
-    """Jacobian (6, 6) of the camera's perturbation in its own frame by that of the robot, both rotation first."""
-    jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = jacobian[3:, 3:] = model.rotation.T
-    jacobian[3:, :3] = -np.cross(model.rotation.T, model.position)
-    return jacobian
-
-
-def pixel_covariances(model: CameraModel, by_point: Array, covariances: Array | None) -> Array:
-    """Covariances (K, 2, 2) [px^2] of the pixels of points with ``covariances`` (K, 3, 3), None if these are exact, and Jacobians
-    ``by_point`` (K, 2, 3)."""
-    noise = np.broadcast_to(model.sigma**2 * np.eye(2), (len(by_point), 2, 2))
-    return noise if covariances is None else noise + by_point @ covariances @ by_point.transpose(0, 2, 1)
 
 
 def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:

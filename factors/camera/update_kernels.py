@@ -7,8 +7,10 @@ import numpy as np
 
 from factors.camera.kernels import POINT, TILT, WIDTH, Lens, project_planar
 from factors.compiled import compiled
+from factors.gaussian import inverse, put
 from factors.robust import huber_weight
 from factors.se2 import Array, between_one, compose_one
+from factors.update import corrected
 
 Row = tuple[float, float, float]
 REWEIGHTED, STILL = 50, 1e-5  # most rounds to find a tilt, and standard deviations that the last may change it
@@ -159,6 +161,54 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
         for j in range(size + 3):
             out[i, j] = scale * (out[i, j] - p * shared[0, j] - q * shared[1, j])
     return out[:, size + 2].copy(), out[:, :size].copy()
+
+
+@compiled(error_model="numpy")
+def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, Array]:
+    """Roll and pitch (2,) [rad] of a robot at a ``pose`` (3,) with this ``covariance`` (3, 3), as least squares find them in an
+    image, and their covariance (2, 2)."""
+    residual, jacobian = whitened(image, pose)
+    prior = np.eye(POINT)
+    put(inverse(covariance), prior)
+    known = np.arange(POINT), np.ones(len(residual)), np.zeros(POINT)
+    delta, posterior, _ = corrected(prior, residual, jacobian, *known)
+    return image.tilt * delta[3:], image.tilt**2 * posterior[3:, 3:]
+
+
+@compiled(error_model="numpy")
+def placed(position: Array, rotation: Array, tilt: float, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
+    """Position (3,) and rotation (3, 3) in the world of a camera mounted at ``position`` with ``rotation`` on a robot at ``pose``
+    (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose
+    and the standard deviation ``tilt`` [rad] of roll and pitch."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, POINT)), np.empty((6, 6))
+    x, y, z = position[0], position[1], position[2]
+    where[0], where[1], where[2] = pose[0] + c * x - s * y, pose[1] + s * x + c * y, z
+    for i in range(3):
+        a, b, d = rotation[0, i], rotation[1, i], rotation[2, i]
+        turned[0, i], turned[1, i], turned[2, i] = c * a - s * b, s * a + c * b, d
+        lift[i, 2], lift[i, 3], lift[i, 4] = d, tilt * a, tilt * b
+        lift[3 + i, 0], lift[3 + i, 1], lift[3 + i, 2] = a, b, x * b - y * a
+        lift[3 + i, 3], lift[3 + i, 4] = tilt * (y * d - z * b), tilt * (z * a - x * d)
+    for i in range(6):
+        p = (lift[i, 0], lift[i, 1], lift[i, 2])
+        for j in range(6):
+            by_tilt = lift[i, 3] * lift[j, 3] + lift[i, 4] * lift[j, 4]
+            carried[i, j] = _product(covariance, p, (lift[j, 0], lift[j, 1], lift[j, 2])) + by_tilt
+    return where, turned, carried
+
+
+@compiled(error_model="numpy")
+def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
+    """The covariance (K, 2, 2) of pixels with noise ``sigma`` [px], of points with ``covariances`` (K, 3, 3)."""
+    out = np.empty((len(by_point), 2, 2))
+    for k in range(len(by_point)):
+        of = covariances[k]
+        p = (by_point[k, 0, 0], by_point[k, 0, 1], by_point[k, 0, 2])
+        q = (by_point[k, 1, 0], by_point[k, 1, 1], by_point[k, 1, 2])
+        out[k, 0, 0], out[k, 1, 1] = sigma * sigma + _product(of, p, p), sigma * sigma + _product(of, q, q)
+        out[k, 0, 1] = out[k, 1, 0] = _product(of, p, q)
+    return out
 
 
 @compiled(inline="always")

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from factors import positive, se2
+from factors import se2
 from factors.landmarks import kernels
 from factors.landmarks.model import (
     CONSTANTS,
@@ -28,6 +28,7 @@ from factors.se2 import Array, Integers
 from factors.sighting import delayed
 from factors.update import CONVERGED, GATE, Correction
 
+NOTHING = np.zeros(0)  # values of constants if the factor estimates none
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # if there is no offset, or no covariance of it
 LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
 
@@ -59,9 +60,15 @@ class BearingRangeFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
-        error, jacobian = self._linearized(values)
-        kernels.weigh(error, jacobian, self.model.robust)
-        return error.ravel(), [block.reshape(error.size, -1) for block in self._blocks(jacobian)]
+        if not self.free:
+            constants = values[1] if self.estimated else NOTHING
+            linear = kernels.weighted(self.model.packed, self.packed, values[0], constants, self.places)
+            residual, by_pose, by_sensor = linear
+            return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
+        error, blocks = self.whitened(values)
+        weight = np.sqrt(geman_mcclure_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
+        weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
+        return (weight[:, None] * error).ravel(), weighted
 
     @property
     def kind(self) -> Hashable:
@@ -75,9 +82,8 @@ class BearingRangeFactor:
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
         """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
         predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
-        error, (by_pose,) = self.whitened([pose])
-        noise = np.eye(2) + by_pose @ covariance @ by_pose.transpose(0, 2, 1)
-        return int(np.count_nonzero(positive.squared(error, noise) > limit))
+        contiguous = np.ascontiguousarray(covariance)
+        return int(kernels.beyond(self.model.packed, pose, self.packed, contiguous, limit))
 
     @property
     def packed(self) -> kernels.Sighting:
@@ -118,11 +124,6 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
-        error, jacobian = self._linearized(values)
-        return error, self._blocks(jacobian)
-
-    def _linearized(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Whitened residual (K, 2), and its Jacobian (K, 2, WIDTH) by all that it may depend on."""
         packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
@@ -130,16 +131,12 @@ class BearingRangeFactor:
             packed = (np.reshape(values[-1], (1, 2)), *packed[1:])
         error, jacobian = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
         kernels.linearize(self.model.packed, values[0], changes, packed, error, jacobian)
-        return error, jacobian
-
-    def _blocks(self, jacobian: Array) -> list[Array]:
-        """The columns of a Jacobian (K, 2, WIDTH) for each value."""
         blocks = [jacobian[..., :POINT]]
         if self.estimated:
             blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])
         if self.free:
             blocks.append(jacobian[..., POINT:CONSTANTS])
-        return blocks
+        return error, blocks
 
     def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:
         """The factor on the pose only, at given constants (one array (P,), or none) and position (2,) of a free landmark."""

@@ -132,6 +132,26 @@ def weigh(error: Array, jacobian: Array, robust: float) -> None:
                 jacobian[k, i, j] *= root
 
 
+@compiled(error_model="numpy")
+def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
+    """The number of landmarks whose normalised innovation squared exceeds ``limit``, with pose ``covariance`` (3, 3)."""
+    count = len(packed[0])
+    error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
+    linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
+    for k in range(count):
+        a, b, c = 1.0, 0.0, 1.0
+        for i in range(3):
+            for j in range(3):
+                a += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 0, j]
+                b += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 1, j]
+                c += by_pose[k, 1, i] * covariance[i, j] * by_pose[k, 1, j]
+        x, y = error[k, 0], error[k, 1]
+        # rounding may take all of the difference, which is never less than that
+        determinant = max(a * c - b * b, 0.5 * (a + c))
+        outliers += (c * x * x - 2.0 * b * x * y + a * y * y) / determinant > limit
+    return outliers
+
+
 @compiled
 def linearize_all(
     model: Array,
@@ -219,6 +239,43 @@ def updated(
     if not (np.all(np.isfinite(delta)) and cholesky(posterior)[1]):
         raise np.linalg.LinAlgError("an update is not finite, or not positive definite")
     return delta, posterior, residual, max(0.0, nis), measured
+
+
+@compiled(error_model="numpy")
+def weighted(
+    model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
+) -> tuple[Array, Array, Array]:
+    """Whitened, robustly weighted residual (2K,) and its Jacobians by the pose (2K, 3) and by the constants (2K, P); arguments as
+    of :func:`updated`."""
+    count, wide = len(packed[0]), len(indices)
+    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
+    _linearized(model, packed, pose, values, indices, residual, jacobian)
+    out, by_pose, by_values = np.empty(2 * count), np.empty((2 * count, 3)), np.empty((2 * count, wide))
+    for k in range(count):
+        root = math.sqrt(geman_mcclure_weight(residual[k, 0] ** 2 + residual[k, 1] ** 2, model[ROBUST]))
+        for i in range(2):
+            row = 2 * k + i
+            out[row] = root * residual[k, i]
+            for j in range(3):
+                by_pose[row, j] = root * jacobian[k, i, j]
+            for j in range(wide):
+                by_values[row, j] = root * jacobian[k, i, 3 + j]
+    return out, by_pose, by_values
+
+
+@compiled(error_model="numpy")
+def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
+    """Measured less predicted ranges [m] and bearings [rad], of those that were measured, from whitened ``residual`` (K, 2)."""
+    by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
+    r = b = 0
+    for k in range(len(ranges)):
+        if not math.isnan(ranges[k]):
+            by_range[r] = -residual[k, 0] * math.hypot(model[RANGE_SIGMA], model[RELATIVE] * ranges[k])
+            r += 1
+        if not math.isnan(bearings[k]):
+            by_bearing[b] = -residual[k, 1] * model[BEARING_SIGMA]
+            b += 1
+    return by_range[:r], by_bearing[:b]
 
 
 @compiled(error_model="numpy")

@@ -24,8 +24,9 @@ from factorgraph_loc.vision.keypoints import spread_out
 from factorgraph_loc.vision.relocalization import FoundOnFloor, found_on_floor, on_floor
 from factors import se2
 from factors.camera import model as reprojection
-from factors.camera.factor import ReprojectionFactor, leaning
-from factors.camera.model import FOCAL, PLANAR, TIME_OFFSET, CameraModel, TiltScale
+from factors.camera import update_kernels as pixel_kernels
+from factors.camera.factor import ReprojectionFactor
+from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel, TiltScale
 from factors.motion import Increment, propagate
 from factors.se2 import Array
 
@@ -237,7 +238,8 @@ class KnownPoints:
         """
         if expected.estimated:  # unknown constants would explain the tilt
             return factor
-        tilt, noise = leaning(expected, predicted.pose, predicted.covariance)
+        pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
+        tilt, noise = pixel_kernels.leaning(expected.packed(), pose, covariance)
         if math.hypot(*tilt) > STEEPEST:
             return None
         self.floor, sigma = self.floor.learnt(tilt, noise, float(expected.model.tilt))
@@ -261,16 +263,24 @@ class KnownPoints:
             elif place < FOCAL:
                 full[:3, column] = model.rotation[place - 3]
             elif place == TIME_OFFSET and expected.twist is not None:
-                full[:, column] = reprojection.lift(model)[:, PLANAR] @ expected.twist
+                full[:, column] = _lift(model) @ expected.twist
         return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
 
 
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
     """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3), which may tilt."""
-    spatial, lift = np.zeros((6, 6)), reprojection.lift(model)
-    spatial[np.ix_(PLANAR, PLANAR)] = covariance
-    spatial[0, 0] = spatial[1, 1] = model.tilt**2
-    return CameraPose(*reprojection.camera_pose(model, pose), lift @ spatial @ lift.T)
+    arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
+    return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
+
+
+def _lift(model: CameraModel) -> Array:
+    """Jacobian (6, 3) of the camera's perturbation in its own frame (rotation first) by that of the robot's planar pose."""
+    x, y, _ = model.position
+    lift = np.zeros((6, 3))
+    lift[:3, 2] = model.rotation[2]
+    lift[3:, 0], lift[3:, 1] = model.rotation[0], model.rotation[1]
+    lift[3:, 2] = -y * model.rotation[0] + x * model.rotation[1]
+    return lift
 
 
 def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
@@ -279,8 +289,12 @@ def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) ->
     model, count = expected.model, len(expected.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
-    _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, expected.points)
-    covariances = reprojection.pixel_covariances(model, by_point, expected.point_covariances)
+    if expected.point_covariances is None:
+        covariances = np.zeros((count, 2, 2))
+        covariances[:, (0, 1), (0, 1)] = model.sigma**2
+    else:
+        _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, expected.points)
+        covariances = pixel_kernels.pixel_noise(by_point, expected.point_covariances, float(model.sigma))
     if focal > 0.0:
         away = focal * (expected.pixels - (model.cx, model.cy))
         covariances = covariances + away[:, :, None] * away[:, None, :]

@@ -20,7 +20,8 @@ from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingR
 from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
-from factors.landmarks.model import PARAMETERS, TIME_OFFSET, sigmas
+from factors.landmarks.kernels import innovations
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET
 from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction
@@ -304,9 +305,9 @@ class LandmarkSensor(Sensor):
     def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
         factor = observation.measured
         self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
-        errors = -correction.residual * sigmas(factor.model, factor.ranges)
-        self._diagnostics.add_residuals(f"{self.name}.range", errors[~np.isnan(factor.ranges), 0].tolist())
-        self._diagnostics.add_residuals(f"{self.name}.bearing", errors[~np.isnan(factor.bearings), 1].tolist())
+        ranges, bearings = innovations(factor.model.packed, correction.residual, factor.ranges, factor.bearings)
+        self._diagnostics.add_residuals(f"{self.name}.range", ranges.tolist())
+        self._diagnostics.add_residuals(f"{self.name}.bearing", bearings.tolist())
         return True
 
     @property
