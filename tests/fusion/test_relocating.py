@@ -5,6 +5,7 @@ import pytest
 from landmark_world import simulate, with_sightings
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import cut, join
 
@@ -12,11 +13,6 @@ from factorgraph_loc.model.log import cut, join
 @pytest.fixture(scope="module")
 def log():
     return simulate(seconds=20.0)
-
-
-def off(trajectory, log):
-    """Position errors at the estimates [m], NaN in gaps of the reference."""
-    return np.hypot(*(trajectory.poses - log.reference.at(trajectory.t, max_gap=0.1))[:, :2].T)
 
 
 def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
@@ -31,7 +27,8 @@ def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
     assert 18.0 < t < 22.0
     assert np.all(status[(result.t > 13.0) & (result.t < t)] == "ambiguous")
     assert np.all(status[result.t > t + 0.1] == "localized")
-    assert np.nanmax(off(result.final, carried)[result.final.t > t]) < 0.2
+    final = errors(result.final, carried.reference)
+    assert np.nanmax(final.position[final.t > t]) < 0.2
 
 
 @pytest.mark.parametrize("name", ["smoother", "batch"])
@@ -57,7 +54,7 @@ def test_one_landmark_does_not_tell_the_place(name, log):
     late = with_sightings(log, (np.array(s.landmark) == "b") | (s.t > 8.0))
     result = run(late, RunConfig(name, prior="unknown"))
     assert result.final.t[0] < 0.3
-    assert off(result.final, log).max() < 0.3
+    assert errors(result.final, log.reference).position.max() < 0.3
 
 
 def test_landmarks_that_are_to_be_estimated_cannot_tell_the_place(log):

@@ -6,6 +6,7 @@ from drives import driven
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import BearingRangeStream, Landmark, Log, Rig, Trajectory, VelocityStream, World
+from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factors import se2
 
@@ -35,28 +36,25 @@ def drive(*, slips=False, blocked=False):
     return Log("wall", rig, world, streams, Trajectory(t, poses))
 
 
-def errors(log, estimator):
-    run = fgloc.run(log, estimator)
-    result = run.result
-    inside = (result.t >= log.reference.t[0]) & (result.t <= log.reference.t[-1])
-    error = np.hypot(*(result.poses[inside, :2] - log.reference.at(result.t[inside])[:, :2]).T)
-    return result.t[inside], error, run
+def off(log, estimator):
+    """Errors of the causal estimates, and the events."""
+    result = fgloc.run(log, estimator).result
+    return errors(result.causal(), log.reference), result.diagnostics.events
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "smoother", "particle_filter"])
 def test_ranges_that_agree_overrule_wheels_that_slip(estimator):
-    t, error, run = errors(drive(slips=True), estimator)
-    assert error.max() < 0.8  # the wheels report 3 m
-    assert error[t > END + 5.0].max() < 0.2
-    assert any("odometry contradicts" in what for _, what in run.result.diagnostics.events)
+    slipped, events = off(drive(slips=True), estimator)
+    assert slipped.position.max() < 0.8  # the wheels report 3 m
+    assert slipped.position[slipped.t > END + 5.0].max() < 0.2
+    assert any("odometry contradicts" in what for _, what in events)
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "smoother", "particle_filter"])
 def test_one_blocked_anchor_of_four_is_no_slip(estimator):
-    _, error, run = errors(drive(blocked=True), estimator)
-    _, right, _ = errors(drive(), estimator)
-    assert error.max() < right.max() + 0.1
-    assert not run.result.diagnostics.events
+    (blocked, events), (right, _) = off(drive(blocked=True), estimator), off(drive(), estimator)
+    assert blocked.position.max() < right.position.max() + 0.1
+    assert not events
 
 
 def test_a_late_measurement_is_compared_as_if_it_had_been_in_time():

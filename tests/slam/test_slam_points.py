@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import FeatureStream, SightingStream, Trajectory, VelocityStream
-from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.solver import FullHistory
 from factorgraph_loc.sensors.camera.settings import CameraUncertainty
@@ -59,24 +59,13 @@ def mapped(logs):
     return cache(lambda name, seed: run(logs[seed], CONFIGS[name]))
 
 
-def errors(result, log):
-    """Errors (N, 3) of the final trajectory."""
-    out = result.final.poses - log.reference.at(result.final.t)
-    out[:, 2] = se2.wrap(out[:, 2])
-    return out
-
-
 def rmse(result, log):
-    return float(np.sqrt(np.mean(np.sum(errors(result, log)[:, :2] ** 2, axis=1))))
+    return score(result, log)["final.position_rmse"]
 
 
 def test_errors_are_as_large_as_the_covariances_say(mapped, logs):
     # the last pose of five runs; the mean leaves this band once in a thousand
-    total = 0.0
-    for seed in SEEDS:
-        result = mapped("smoother", seed)
-        error = errors(result, logs[seed])[-1]
-        total += error @ np.linalg.solve(result.final.covariances[-1], error)
+    total = sum(errors(mapped("smoother", seed).final, logs[seed].reference).nees[-1] for seed in SEEDS)
     assert chi2.ppf(0.0005, 15) < total < chi2.ppf(0.9995, 15)
 
 
@@ -104,8 +93,7 @@ def test_a_step_that_leads_astray_is_undone(mapped, log, monkeypatch):
     monkeypatch.setattr(FullHistory, "value", astray)
     result = run(log, CONFIGS["smoother"])
     assert [text for _, text in result.diagnostics.events] == ["solver rebuilt: the estimate jumped"]
-    causal = np.linalg.norm(result.poses[:, :2] - log.reference.at(result.t)[:, :2], axis=1)
-    assert causal.max() < 1.0
+    assert errors(result.causal(), log.reference).position.max() < 1.0
     assert rmse(result, log) < 1.2 * rmse(mapped("smoother", 1), log)
 
 

@@ -8,6 +8,7 @@ from drives import driven, even_noise
 from mapped_hall import VELOCITIES, write_mapped
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.io.native.native import write_native
 from factorgraph_loc.io.readers import load
@@ -61,8 +62,7 @@ def drive(with_pose=False):
 
 def final_error(log, estimator, **settings):
     found = run(log, RunConfig(estimator, settings, prior="0,0,0"))
-    at = log.reference.at(found.final.t)
-    return float(np.sqrt(np.mean(np.sum((found.final.poses - at)[:, :2] ** 2, axis=1)))), found
+    return score(found, log)["final.position_rmse"], found
 
 
 def right_ones(log):
