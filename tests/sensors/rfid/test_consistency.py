@@ -1,4 +1,4 @@
-"""Reads against those that the detection models predict, on the way: status and events."""
+"""Reads against those that the detection models predict: status and events on the way, and groups along the final trajectory."""
 
 from dataclasses import replace
 from functools import cache
@@ -121,3 +121,47 @@ def test_a_dead_antenna_is_named_and_ignored():
     assert set(np.array(found.status)[found.t > 10.0]) == {"localized"}
     errors = [score(one, log)["causal.position_rmse"] for one in (right, found)]
     assert errors[1] < 1.3 * errors[0]
+
+
+@cache
+def long_office(share: float = 0.0) -> Log:
+    faults = {"fading": {"duration": 5.0, "share": share}}
+    return simulate(preset("office", {"drive": {"duration": 120.0}, "faults": faults}), 3)
+
+
+def reliability(log: Log, **changes: float):
+    """Reads observed over reads predicted along the final trajectory, and the warnings."""
+    result = run(told(log, **changes), RunConfig("ekf"))
+    return result.reliability["rfid"], [line for line in result.warnings if "reads" in line]
+
+
+def test_a_right_model_predicts_all_groups():
+    """All groups within four standard deviations: one in a thousand logs would fail by chance."""
+    found, warnings = reliability(long_office())
+    assert not warnings
+    assert found.overdispersion < 1.3
+    assert np.all(np.abs(found.observed - found.predicted) < 4.0 * found.sigma)
+    assert {"1 to 2 m", "4 to 5 m", "antenna 1", "antenna 8"} <= {*found.groups}
+
+
+def test_a_range_that_is_too_long_shows_at_the_far_end():
+    found, warnings = reliability(long_office(), r_max=5.4)
+    share = dict(zip(found.groups, found.observed / found.predicted, strict=True))
+    assert share["5 to 6 m"] < 0.6
+    assert share["1 to 2 m"] == pytest.approx(1.0, abs=0.15)
+    (line,) = warnings
+    assert "by distance and antenna: 5 to 6 m: 0." in line
+
+
+def test_a_rate_that_is_too_high_shows_everywhere():
+    found, warnings = reliability(long_office(), p0=0.6)
+    assert np.all(found.observed > 1.1 * found.predicted)
+    assert any("over those that the detection models predict" in line for line in warnings)
+
+
+def test_bursts_are_counted_as_few():
+    found, warnings = reliability(long_office(0.4), p0=0.6)
+    assert found.overdispersion > 2.5
+    assert any("come in bursts" in line for line in warnings)
+    result = run(with_rig(long_office(0.4), "rfid", tempering=0.2), RunConfig("ekf"))
+    assert not any("come in bursts" in line for line in result.warnings)
