@@ -43,7 +43,6 @@ class SightingWindow:
         self, model: BearingRangeModel, rows: list[Sighting], motion: Motion, start: KnownPosition | None = None
     ) -> None:
         self._model, self._motion, self._start = model, motion, start
-        self._times = [r.odometry for r in rows]
         self.now = rows[-1].odometry
         self.points = np.array([r.point for r in rows])
         self._ranges, self._bearings = np.array([r.range for r in rows]), np.array([r.bearing for r in rows])
