@@ -13,6 +13,9 @@ from recorded_logs import recorded_log
 
 import factorgraph_loc as fgloc
 
+sys.path.insert(0, str(Path(__file__).resolve().parent / "benchmarks"))
+from field_benchmark.cases import CASES
+
 CARRIED, FOUND = 60.0, 80.0  # s: in between the wheels stand still while the robot moves
 
 ROBOTS = ("mrclam6-robot1", "mrclam6-robot3", "mrclam6-robot5", "woods-r5")
@@ -25,7 +28,7 @@ LIFTED = tuple(f"field-carried-{seed}" for seed in (1, 2, 3, 4))
 FAULTS = ("clean", "antenna_common", "antenna", "map", "offset0.15", "latency0.15", "slip200-400", "weak0.2-0.5")
 FAULTS += ("deadantenna3", "lostreads0.2", "scale1.03")
 FAULTY = tuple(f"field-office-1-{fault}" for fault in FAULTS)
-
+BROKEN = tuple(f"fault-{case}-{seed}" for case in ("wall", "plaza", "moved") for seed in (1, 2, 3))
 
 # each function makes the logs of these names in a folder; ``programs`` is the folder of field.py
 
@@ -114,6 +117,12 @@ def faulty(names: tuple[str, ...], logs: Path, programs: Path) -> None:
             (Path(temporary) / ("clean-office-1" if fault == "clean" else f"1-{fault}")).rename(logs / name)
 
 
+def broken(names: tuple[str, ...], logs: Path, _: Path) -> None:
+    """The log of a case of the benchmark of faults."""
+    _, case, seed = names[0].split("-")
+    fgloc.write_native(CASES[case](int(seed))[0], logs / names[0])
+
+
 def run_field(programs: Path, *arguments: str) -> None:
     """Have field.py make its logs, and run the fastest estimator on them."""
     if not (programs / "field.py").is_file():
@@ -130,4 +139,5 @@ SOURCES: tuple[tuple[Callable[[tuple[str, ...], Path, Path], None], tuple[str, .
     *((lifted, (name,)) for name in LIFTED),
     (halls, HALLS),
     (faulty, FAULTY),
+    *((broken, (name,)) for name in BROKEN),
 )
