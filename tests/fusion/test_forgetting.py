@@ -1,5 +1,7 @@
 """Estimators that forget their past: what is left is what it would be with all of it."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from by_hand import made
@@ -29,15 +31,8 @@ def log():
 @pytest.fixture(scope="module")
 def driven(log):
     """``driven(name, sensors, settings, forget)``: what :func:`drive` gives, computed once."""
-    known = {}
-
-    def of(name, sensors, settings, forget):
-        key = (name, sensors, tuple(settings.items()), forget)
-        if key not in known:
-            known[key] = drive(log, name, sensors, settings, forget)
-        return known[key]
-
-    return of
+    once = cache(lambda name, sensors, settings, forget: drive(log, name, sensors, dict(settings), forget))
+    return lambda name, sensors, settings, forget: once(name, sensors, tuple(settings.items()), forget)
 
 
 def drive(log, name, sensors, settings, forget):
