@@ -39,7 +39,7 @@ def empty(height: float, title: str = "") -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(_WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(_WIDTH, height))
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=16)
@@ -91,7 +91,7 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
         labels = [plain(label, _LABEL) for label in entries]
         columns = min(len(labels), max(1, _LEGEND // (max(map(len, labels)) + _SIGN)))
         style = {"ncols": columns, "fontsize": 13, "markerscale": markers}
-        figure.legend(entries.values(), labels, loc="outside lower center", **style)
+        figure.legend(entries.values(), labels, loc="lower center", **style)
 
 
 @contextmanager
@@ -121,6 +121,7 @@ def svg(figure: Figure) -> Picture:
 
     out = io.BytesIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "factorgraph-loc"}), drawing(figure):
+        _lay_out(figure)
         figure.savefig(out, format="svg", metadata={"Creator": None, "Date": None, "Format": None, "Type": None})
     return Picture.of("image/svg+xml", out.getvalue())
 
@@ -139,10 +140,30 @@ def png_bytes(figure: Figure) -> bytes:
 
 def _drawn(figure: Figure) -> Image:
     """The figure as an image in full colour."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from PIL.Image import fromarray  # noqa: PLC0415
 
     figure.set_dpi(_DPI)
-    canvas: Any = figure.canvas
+    canvas: Any = FigureCanvasAgg(figure)
     with drawing(figure):
+        _lay_out(figure)
         canvas.draw()
     return fromarray(np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, :3]))
+
+
+def _lay_out(figure: Figure) -> None:
+    """Place the axes between the title and the legend. The constrained layout of matplotlib takes up to four times as long."""
+    aspects = [(axis, axis.get_aspect()) for axis in figure.axes]
+    for axis in figure.axes:
+        axis.set_aspect("auto")  # as large as there is room: labels outside of that would have none
+    figure.tight_layout()
+    for axis, aspect in aspects:
+        axis.set_aspect(aspect)
+    places = figure.subplotpars
+    specs = [spec.get_topmost_subplotspec() for axis in figure.axes if (spec := axis.get_subplotspec())]
+    rows = max((spec.get_gridspec().nrows for spec in specs), default=1)
+    height = (places.top - places.bottom) / (rows + places.hspace * (rows - 1))
+    below = sum(legend.get_window_extent().height for legend in figure.legends) / figure.bbox.height
+    lower = height - below / rows
+    if lower > 0.0:
+        figure.subplots_adjust(bottom=places.bottom + below, hspace=places.hspace * height / lower)
