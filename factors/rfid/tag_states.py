@@ -48,6 +48,7 @@ MOST_MOVED = 0.15
 WEAKNESSES = np.array(((0.0, -2.4, 0.5), (0.0, -3.7, 0.1), (-0.5, 0.0, 0.2), (-0.5, -1.0, 0.2)))
 # columns of the weights: as surveyed, then dead, weak, and moved to each place
 DEAD, WEAK, MOVED = 1, 2, 2 + len(WEAKNESSES)
+COLUMNS = {"dead": slice(DEAD, WEAK), "weak": slice(WEAK, MOVED), "moved": slice(MOVED, None)}
 
 
 def displacements() -> Array:
@@ -103,19 +104,15 @@ class TagStates:
     @property
     def suspects(self) -> dict[str, dict[int, float]]:
         """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`, by state, with that probability."""
-        weights = self._weights[self.doubtful]
+        doubtful, suspects = self.doubtful, dict[str, dict[int, float]]()
+        weights = self._weights[doubtful]
         shares = np.exp(weights - weights.max(axis=1, keepdims=True))
         shares /= shares.sum(axis=1, keepdims=True)
-        states = {
-            "dead": shares[:, DEAD],
-            "weak": shares[:, WEAK:MOVED].sum(axis=1),
-            "moved": shares[:, MOVED:].sum(axis=1),
-        }
-        believed = {state: np.flatnonzero(share > BELIEVED) for state, share in states.items()}
-        return {
-            state: dict(zip(self.doubtful[rows].tolist(), states[state][rows].tolist(), strict=True))
-            for state, rows in believed.items()
-        }
+        for state, columns in COLUMNS.items():
+            probability = shares[:, columns].sum(axis=1)
+            rows = np.flatnonzero(probability > BELIEVED)
+            suspects[state] = dict(zip(doubtful[rows].tolist(), probability[rows].tolist(), strict=True))
+        return suspects
 
     def were_read(self, tags: Integers) -> NDArray[np.bool_]:
         """Which of ``tags`` (U,) were read, and are not dead therefore."""

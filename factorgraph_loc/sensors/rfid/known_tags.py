@@ -232,7 +232,8 @@ class KnownTags:
 
     def _tell(self) -> None:
         for state, tags in self.states.suspects.items():
-            self._diagnostics.doubted[f"{state}_tags"] = {self.map.names[i]: p for i, p in tags.items()}
+            names = map(self.map.names.__getitem__, tags)
+            self._diagnostics.doubted[f"{state}_tags"] = dict(zip(names, tags.values(), strict=True))
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
         """The active antennas: row of each, -1 if the rig lacks it; antenna index and number of rounds of each row. Cached, because

@@ -220,8 +220,8 @@ class TagSensor(Sensor):
 
     def _values(self, view: View) -> dict[str, Array]:
         """The parameters (P,) of the detection models that are estimated, by block."""
-        values = {name: view.value(name) for name in self._blocks}
-        return {name: value for name, value in values.items() if value is not None}
+        value = view.value(self.name) if self._blocks else None
+        return {} if value is None else {self.name: value}
 
     def _estimated(self, view: View) -> Array:
         """The estimated parameters (Q,) of the likelihood."""
