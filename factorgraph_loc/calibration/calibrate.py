@@ -122,7 +122,8 @@ def _check_alike(first: Log, log: Log) -> None:
                 raise InputError(f"{other_log.name}: has no {sensor}, expected one in every log to calibrate from")
     for name, stream in log.streams.items():
         if name in first.streams and not are_alike(first.streams[name], stream):
-            raise InputError(f"{log.name}: its {name} is of another kind than that of {first.name}")
+            kinds = f"{type(stream).__name__}, that of {first.name} {type(first.streams[name]).__name__}"
+            raise InputError(f"{log.name}: its {name} has the form {kinds}; calibrate them separately")
     if has_heading(log) != has_heading(first):
         raise InputError(
             f"{log.name} and {first.name}: only one has headings in its reference; calibrate them separately"

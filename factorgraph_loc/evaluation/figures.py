@@ -60,14 +60,16 @@ class Track:
 
     @classmethod
     def of(cls, result: RunResult) -> Track:
-        """The data of a run."""
+        """The plotted data of a run, from its result in memory."""
         nis = {s: np.array(rows, dtype=float).reshape(-1, 3) for s, rows in result.diagnostics.nis.items()}
         events = tuple(result.diagnostics.events)
         return cls(result.causal(), result.final, nis, events, result.max_gap, result.reliability)
 
     @classmethod
     def read(cls, files: ResultFiles, max_gap: float = MAX_GAP) -> Track:
-        """The data in the files of a run."""
+        """The plotted data of a run, read from its result files. ``reliability`` stays empty: no file has it.
+
+        ``max_gap`` [s]: see the class."""
         causal, final = (estimates.trajectory for estimates in files.estimates().values())
         return cls(causal if len(causal) else None, final, files.innovations(), files.events(), max_gap)
 

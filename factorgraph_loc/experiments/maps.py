@@ -264,7 +264,8 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
     prior, source = resolve_prior(log, options.prior)
     if prior is None or (options.extend and not prior.has_heading):
         if options.extend:
-            raise InputError(f"{log.name}: its map can be extended from odometry only with a known start; give --prior")
+            needed = "needs a start with a heading; give --prior X,Y,HEADING"
+            raise InputError(f"{log.name}: --extend without reference poses {needed}")
         return None, "that of the start: the first pose is the origin (0, 0, 0)"
     certain = replace(prior, covariance=EXACT_SIGMA**2 * np.eye(3))
     return (prior if options.extend else certain), f"that of the start: {_in_words(prior, source)}"

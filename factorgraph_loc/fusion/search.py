@@ -95,8 +95,11 @@ class Search:
                 self._population.add(odometry, observation)
         return self.advance(odometry.t) or is_informative
 
-    def weigh(self, observation: Evidence, odometry: ChainState) -> None:
-        """Weigh the particles by an observation that is not a sensor's, once they have begun."""
+    def queue(self, observation: Evidence, odometry: ChainState) -> None:
+        """Queue an observation that is not from the search's own sensors, such as the free lengths of a proximity sensor.
+
+        :meth:`advance` weighs the particles by it. No effect before the particles have processed their first observation.
+        """
         if self._population is not None and self._population.newest is not None:
             self._population.add(odometry, observation)
 

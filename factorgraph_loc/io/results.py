@@ -86,7 +86,9 @@ class ResultFiles:
             table = pl.read_csv(self.read(EVENTS), schema_overrides={STAMP: pl.Int64, "event": pl.String})
             table = table.select(STAMP, "event")
         if table.null_count().sum_horizontal().item() or not table[STAMP].is_between(-LATEST, LATEST).all():
-            raise InputError(f"{source}: has a row without a stamp and an event, expected both")
+            raise InputError(
+                f"{source}: has a row that lacks its stamp or its event, or a stamp beyond {LATEST:.1e} ns"
+            )
         return tuple(((t_ns - (self.t0_ns or 0)) / 1e9, text) for t_ns, text in table.iter_rows())
 
 

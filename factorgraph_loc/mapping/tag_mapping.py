@@ -86,7 +86,9 @@ def map_tags(
     else:
         if prior is None:
             if extend:
-                raise InputError(f"{log.name}: its map can be extended from odometry only with a known start")
+                raise InputError(
+                    f"{log.name}: prior is None, expected a start, as extend is true without reference poses"
+                )
             prior = PosePrior(log.span()[0], np.zeros(3), EXACT_SIGMA**2 * np.eye(3))
             observations = replace(observations, facing=np.full(len(given), np.nan))
         slam = tag_slam(log, observations, prior, known, progress)

@@ -55,7 +55,8 @@ class Exchange:
 
     @abstractmethod
     def to_numpy(self) -> Array:
-        """The poses as an array with a row for each."""
+        """The poses as an array (N, 4) or (N, 8), one row per pose: the time t [s] first, then the pose. The columns are those of
+        the subclass."""
 
     @classmethod
     def from_polars(cls, table: pl.DataFrame) -> Self:
@@ -66,7 +67,7 @@ class Exchange:
         return cls.from_numpy(numbers(table, cls._columns()))
 
     def to_polars(self) -> pl.DataFrame:
-        """The poses as a table with a row for each."""
+        """The poses as a table with the columns of :meth:`to_numpy`, one row per pose."""
         import polars as pl  # noqa: PLC0415 - most users of trajectories need none
 
         return pl.DataFrame(self.to_numpy(), schema=list(self._columns()))

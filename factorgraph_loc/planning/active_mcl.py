@@ -78,7 +78,7 @@ class ActiveMcl:
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
         """Weigh the particles by free lengths (D,) [m] read by a proximity sensor; no effect before the first scan."""
-        self._search.weigh(LengthsSeen(sensor, lengths), self._motion.state(self._t))
+        self._search.queue(LengthsSeen(sensor, lengths), self._motion.state(self._t))
         self._search.advance(self._t)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:

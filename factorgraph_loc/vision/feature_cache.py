@@ -33,7 +33,8 @@ class ImageFeatures:
 
 
 def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
-    """Encode pixels with 24 bits (0.001 px or better), descriptors without loss."""
+    """Encode features as bytes: pixel coordinates as float32, which is exact to 0.001 px or better below 16384 px; descriptors
+    without loss."""
     points = keypoints.points.astype("<f4")
     binary = descriptors.dtype == np.uint8
     narrow = descriptors.astype(np.uint8)

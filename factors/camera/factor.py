@@ -74,7 +74,10 @@ class ReprojectionFactor:
         )
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value, whatever the tilt."""
+        """Whitened residual (2K,) and its Jacobian (2K, d) with respect to each value, with robust weights and tempering.
+
+        The unknown tilt is marginalised: its variance is part of the noise of the points.
+        """
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]

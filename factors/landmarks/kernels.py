@@ -237,7 +237,9 @@ def updated(
             weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
         delta, posterior, _ = corrected(prior, now, jacobian, columns, weights, previous)
     if not (np.all(np.isfinite(delta)) and cholesky(posterior)[1]):
-        raise np.linalg.LinAlgError("an update is not finite, or not positive definite")
+        raise np.linalg.LinAlgError(
+            "an update has a step that is not finite, or a covariance that is not positive definite"
+        )
     return delta, posterior, residual, max(0.0, nis), measured
 
 

@@ -144,7 +144,10 @@ def test_logs_that_do_not_go_together_are_refused(simulate, headless):
         check([log, log])
     odometry = second.streams["odometry"]
     increments = IncrementStream(odometry.t, odometry.v, odometry.v, odometry.w)
-    with pytest.raises(InputError, match=r"simulated-2: its odometry is of another kind than that of simulated-1"):
+    with pytest.raises(
+        InputError,
+        match=r"simulated-2: its odometry has the form IncrementStream, that of simulated-1 VelocityStream; calib",
+    ):
         check([log, replace(second, streams={**second.streams, "odometry": increments})])
     with pytest.raises(InputError, match=r"simulated-1: odometry and reference overlap in 14 windows"):
         learn(log)

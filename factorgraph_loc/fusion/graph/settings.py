@@ -40,8 +40,8 @@ class SmootherSettings(GraphSettings):
         float | None, Field(ge=0.1, le=3600.0), InUnit("s"), WrapValidator(_lag), PlainSerializer(_written)
     ] = None
     """length of the window, behind which poses are final, or all: the full history is kept solved. By default causal estimates
-    come from a window of 10 s and the final trajectory from the whole problem; where landmarks or points are estimated,
-    all"""
+    come from a window of 10 s and the final trajectory from the whole problem; with loops, or where landmarks or
+    points are estimated, all"""
     relinearize_threshold: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
     """change of a variable [m, rad, or the unit of a constant] above which its factors are linearised again"""
     relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10

@@ -61,8 +61,12 @@ class TableTopic(TopicSettings):
 
 
 class RowsOfTopic:
-    """Collects rows of a topic: ``columns`` of names and of numbers, by the ``fields`` of its messages; missing numbers are NaN.
-    ``units``: names or factors by column; ``table``: description of the rows."""
+    """Collects the rows of a table from the messages of a topic.
+
+    ``fields``: where in a message the value of each column is; ``table``: the description of the columns; ``columns``: those to
+    collect, by default all but the first; ``units``: the unit of a column, or a factor. A missing number becomes NaN, an empty
+    name raises InputError.
+    """
 
     def __init__(
         self,

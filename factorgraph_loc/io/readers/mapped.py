@@ -280,7 +280,10 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
     mapped = folder.read(options, ODOMETRY)
     side = next((name for name in WHEELS if name in mapped.columns), None)
     if side is None and (options.track is not None or options.radius is not None):
-        raise InputError(f"{path}: track and radius are for columns of wheels, such as left and right")
+        raise InputError(
+            f"{path}: track or radius is given, but no columns of wheels are mapped, such as left and right; map them, or remove "
+            "track and radius"
+        )
     size, track = options.sizes(path, side, turns=side in TURNS) if side else (1.0, 0.0)
     t_ns, columns = _columns(mapped, options.clock_offset)
     if "dx" in columns:
@@ -312,7 +315,10 @@ def _reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Traje
         return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=options.has_heading)
     mapped = folder.read(options, (*POSES, ("t", "x", "y")))
     if "heading" not in mapped.columns and "qw" not in mapped.columns and options.has_heading:
-        raise InputError(f"{path}: columns maps no heading: set has_heading = false if there is none")
+        raise InputError(
+            f"{path}: [options.reference] columns names neither heading nor qx, qy, qz, qw: add one of them, or set "
+            "has_heading = false"
+        )
     t_ns, columns = _columns(mapped, options.clock_offset)
     poses = _planar(path, mapped.rows, columns, options, warnings)
     keep = checks.in_order(path, mapped.rows, t_ns, warnings)

@@ -47,8 +47,12 @@ NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Predicted:
-    """The prediction for an image: ``pose`` (3,) of the factor's variable with body-frame ``covariance`` (3, 3), and the
-    corrections (P,) of the camera's constants that are estimated with their ``spread`` (P, P)."""
+    """The prediction for an image.
+
+    ``pose`` (3,): of the pose variable that the factor is on; ``covariance`` (3, 3): of that pose, in the body frame.
+    ``constants`` (P,): the current corrections of those camera constants that are estimated; ``spread`` (P, P): their covariance.
+    Both are None if no constant is estimated.
+    """
 
     pose: Array
     covariance: Array

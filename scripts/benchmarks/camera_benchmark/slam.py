@@ -53,8 +53,12 @@ def section(options: Options) -> Report:
         known = report.collect(frame, jobs)
         found = {seed: outcome for (_, seed), outcome in report.collect(mapped, jobs).items()}
         failures(report, found)
-        what = f"at most 20 of {POINTS} identified points in each" if folder is None else "rendered"
-        report.say(f"{len(found)} offices of {duration:.0f} s, {RATE:.0f} images/s, {what}.")
+        what = (
+            f"Each office has {POINTS} points, identified by name. An image shows at most 20."
+            if folder is None
+            else "The images are rendered."
+        )
+        report.say(f"Drives of {duration:.0f} s in {len(found)} offices, with {RATE:.0f} images per second. {what}")
         report.say(sentence(list(known.values())))
         table(report, found)
     return report

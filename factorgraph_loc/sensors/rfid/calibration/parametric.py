@@ -56,7 +56,11 @@ class Family:
     design: Callable[[Array, Array], Array] | None = None
 
     def jacobian(self, values: Array, points: Array, facing: Array) -> Array:
-        """Derivatives (M, P) of the logits of tags at ``points`` (M, 3)."""
+        """Derivatives (M, P), by the parameters with values ``values`` (P,), of the logit of the read probability.
+
+        It is that of tags at ``points`` (M, 3) [m] in the antenna's frame. ``facing`` (M,): cosine of the angle between the tag's
+        facing and the direction to the antenna.
+        """
         if self.design is not None:
             return self.design(points, facing)
         start = logits(self.built(values), points, facing)[0]
