@@ -171,7 +171,9 @@ def _settings(
             raise InputError(f"unknown key {key}{nearest(key, [*of_run, *of_world])}")
     changed = {key: value for key, value in changes.items() if key in of_world}
     if isinstance(world, SimulationSettings) and changed:
-        raise InputError("changes of the world apply to a preset or a file, but settings are given")
+        raise InputError(
+            "the world is given as settings, so no key of it can be changed: name a preset or a file, or edit the settings"
+        )
     simulation = world if isinstance(world, SimulationSettings) else named_settings(str(world), changed)
     run = {key: value for key, value in changes.items() if key in of_run}
     return simulation, parse_model(ActiveSettings, run, "the settings")

@@ -68,7 +68,7 @@ class Cluster(Executor):
             raise InputError(f"{named}: no scheduler answers there: {error_text(error)}") from error
         if not self._client.nthreads():
             self._client.close()
-            raise InputError(f"{named}: it has no workers")
+            raise InputError(f"{named}: the scheduler has no workers; start one with `dask worker ADDRESS`")
         return self
 
     def __exit__(self, _: object, error: BaseException | None, *__: object) -> None:

@@ -170,7 +170,7 @@ def run_experiment(
     from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
 
     if scheduler is not None and jobs is not None:
-        raise InputError("--jobs applies to this machine, but --scheduler names a cluster: expected one of them")
+        raise InputError("--jobs applies to this machine, but --scheduler names a cluster: remove one of them")
     todo = prepared.todo(again=again)
     states = dict(prepared.states)
     waiting = {run.key for run in todo}

@@ -138,7 +138,7 @@ def _mapped_kind(log: Log, options: MapOptions) -> str:
     given = {flag: kind for name, (flag, kind) in FLAGS.items() if getattr(options, name) != getattr(usual, name)}
     what = options.of or next(iter(given.values()), None) or _usual_kind(log, extend=options.extend)
     if flag := next((flag for flag, kind in given.items() if kind != what), None):
-        raise InputError(f"{flag} is for maps of {given[flag]}, but {what} are mapped here")
+        raise InputError(f"{flag} is for maps of {given[flag]}, but {what} are mapped here; leave {flag} out")
     return what
 
 
@@ -164,9 +164,11 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
             f"--estimator is {quoted(estimator)}, expected one that estimates landmarks: {', '.join(MAP_ESTIMATORS)}"
         )
     if options.poses is not None:
-        raise InputError("--poses is for maps of tags, but landmarks are mapped here")
+        raise InputError("--poses is for maps of tags, but landmarks are mapped here; leave it out")
     if "landmarks" in settings:
-        raise InputError(f"--set is {estimator}.landmarks, but a map is made without the log's map, or with --extend")
+        raise InputError(
+            f"--set is {estimator}.landmarks, but --extend alone selects how the map is used; leave it out"
+        )
     require_mappable(log)
     if options.extend and not log.world.landmarks:
         raise InputError(f"{log.name}: has no map that could be extended; leave --extend out")

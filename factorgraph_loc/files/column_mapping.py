@@ -88,7 +88,7 @@ def read_mapped(
         expected = " or ".join(", ".join(shape) for shape in shapes)
         raise InputError(f"{path}: columns maps {listed(sorted(given)) or 'nothing'}, expected {expected}")
     if stray := sorted(set(mapping.units) - given):
-        raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns")
+        raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns: map the field, or remove the unit")
     needed: list[Alternatives] = [
         (column,) for field, column in mapping.columns.items() if field not in (*optional, *either)
     ]

@@ -105,8 +105,8 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """The arguments of the compiled code that are by near tag: points (C, 3), normals (C, 2), the number of the table by antenna and
-    tag (A, C), and hits (K, C)."""
+    """The data of the C near tags that :func:`weigh_tag` needs: points (C, 3), normals (C, 2), the number of the table for each
+    antenna and tag (A, C), and hits (K, C)."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):

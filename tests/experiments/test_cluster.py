@@ -108,7 +108,7 @@ def test_the_command_takes_a_scheduler(workers, planned, tmp_path):
     assert {row["key"] for row in json.loads(done.stdout)["runs"]} == {run.key for run in runs}
     both = CliRunner().invoke(app, [*command, workers.scheduler_address, "--jobs", "2"])
     assert both.exit_code == 2
-    assert "expected one of them" in both.stderr
+    assert "remove one of them" in both.stderr
 
 
 def test_workers_with_other_code_are_refused(workers, planned, stored, monkeypatch):

@@ -62,9 +62,7 @@ def test_a_field_that_the_message_lacks(mcap, refuse):
 
 
 def test_an_antenna_that_is_not_told(mcap, refuse):
-    refuse(
-        mcap, "expected either fields.antenna, or antenna", rfid={"topic": "/rfid", "fields": {"epc": "reads[].epc"}}
-    )
+    refuse(mcap, "needs either fields.antenna, or antenna", rfid={"topic": "/rfid", "fields": {"epc": "reads[].epc"}})
 
 
 def test_headers_without_stamps(tmp_path, bag_maker, read, refuse):

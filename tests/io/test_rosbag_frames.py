@@ -37,7 +37,7 @@ def test_transforms_that_lead_nowhere(maker, refuse_drive, refused):
     tf = {"topic": "/tf", "parent": "map", "child": "base_link"}
     refuse_drive(maker, "no transforms connect base_link to map: there is no frame 'map'", reference=tf)
     options = {"odometry": {"topic": "/odom"}, "reference": {"topic": "/tf"}}
-    refused(maker.path, "/tf: parent and child are missing: two frames", reader="rosbag", options=options)
+    refused(maker.path, "/tf: parent or child is missing: give two frames", reader="rosbag", options=options)
 
 
 def test_odometry_from_transforms(maker, read_drive, refused):
@@ -49,9 +49,9 @@ def test_odometry_from_transforms(maker, read_drive, refused):
     moves = np.column_stack((moved.dx, moved.dy, moved.dtheta))
     np.testing.assert_allclose(moves[1:], se2.between(poses[:-1], poses[1:]), atol=1e-9)
     for changed, message in (
-        ({"child": None}, "/tf: parent and child are missing: two frames, such as map and base_link"),
+        ({"child": None}, "/tf: parent or child is missing: give two frames, such as map and base_link"),
         ({"child": "base_lnk"}, "there is no frame 'base_lnk': did you mean base_link?"),
-        ({"topic": "/odom"}, "/odom: odometry.parent and odometry.child are for tf, this is nav_msgs/msg/Odometry"),
+        ({"topic": "/odom"}, "/odom: odometry.parent or odometry.child is given, but this is nav_msgs/msg/Odometry"),
     ):
         refused(maker.path, message, reader="rosbag", options={"odometry": options | changed})
 

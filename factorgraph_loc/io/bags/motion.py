@@ -125,7 +125,9 @@ class YawRates:
     def __init__(self, bag: Bag, options: ImuTopic, frames: StaticFrames) -> None:
         topic = bag.topic(options.topic, IMU)
         if options.frame is not None and options.is_given():
-            raise InputError(f"{bag.path} {topic.name}: tf_static has the frame, expected no axes or mounting")
+            raise InputError(
+                f"{bag.path} {topic.name}: frame is given, so the axes are those of tf_static: remove axes and mounting"
+            )
         self._options, self._frames = options, frames
         paths = [f"angular_velocity.{axis}" for axis in "xyz"]
         self._rows = TopicRows(f"{bag.path} {options.topic}", 3, paths)
@@ -148,12 +150,12 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
     known = () if options.wheels else sorted({*POSES, *TWISTS, JOINTS, *TF})
     kind = bag.topic(options.topic, *known).type
     if kind not in TF and (options.parent is not None or options.child is not None):
-        raise InputError(f"{source}: odometry.parent and odometry.child are for tf, this is {kind}")
+        raise InputError(f"{source}: odometry.parent or odometry.child is given, but this is {kind}, not tf: remove it")
     poses = kind in TF or (kind in POSES and not (kind == ODOMETRY and options.use == "twist"))
     if options.is_given() and not poses:
-        raise InputError(f"{source}: axes and mounting are for odometry that comes as poses")
+        raise InputError(f"{source}: axes or mounting is given, but the odometry is not read as poses: remove it")
     if kind == JOINTS and options.wheels is None:
-        raise InputError(f"{source}: odometry.wheels is missing: left, right, radius and track")
+        raise InputError(f"{source}: odometry.wheels is missing: give left, right, radius and track in it")
     if options.wheels is not None and kind not in TF:
         if kind != JOINTS and options.wheels.right_topic is None:
             raise InputError(f"{source}: odometry.wheels.right_topic is missing, as {kind} has no joints")

@@ -170,7 +170,7 @@ class FrameReference:
     def __init__(self, bag: Bag, topic: PoseTopic, stamper: Stamper, static: StaticFrames) -> None:
         self._source = f"{bag.path} {topic.topic}"
         if topic.parent is None or topic.child is None:
-            raise InputError(f"{self._source}: parent and child are missing: two frames, such as map and base_link")
+            raise InputError(f"{self._source}: parent or child is missing: give two frames, such as map and base_link")
         self._parent, self._child = plain(topic.parent), plain(topic.child)
         self._stamper, self._static = stamper, static
         self._edges: dict[str, TopicRows] = {}  # from each frame to its parent, in order of arrival

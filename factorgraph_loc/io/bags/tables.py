@@ -141,7 +141,9 @@ class Reads(RowsOfTopic):
         if "epc" not in options.fields:
             raise InputError(f"{source}: fields.epc is missing")
         if ("antenna" in options.fields) == (options.antenna is not None):
-            raise InputError(f"{source}: expected either fields.antenna, or antenna, the name of the only one")
+            raise InputError(
+                f"{source}: needs either fields.antenna, or antenna, the name of the only one; give one of them"
+            )
         super().__init__(bag, options.topic, options.fields, RFID, READ, options.units)
         self._stamp_unit = round(STAMP_OF_READ.in_unit(options.units.get("stamp", "us"), source)[1])
         # the antenna of a message without reads

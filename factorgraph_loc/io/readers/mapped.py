@@ -238,7 +238,9 @@ def _about_z(rows: TableRows, mapping: ImuFile, numbers: dict[str, Array]) -> Ar
     if "w" not in numbers:
         return about_z(rows.path, rows.rows, np.column_stack([numbers[n] for n in RATES]), mapping.turned())
     if mapping.is_given():
-        raise InputError(f"{rows.path}: axes and mounting apply to rates about three axes, expected columns wx, wy, wz")
+        raise InputError(
+            f"{rows.path}: axes or mounting is given, but columns maps no wx, wy, wz: map them, or remove it"
+        )
     return numbers["w"]
 
 
@@ -249,7 +251,7 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
         raise InputError(f"{path}: [options] has rfid and readers, expected one of them")
     if not files:
         if options.inventories is not None:
-            raise InputError(f"{path}: [options] has inventories without rfid")
+            raise InputError(f"{path}: [options] has inventories, but no rfid: describe the reads in [options.rfid]")
         return None
     tables = [read_all_reads(folder, file) for file in files]
     reads = tables[0] if len(tables) == 1 else joined(path, tables)
@@ -257,14 +259,16 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
     inventories = None
     if (mapping := options.inventories) is not None:
         if gaps:
-            raise InputError(f"{path}: round_gap has no effect with inventories, which define the rounds")
+            raise InputError(
+                f"{path}: round_gap has no effect, as inventories define the rounds: remove one of the two"
+            )
         antennas = {name: given for file in files for name, given in file.antennas.items()}
         inventories = _table(folder, native_tables()["inventories"][1], mapping)
         named = [antennas.get(name, name) for name in inventories.names["antenna"]]
         inventories = replace(inventories, names={"antenna": named})
     if len(gaps) > 1:
         raise InputError(
-            f"{path}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected one"
+            f"{path}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected the same for all"
         )
     return read_rounds(reads, inventories, gaps.pop() if gaps else ROUND_GAP, folder.warnings)
 
@@ -274,7 +278,7 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
     path, warnings = folder.file(options.file), folder.warnings
     if options.is_in_format():
         if options.track is not None or options.radius is not None:
-            raise InputError(f"{path}: format {options.format} has no wheels, expected no track or radius")
+            raise InputError(f"{path}: format {options.format} has no wheels: remove track and radius")
         t_ns, poses = _in_format(folder, options)
         return t_ns, motions.after_rest(motions.between_poses(path, t_ns, poses, warnings))
     mapped = folder.read(options, ODOMETRY)
@@ -329,9 +333,11 @@ def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array
     """Timestamps (N,) and planar poses (N, 3) of a file in the format of another program."""
     path = folder.file(options.file)
     if options.columns or options.units:
-        raise InputError(f"{path}: format {options.format} has no columns or units to map")
-    if (options.format == "kitti") != (options.times is not None):
-        raise InputError(f"{path}: format kitti and times, the file of the stamps, are needed together")
+        raise InputError(f"{path}: format {options.format} names its own columns and units: remove columns and units")
+    if options.format == "kitti" and options.times is None:
+        raise InputError(f"{path}: format is kitti, but times is missing: name the file of the stamps")
+    if options.format != "kitti" and options.times is not None:
+        raise InputError(f"{path}: times is given, but format is {options.format}, not kitti: remove times")
     turned: Turned = options
     if options.times is not None:
         poses = read_kitti(path, folder.file(options.times))
@@ -354,7 +360,9 @@ def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turne
         places = np.column_stack((columns["x"], columns["y"], columns.get("z", np.zeros(len(rows)))))
         return on_floor(path, places, rotations, warnings, turned)
     if turned.is_given():
-        raise InputError(f"{path}: axes and mounting apply to poses with a quaternion, expected columns qx, qy, qz, qw")
+        raise InputError(
+            f"{path}: axes or mounting is given, but columns maps no qx, qy, qz, qw: map them, or remove it"
+        )
     heading = columns.get("heading", np.zeros(len(rows)))
     around = np.abs(np.diff(heading, prepend=heading[0]))
     valid = ~((around > LEAST_AROUND) & (around < 360.0))

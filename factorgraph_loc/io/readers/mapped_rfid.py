@@ -154,11 +154,15 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
     """
     wide = "*" in options.columns.get("rssi", "")
     if not wide and ("antenna" in options.columns) == (options.antenna is not None):
-        raise InputError(f"{path}: expected either columns.antenna, or antenna, the name of the only one")
-    if ("channel" in options.columns) != (options.channels is not None):
-        raise InputError(f"{path}: columns.channel and channels, the frequencies [MHz], are needed together")
+        raise InputError(
+            f"{path}: needs either columns.antenna, or antenna, the name of the only one; give one of them"
+        )
+    if "channel" in options.columns and options.channels is None:
+        raise InputError(f"{path}: columns maps channel, but channels is missing: give the frequencies [MHz]")
+    if "channel" not in options.columns and options.channels is not None:
+        raise InputError(f"{path}: channels is given, but columns maps no channel: map it, or remove channels")
     if {"channel", "frequency"} <= set(options.columns):
-        raise InputError(f"{path}: columns maps frequency and channel, expected one of them")
+        raise InputError(f"{path}: columns maps frequency and channel: remove one of them")
     shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
     cells = read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
     mapped = folder.noted(cells, options)
