@@ -360,8 +360,8 @@ def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> 
         doubts.append(f"{log}: reads over those that the detection models predict, by distance and antenna: {shares}")
     if together * tempering > TOGETHER:
         doubts.append(
-            f"{log}: reads and misses come in bursts, {together:.0f} rounds inform as much as one; the tempering in the rig is "
-            f"{tempering:g}"
+            f"{log}: reads and misses come in bursts, {together:.0f} rounds inform as much as one: set rfid.tempering = "
+            f"{1.0 / together:.2g} in the rig, which has {tempering:g}"
         )
     return Reliability("reads", groups.names(chosen), observed, predicted, sigma, together, tuple(doubts))
 
