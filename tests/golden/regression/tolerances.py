@@ -66,13 +66,17 @@ SINGLE_PRECISION = Branch(
         "residuals.bearing_range.bearing.sums": 0.01,
     },
 )
+MANY_OPTIMA = Branch(
+    SINGLE_PRECISION.reason + " Phase has many optima, and particles stay in one or another of them.",
+    {**SINGLE_PRECISION.loose, "learnt.constants": 2.5},
+)
 WHEN_FOUND = {
     **dict.fromkeys(("status", "nis", "nis.rfid.t", "nis.rfid.sums", "residuals"), NOT_HELD),
     "events.t": 0.4,
 }
 FOUND_BY_PARTICLES = Branch(
     SINGLE_PRECISION.reason + " So the place is found some ticks earlier or later.",
-    {**SINGLE_PRECISION.loose, **WHEN_FOUND, "causal.poses": 6.0, "final.poses": 6.0},
+    {**SINGLE_PRECISION.loose, **WHEN_FOUND, "causal.poses": 6.0, "final.poses": 6.0, "final.covariances": 5.0},
 )
 FOUND = Branch(
     FOUND_BY_PARTICLES.reason,
@@ -179,7 +183,7 @@ def branch_of(case: str) -> Branch | None:
     elif particles and name.startswith(("fault", "tags-landmarks")):
         found = FEW_PARTICLES
     elif hears_tags and (particles or label == "switching"):
-        found = SINGLE_PRECISION
+        found = MANY_OPTIMA if particles and name == "tags-phase" else SINGLE_PRECISION
     elif particles:
         found = DRAWN
     elif name == "points-self-calibration" and label.startswith("smoother"):
