@@ -174,10 +174,10 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 
 @contextmanager
 def rare_garbage_collection() -> Iterator[None]:
-    """A context in which Python seldom searches for garbage, and not among the objects that exist already.
+    """Collect garbage less often within this context, and skip objects that exist already.
 
-    A search through the objects of all loaded modules takes as long as many updates. Nothing changes if the program has called
-    ``gc.freeze``.
+    A collection over the objects of all loaded modules takes as long as many updates. The context has no effect if the program
+    has called ``gc.freeze``.
     """
     if gc.get_freeze_count():
         yield

@@ -94,19 +94,19 @@ def whole_scans(log: Log) -> list[RfidScan]:
 
 @dataclass(frozen=True, eq=False)
 class TagEvidence:
-    """The evidence of a scan on the states of U ``tags``, see :meth:`~factors.rfid.tag_states.TagStates.expect`; ``heard`` (U,):
+    """The evidence of a scan on the states of U ``tags``, see :meth:`~factors.rfid.tag_states.TagStates.expect`; ``is_read`` (U,):
     whether it read them."""
 
     tags: Integers
-    told: Array
-    heard: NDArray[np.bool_]
+    log_likelihoods: Array
+    is_read: NDArray[np.bool_]
 
 
 class KnownTags:
     """Turns scans into read counts of the map's tags. Tags and antennas that map or rig lack are counted as ignored.
 
     It also tracks the ``states`` of the tags. A read shows that a tag is not dead; other evidence of a scan requires a known
-    pose (:meth:`told`, :meth:`learn`). Tags that are believed dead, weak or moved are listed in the diagnostics.
+    pose (:meth:`weigh_states`, :meth:`learn`). Tags that are believed dead, weak or moved are listed in the diagnostics.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
@@ -145,7 +145,7 @@ class KnownTags:
         if new != self.likelihood.model.tempering:
             self.likelihood = self.likelihood.tempered(new)
 
-    def looks(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
+    def read_counts(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
         """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time, with the robot's
         velocity ``twist`` (3,). Without ``count``, ignored reads are not counted, because the scan will be processed again."""
         diagnostics = self._diagnostics if count else Diagnostics()
@@ -178,7 +178,7 @@ class KnownTags:
             diagnostics.ignore("tag not in the map", unknown)
         at, places = np.array(reads, dtype=np.int64).reshape(-1, 2).T
         self.states.hear(m.t, np.unique(places))
-        self._tell()
+        self._report_suspects()
         tags = np.unique(np.concatenate((places, self.states.doubtful)))
         hits = np.zeros((len(used), len(tags)), dtype=np.int64)
         np.add.at(hits, (at, np.searchsorted(tags, places)), 1)
@@ -189,18 +189,20 @@ class KnownTags:
         twists = np.tile(twist, (len(used), 1))
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
-    def told(self, looks: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """The evidence of counts on tags in reach at a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3);
-        ``parameters`` (Q,): estimated parameters of the likelihood."""
+    def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
+        """The evidence of ``counts`` on the states of tags in reach.
+
+        ``pose`` (3,): predicted, with body-frame ``covariance`` (3, 3). ``parameters`` (Q,): of the likelihood, as estimated.
+        """
         assert self.likelihood is not None
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
-        return TagEvidence(*self.likelihood.displaced(poses, looks, *places))
+        return TagEvidence(*self.likelihood.displaced(poses, counts, *places))
 
-    def with_states(self, looks: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
+    def with_states(self, counts: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
         """The counts with the states of tags that may be dead or moved, given their ``evidence``."""
-        elsewhere = self.states.expect(evidence.tags, evidence.told)
-        return looks.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
+        elsewhere = self.states.expect(evidence.tags, evidence.log_likelihoods)
+        return counts.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
         """The counts with the effect of tags removed that are clearly not as surveyed."""
@@ -213,24 +215,24 @@ class KnownTags:
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
         """Learn of the tags that were not read at ``t``, and of those that were read :data:`CONFIRMED` ago."""
-        is_read, tags, told = evidence.heard, evidence.tags, evidence.told
-        self.states.learn(t, tags[~is_read], told[~is_read])
-        self._waiting.append((t, tags[is_read], told[is_read]))
+        is_read, tags, log_likelihoods = evidence.is_read, evidence.tags, evidence.log_likelihoods
+        self.states.learn(t, tags[~is_read], log_likelihoods[~is_read])
+        self._waiting.append((t, tags[is_read], log_likelihoods[is_read]))
         while self._waiting[0][0] < t - CONFIRMED:
             self.states.learn(*self._waiting.popleft())
-        self._tell()
+        self._report_suspects()
 
     def forget(self, since: float) -> None:
         """Take back what was learnt since ``since``."""
         self.states.forget(since)
         self._waiting = deque(row for row in self._waiting if row[0] < since)
-        self._tell()
+        self._report_suspects()
 
     def silent(self) -> None:
         """Take back what was learnt since the last read, because the reader or all tags have failed."""
         self.forget(math.nextafter(self.states.last_read, math.inf))
 
-    def _tell(self) -> None:
+    def _report_suspects(self) -> None:
         for state, tags in self.states.suspects.items():
             names = map(self.map.names.__getitem__, tags)
             self._diagnostics.doubted[f"{state}_tags"] = dict(zip(names, tags.values(), strict=True))

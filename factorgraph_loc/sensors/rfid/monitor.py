@@ -194,8 +194,8 @@ class ReadGroups:
         """Add ``reads`` in ``rounds`` (K,) of ``antennas`` (K,); ``counts`` (K, C): which of them are counted."""
         _add(self.sums, antennas, rounds, reads.hits, reads.p, reads.distance, counts)
 
-    def told(self, fewest: float = FEWEST) -> Integers:
-        """The groups that are predicted to have so many reads or more; antennas only if there are several."""
+    def large(self, fewest: float = FEWEST) -> Integers:
+        """The groups of at least ``fewest`` predicted reads; antennas only if there are several."""
         count = len(self.sums[1]) if len(self.antennas) > 1 else BANDS
         return np.flatnonzero(self.sums[1, :count] >= fewest)
 
@@ -255,8 +255,8 @@ class ConsistencyMonitor:
     @property
     def shares(self) -> str:
         """Reads over predicted reads of the groups that are off most."""
-        groups = self._groups.told()
-        return self._groups.shares(groups if len(groups) else self._groups.told(1.0))
+        groups = self._groups.large()
+        return self._groups.shares(groups if len(groups) else self._groups.large(1.0))
 
     def dead_antennas(self, together: float) -> list[int]:
         """The antennas that read nothing, or nearly so, although :data:`MANY` independent reads were predicted of each."""

@@ -47,7 +47,7 @@ class TagObservation:
     here: TagReadCounts | None = None  # reads and misses, relative to the pose at the scan's time
     rounds: int = 0  # antenna rounds, for reads and misses
     blocks: tuple[str, ...] = ()
-    told: TagEvidence | None = None  # of the states of tags
+    states: TagEvidence | None = None  # evidence on the states of tags
     iterations: ClassVar[int] = ITERATIONS
 
     @property
@@ -145,16 +145,16 @@ class TagSensor(Sensor):
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
         is_late = "time_offset" in self.constants.names
         twist = self._wheels.twist(m.t) if is_late and self._wheels is not None else STANDING
-        counts, likelihood = self.tags.looks(m, twist), self.tags.likelihood
+        counts, likelihood = self.tags.read_counts(m, twist), self.tags.likelihood
         if counts is None or likelihood is None:
             return
         relative = counts if view.offset is None else counts.moved(view.offset.delta)
         evidence = None
         if view.localized and np.trace(view.covariance[:2, :2]) < PLACED**2:
-            evidence = self.tags.told(relative, view.pose, view.covariance, self._estimated(view))
+            evidence = self.tags.weigh_states(relative, view.pose, view.covariance, self._estimated(view))
             counts = self.tags.with_states(counts, evidence)
             relative = counts if view.offset is None else counts.moved(view.offset.delta)
-        observation = replace(self._detection(m, relative, counts), told=evidence)
+        observation = replace(self._detection(m, relative, counts), states=evidence)
         yield observation if not view.localized or self._learns(m.t) else observation.on_pose(self._values(view), {})
         if self._silence.lasts and view.newest:
             return
@@ -190,8 +190,8 @@ class TagSensor(Sensor):
             return False
         if view.newest:
             self._monitor.add(t, correction.excess_nll, correction.variance)
-        if observation.told is not None and self._monitor.suspicious_since is None and t >= self._confirmed:
-            self.tags.learn(t, observation.told)
+        if observation.states is not None and self._monitor.suspicious_since is None and t >= self._confirmed:
+            self.tags.learn(t, observation.states)
             if view.newest:
                 self._count(observation, view)
         return True
@@ -242,7 +242,7 @@ class TagSensor(Sensor):
         return not self._silence.lasts
 
     def evidence(self, m: RfidScan) -> TagObservation | None:
-        counts = self.tags.looks(m, count=False)
+        counts = self.tags.read_counts(m, count=False)
         if counts is None or self.tags.likelihood is None:
             return None
         observation = self._detection(m, counts, counts)  # with the models of the rig

@@ -347,7 +347,7 @@ def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> 
     ones = np.ones(len(looks.p), dtype=np.int64)
     reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
     groups.add(looks.antenna, ones, reads, ones[:, None] > 0)
-    together, chosen = _overdispersion(looks, (looks.distance // BAND).astype(np.int64)), groups.told()
+    together, chosen = _overdispersion(looks, (looks.distance // BAND).astype(np.int64)), groups.large()
     if not len(chosen):
         return None
     observed, predicted, variance = groups.sums[:, chosen]
