@@ -20,14 +20,11 @@ from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion.filter import Filter, FilterSettings
 from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, PosePrior
 from factorgraph_loc.model.measurement import Measurement
-from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.known_points import CAMERAS
 from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.use import TurnCheck
-from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_motion import (
@@ -107,8 +104,6 @@ class Monoslam(Filter):
         self._constants = self._motion.constants
         camera = setup.rig.find(CameraSettings) if any(name in setup.sensors for name in CAMERAS) else None
         self._scale = self._constants.names.index(SCALE) if SCALE in self._constants.names else None
-        turns = camera.model() if camera is not None and moving(setup.sensors) else None
-        self._check = TurnCheck(turns, self._motion, self.diagnostics, NOTHING)
         self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None
         self._relocalized = False
@@ -192,7 +187,6 @@ class Monoslam(Filter):
         if eye is None:
             self.diagnostics.ignore("camera", len(m.pixels))
             return
-        self._check.add(m)
         state, match = self._match(m, self._state, eye)
         state, self._relocalized = self._relocated(m, state, eye, match)
         if len(match.pixels) and not self._relocalized and not self._is_vague(state):
@@ -295,7 +289,7 @@ class Monoslam(Filter):
     def _estimate(self) -> PoseEstimate:
         robot = self._state.robot
         pose, covariance = seen_from_above(robot, self._pose_covariance(robot, self._state.covariance))
-        return PoseEstimate(self._t, pose, covariance, "localized", doubts_model=self._check.told)
+        return PoseEstimate(self._t, pose, covariance, "localized")
 
     def _pose_covariance(self, robot: RobotState, covariance: Array) -> Array:
         """The covariance (6, 6) of a pose, including that of the start without a map, or of the camera's mounting in one."""

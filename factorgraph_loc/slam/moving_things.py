@@ -17,8 +17,8 @@ from factorgraph_loc.fusion.graph.graph import GraphView, Keyframe
 from factorgraph_loc.sensors.camera.known_points import lifted
 from factorgraph_loc.vision.consensus import GATE, Truths
 from factors import positive
-from factors.camera.model import CameraModel, linearize_in_space
-from factors.camera.ray_pairs import RayPairs, nearness
+from factors.camera.model import CameraModel, linearize_in_space, rays
+from factors.camera.triangulation_kernels import inverse_depths
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -101,16 +101,17 @@ def fitting(model: CameraModel, first: Array, second: Array, step: Increment) ->
     Two distances are tried: that where the rays are nearest to each other, and the best one for an error of the step
     (Gauss-Newton).
     """
-    pairs = RayPairs.of(model, first, second)
-    camera, nearer = lifted(model, step.delta, step.covariance), nearness(pairs, step.delta)[0]
-    squared = np.full(len(pairs), np.inf)
+    first_rays, second_rays = (rays(model, pixels) @ model.rotation.T for pixels in (first, second))
+    camera = lifted(model, step.delta, step.covariance)
+    nearer = inverse_depths(first_rays, second_rays, model.position, step.delta)
+    squared = np.full(len(first), np.inf)
     for _ in range(DISTANCES):
         nearer = np.clip(nearer, 1.0 / FARTHEST, 1.0 / NEAREST)
-        points = model.position + pairs.first / nearer[:, None]
+        points = model.position + first_rays / nearer[:, None]
         projected, by_camera, by_point = linearize_in_space(model, camera.position, camera.rotation, points)
         noise = by_camera @ camera.covariance @ by_camera.transpose(0, 2, 1) + 2.0 * model.sigma**2 * np.eye(2)
         squared = np.minimum(squared, positive.squared(projected - second, noise))
-        by_nearness = -np.einsum("kij,kj->ki", by_point, pairs.first) / nearer[:, None] ** 2
+        by_nearness = -np.einsum("kij,kj->ki", by_point, first_rays) / nearer[:, None] ** 2
         weighted = np.linalg.solve(noise, by_nearness[..., None])[..., 0]
         nearer = nearer + np.einsum("ki,ki->k", weighted, second - projected) / np.einsum(
             "ki,ki->k", weighted, by_nearness

@@ -7,7 +7,6 @@ __all__ = [
     "features",
     "fiducials",
     "frame",
-    "image_turn",
     "images",
     "keypoints",
     "matching",

@@ -6,7 +6,6 @@ __all__ = [
     "kernels",
     "model",
     "point",
-    "ray_pairs",
     "triangulation_kernels",
     "update_kernels",
 ]

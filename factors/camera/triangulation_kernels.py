@@ -1,4 +1,4 @@
-"""Compiled triangulation of a point that is seen from several places."""
+"""Compiled triangulation of points that are seen from several places."""
 
 import math
 
@@ -62,6 +62,28 @@ def triangulated(
             if np.abs(step).max() < SETTLED:
                 break
     return True, point, covariance, squared
+
+
+@compiled(error_model="numpy")
+def inverse_depths(first: Array, second: Array, position: Array, motion: Array) -> Array:
+    """The inverse depths (K,) [1/m], negative behind the camera, at which the rays of two images are nearest to each other.
+
+    ``first``, ``second`` (K, 3): rays in the robot frame at each image, of depth 1 along the optical axis. ``position`` (3,): of
+    the camera on the robot. ``motion`` (3,): of the robot, which moves on a plane.
+    """
+    inverse_depth = np.empty(len(first))
+    c, s = math.cos(motion[2]), math.sin(motion[2])
+    x = motion[0] + c * position[0] - s * position[1] - position[0]
+    y = motion[1] + s * position[0] + c * position[1] - position[1]
+    for k in range(len(first)):
+        a, b = first[k], second[k]
+        u, v, w = c * b[0] - s * b[1], s * b[0] + c * b[1], b[2]  # the second ray in the first frame
+        # a / inverse depth = (x, y, 0) + mu (u, v, w), crossed with (u, v, w)
+        far_x, far_y, far_z = y * w, -x * w, x * v - y * u
+        squared = max(far_x * far_x + far_y * far_y + far_z * far_z, 1e-18)
+        across = (a[1] * w - a[2] * v) * far_x + (a[2] * u - a[0] * w) * far_y + (a[0] * v - a[1] * u) * far_z
+        inverse_depth[k] = across / squared
+    return inverse_depth
 
 
 @compiled(error_model="numpy")

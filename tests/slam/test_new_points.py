@@ -16,7 +16,8 @@ from factorgraph_loc.slam.new_points import (
     sightings_of,
     triangulate,
 )
-from factors.camera.model import CameraModel, predict
+from factors.camera.model import CameraModel, predict, rays
+from factors.camera.triangulation_kernels import inverse_depths
 from factors.se2 import Array
 
 POINT = np.array((5.0, 2.5, 1.4))
@@ -147,3 +148,14 @@ def test_what_waits_is_bounded() -> None:
     waiting.forget(40)
     assert waiting.count("once") == 0
     assert waiting.count("always") >= FEWEST
+
+
+def test_rays_of_two_images_meet_at_the_depth_of_their_point() -> None:
+    points = np.array(((3.0, 0.8, 1.0), (6.0, 2.0, 0.4), (2.0, 0.3, 1.2)))
+    motion = np.array((0.3, 0.04, 0.12))
+    seen = [predict(MODEL, pose, points)[0] for pose in (np.zeros(3), motion)]
+    before, after = (rays(MODEL, pixels) @ MODEL.rotation.T for pixels in seen)
+    depths = 1.0 / inverse_depths(before, after, MODEL.position, motion)
+    np.testing.assert_allclose(depths, predict(MODEL, np.zeros(3), points)[1], rtol=1e-6)
+    behind = inverse_depths(-before, -after, MODEL.position, motion)
+    np.testing.assert_allclose(1.0 / behind, -depths, rtol=1e-6)

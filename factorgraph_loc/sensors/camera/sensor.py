@@ -21,7 +21,6 @@ from factorgraph_loc.sensors.base import Binding, Blocks, Columns, NewVariable, 
 from factorgraph_loc.sensors.camera.known_points import CAMERAS, ITERATIONS, SETTLED, KnownPoints, Predicted
 from factorgraph_loc.sensors.camera.measurement import Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.camera.use import TurnCheck
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.vision.relocalization import FoundOnFloor
@@ -118,7 +117,6 @@ class CameraSensor(Sensor):
         self.constants = constants if binding.calibration == "all" else NOTHING
         self._carries = binding.calibration != "particles"  # too many for particles
         self.points = KnownPoints(binding.setup, self._diagnostics, constants, binding.points, self.name)
-        self._check = TurnCheck(self.points.model, motion, self._diagnostics, constants)
         # times [s] of recent looks at what was surveyed with an error and is not estimated
         self._looks: dict[str, list[float]] = defaultdict(list)
         self._before: deque[tuple[float, TiltScale]] = deque()  # the filter of the floor before each image
@@ -129,12 +127,7 @@ class CameraSensor(Sensor):
             # camera's mounting is estimated
             self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
-    @property
-    def doubts_model(self) -> bool:
-        return self._check.told
-
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:
-        self._check.add(m)
         twist = self._motion.twist(m.t) if self.points.needs_twist else None
         predicted, values, spreads = Predicted(view.pose, view.covariance), {}, {}
         for name in self._shared:

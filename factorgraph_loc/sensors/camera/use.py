@@ -1,45 +1,29 @@
-"""A camera in a run: checks of the settings, preparation of images, and detection of a wrong time offset or focal length.
-
-Features followed from one image to the next measure how much the camera turned between them. The odometry's rotation depends on
-the time of the images: of a grid of time offsets one fits best (compare Kelly, Sukhatme, International Journal of Robotics
-Research 33(12), 2014). Noise and slip of the wheels are the same at each offset. The ratio of both rotations is unknown, so it
-does not determine the focal length. But when a camera turns, features at the edges of the image move faster than in its middle,
-the more so the shorter the focal length is.
-"""
+"""A camera in a run: checks of the settings, and preparation of images."""
 
 from __future__ import annotations
 
-import math
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
-from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import TURN, Measurement
 from factorgraph_loc.model.measurement import named as name_of
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import CameraImage, FeatureStream, ImageStream, Pixels
+from factorgraph_loc.sensors.camera.measurement import CameraImage, FeatureStream, ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.interfaces import Ending, Review, Use
-from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.tables import Intake
 from factorgraph_loc.text import plain
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.image_turn import measure_turn
 from factorgraph_loc.vision.settings import FrontendSettings
-from factors import se2
-from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -172,105 +156,3 @@ class CameraIntake(Intake):
         if width != self._known.setdefault(m.feature, width) or not width:
             expected = f"{self._known[m.feature]} numbers each, as in earlier {plain(m.feature)}"
             raise bad_field(name_of(m), "length of descriptors", width, expected)
-
-
-OFFSETS = np.linspace(-0.3, 0.3, 31)  # s that are tried
-SHORTEST, LONGEST = 0.15, 1.0  # s between images that are compared
-TURNED, CHANGED = 0.05, 0.02  # rad: least turn between them, or least change of it by a fifth of a second
-# rad, and relative: largest standard deviations of turn and focal length from two images
-SHARP, CLEAR = 0.003, 0.1
-SLIPPED = 5.0  # standard deviations from what the wheels say at any offset
-FEWEST, MOST = 40, 200  # pairs of images: what is right until then stays so
-LATE, WRONG = 0.03, 0.01  # s, and relative: smaller errors are not reported
-SIGNIFICANT = 5.0  # standard deviations beyond that
-
-
-class _Image(NamedTuple):
-    t: float
-    names: NDArray[Any]
-    pixels: Array
-
-
-class TurnCheck:
-    """Reports each wrong constant once, as an event; see the module. ``estimated``: constants that are not checked. Without a
-    ``model`` nothing is."""
-
-    def __init__(
-        self, model: CameraModel | None, motion: Motion, diagnostics: Diagnostics, estimated: Estimated
-    ) -> None:
-        self._model, self._motion, self._diagnostics = model, motion, diagnostics
-        self._open = {FOCAL, TIME_OFFSET} - set(estimated.indices)
-        self.told = False  # whether a constant is wrong
-        self._left = MOST
-        self._last: _Image | None = None
-        self._waiting: deque[tuple[_Image, _Image]] = deque()  # for the odometry of after them
-        # number of turns, their squares, products with those of the wheels, and the squares of these, by offset
-        self._turns = np.zeros((4, len(OFFSETS)))
-        self._focal = np.zeros(4)  # number, and moments of the error of the focal length with their weight
-
-    def add(self, m: Pixels) -> None:
-        """Add an image; a late one is left out."""
-        model, last, t = self._model, self._last, m.t
-        if model is None or not self._open or not self._left:
-            return
-        if last is not None and t < last.t + SHORTEST:
-            return
-        while self._waiting and self._waiting[0][1].t + OFFSETS[-1] < t:
-            first, second = self._waiting.popleft()
-            if t - first.t < self._motion.horizon - LONGEST:  # the odometry of then is still kept
-                self._compare(model, first, second)
-        names = m.names if m.frame is None else m.frame.tracks
-        self._last = _Image(t, np.asarray(names), np.asarray(m.pixels, dtype=float))
-        if last is not None and t < last.t + LONGEST:
-            self._waiting.append((last, self._last))
-
-    def _compare(self, model: CameraModel, first: _Image, second: _Image) -> None:
-        """Compare the turn between two images with those of the wheels at all offsets."""
-        motion, middle = self._motion, len(OFFSETS) // 2
-        begin, constants = motion.state(first.t), np.zeros(len(motion.constants.names))
-        start, end = (motion.poses_at(begin, image.t + OFFSETS, constants)[:, 2] for image in (first, second))
-        turns = se2.wrap(end - start)
-        if abs(turns[middle]) < TURNED and abs(turns[middle + 5] - turns[middle - 5]) < CHANGED:
-            return
-        self._left -= 1
-        _, rows, columns = np.intersect1d(first.names, second.names, return_indices=True)
-        step = motion.relative(begin, motion.state(second.t))
-        starts = [np.append(step.delta[:2], turn) for turn in turns[::5].tolist()]
-        turn_focal = measure_turn(model, first.pixels[rows], second.pixels[columns], starts)
-        if turn_focal is None:
-            return
-        (turn, sigma), (focal, focal_sigma) = turn_focal
-        if focal_sigma < CLEAR:
-            self._focal += np.array((focal_sigma**2, 1.0, focal, focal**2)) / focal_sigma**2
-            self._tell_focal(second.t)
-        variance = float(step.covariance[2, 2]) + SHARP**2
-        if sigma < SHARP and np.min(np.abs(turn - turns)) < SLIPPED * math.sqrt(variance):
-            same = np.ones_like(turns)
-            self._turns += np.array((same * variance, same * turn**2, turn * turns, turns**2)) / variance
-            self._tell_offset(second.t)
-
-    def _tell_offset(self, t: float) -> None:
-        count, own, both, squares = self._turns
-        if TIME_OFFSET not in self._open or count[0] < FEWEST:
-            return
-        left = own - both**2 / squares  # with the share that fits best of what the wheels turned
-        best = int(np.argmin(left))
-        evidence = (left[np.abs(OFFSETS) < LATE].min() / left[best] - 1.0) * count[0]
-        if evidence > SIGNIFICANT**2:
-            late = "later" if OFFSETS[best] > 0.0 else "earlier"
-            what = f"images seem to be taken {abs(OFFSETS[best]):.2f} s {late} than they are stamped (time_offset)"
-            self._tell(TIME_OFFSET, t, what)
-
-    def _tell_focal(self, t: float) -> None:
-        count, weight, first, second = self._focal.tolist()
-        error = first / weight
-        sigma = math.sqrt(max(1.0, (second - first * error) / count) / weight)
-        if FOCAL in self._open and count >= FEWEST and abs(error) > WRONG + SIGNIFICANT * sigma:
-            comparison = "longer" if error > 0.0 else "shorter"
-            what = f"the focal length seems to be {100.0 * abs(error):.0f} % {comparison} than the rig says (fx, fy)"
-            self._tell(FOCAL, t, what)
-
-    def _tell(self, constant: int, t: float, what: str) -> None:
-        self.told = True
-        self._open.remove(constant)
-        self._diagnostics.event(t, f"camera: {what}")
