@@ -89,7 +89,7 @@ ESTIMATORS = Group("estimators", "process", "estimate")
 READERS = Group("readers", "Options", "read")
 MAPPERS = Group("mappers")
 
-FEATURES = ("colour", "sift", "orb", "fast_hessian", "harris_laplace", "hessian_laplace")  # of images
+FEATURES = ("colour", "sift", "orb")  # of images
 MAP_ESTIMATORS = ("batch", "smoother", "ekf")  # those that estimate landmarks
 ACTIVE_ESTIMATORS = ("active_mcl", "particle_filter", "smoother")  # of robots that plan their paths
 PRESETS = {  # of simulations, each with its world

@@ -31,7 +31,7 @@ def matched_values(sequence: Sequence) -> list[tuple[Float, Float]]:
     features = ColourExtractor(COUNT)
     described = []
     for image in (sequence.first, *sequence.others):
-        keypoints, found = features.record(image, features.detect(image))
+        keypoints, found = features.record(image)
         described.append((keypoints, values(found), image.shape))
     to = [np.eye(3), *sequence.homographies]
     matched = []

@@ -4,11 +4,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import polars as pl
+
 from factorgraph_loc.api.running import run
 from factorgraph_loc.calibration import calibrate as calibration
 from factorgraph_loc.calibration import report as rig_report
 from factorgraph_loc.evaluation.features import scores as feature_scores
-from factorgraph_loc.evaluation.features.feature_evaluation import feature
+from factorgraph_loc.evaluation.features.feature_evaluation import Feature
 from factorgraph_loc.evaluation.features.sequences import find_sequences
 from factorgraph_loc.experiments import maps, output
 from factorgraph_loc.files.models import replacing
@@ -16,6 +18,7 @@ from factorgraph_loc.files.temporary import of_system, require_free, temporary_f
 from factorgraph_loc.io.native.rig_file import write_rig
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all, read_log
 from factorgraph_loc.plugins import FEATURES, MAP_ESTIMATORS
+from factorgraph_loc.vision.features import extractor
 
 RIG = ".rig.toml"
 
@@ -85,10 +88,10 @@ def features(
     count: int = 1000,
     overwrite: bool = False,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
-) -> feature_scores.FeatureScores:
+) -> pl.DataFrame:
     """Evaluate point features on images of planar scenes: folders of sequences, or photographs, which are warped."""
     require_free(Path(out), feature_scores.FILES, overwrite=overwrite)
-    chosen = [feature(name, count) for name in features]
+    chosen = [Feature(name, extractor(name, count).detectAndCompute) for name in features]
     scores = feature_scores.evaluate_all(find_sequences([Path(path) for path in images]), chosen, progress)
     feature_scores.write_scores(scores, Path(out))
     return scores

@@ -25,12 +25,12 @@ def evaluate(
         ),
     ],
     out: Out,
-    features: Annotated[str, typer.Option(metavar="A,B", help="Features and detectors to compare.")] = ALL,
+    features: Annotated[str, typer.Option(metavar="A,B", help="Features to compare.")] = ALL,
     count: Annotated[int, typer.Option(min=1, help="Points per image, the strongest of each feature.")] = 1000,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Compare features on images of planar scenes: repeatability, matching, estimated homography, time."""
+    """Compare features on images of planar scenes: repeatability, matching, time."""
     from factorgraph_loc.api import learning
     from factorgraph_loc.evaluation.features import scores as evaluation
 
@@ -40,7 +40,7 @@ def evaluate(
     with show.progress("evaluating", counted=True) as progress:
         scores = learning.features(images, out, features=names, count=count, overwrite=overwrite, progress=progress)
     if json:
-        show.document(scores.rows)
+        show.document(scores.to_dicts())
         return
     show.table(*evaluation.summary(scores))
     show.line()

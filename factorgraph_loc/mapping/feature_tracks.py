@@ -89,8 +89,7 @@ def matched_pairs(
         if not (len(a.pixels) and len(b.pixels)):
             continue
         allowed = near_epipolar_lines(model, cameras, i, j, a.pixels, b.pixels, gate)
-        binary = a.descriptors.dtype == np.uint8
-        matches = match(a.descriptors, b.descriptors, binary=binary, ratio=RATIO, allowed=allowed)
+        matches = match(a.descriptors, b.descriptors, ratio=RATIO, allowed=allowed)
         if len(matches):
             out.append((i, j, matches.indices, matches.distances / np.median(matches.distances + 1e-9)))
     return out

@@ -140,9 +140,7 @@ def _same(first: PointMap, second: PointMap) -> Integers:
         covariance = _covariances(second, which) + _covariances(first, np.array([i]))
         agree = positive.squared(second.positions[which] - first.positions[i], covariance) < GATE
         for j in which[agree].tolist():
-            apart = distance_matrix(
-                first.descriptors[views[i]], second.descriptors[second_views[j]], binary=first.feature == "orb"
-            )
+            apart = distance_matrix(first.descriptors[views[i]], second.descriptors[second_views[j]])
             rows.append((float(apart.min()), i, j))
     pairs: list[tuple[int, int]] = []
     ours: set[int] = set()
@@ -165,7 +163,7 @@ def _limit(points: PointMap, views: list[Integers]) -> float:
     """A percentile, over points, of the distance between the most similar two views of one point; 0 without such points."""
     least = []
     for mine in [mine for mine in views if len(mine) > 1][:COMPARED]:
-        apart = distance_matrix(points.descriptors[mine], points.descriptors[mine], binary=points.feature == "orb")
+        apart = distance_matrix(points.descriptors[mine], points.descriptors[mine])
         least.append(float(apart[np.triu_indices(len(mine), 1)].min()))
     return float(np.percentile(least, PERCENTILE)) if least else 0.0
 

@@ -21,7 +21,7 @@ from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.consensus import FEWEST, CameraPose, Truths
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import spread_out
-from factorgraph_loc.vision.matching import match_guided
+from factorgraph_loc.vision.matching import gates, match
 from factorgraph_loc.vision.relocalization import located
 from factors.camera import inverse_depth
 from factors.se2 import Array, Integers
@@ -127,7 +127,6 @@ class FeatureMatcher:
         return replace(match, taken=taken)
 
     def _searched(self, m: CameraFrame, state: SlamState, eye: Eye) -> Match:
-        binary = m.feature == "orb"
         which = [i for i, p in enumerate(state.points) if p.descriptor is not None]
         sights, inside = _visible(eye, eye.mapped(state, which))
         which = [which[i] for i in inside.tolist()]
@@ -135,13 +134,13 @@ class FeatureMatcher:
         if which:
             descriptors = np.array([state.points[i].descriptor for i in which])
             covariances = Innovation.of(sights, state.covariance).each(sights.noise)
-            matches = match_guided(descriptors, m.descriptors, sights.pixels, covariances, m.pixels, binary=binary)
+            matches = match(descriptors, m.descriptors, allowed=gates(sights.pixels, covariances, m.pixels))
             ours = [(feature, which[row]) for row, feature in matches.indices.tolist()]
         known, wanted = self._known(m, state, eye)
         ours = self._agreeing(m.pixels, ours, state, eye)
         in_map = {f for f, _ in known}
-        match = self._match(m.pixels, [pair for pair in ours if pair[0] not in in_map], known, tuple(which), wanted)
-        return replace(match, tempering=eye.model.tempering)
+        outside = [pair for pair in ours if pair[0] not in in_map]
+        return replace(self._match(m.pixels, outside, known, which, wanted), tempering=eye.model.tempering)
 
     def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
         """The camera pose from this image and the map alone; None if they do not determine it."""

@@ -1,7 +1,7 @@
 """The views of each point of a graph: the last one, and earlier ones for a map.
 
 A point with a lost track is matched by the descriptor of its last view. The nearest descriptor in the ellipse predicted from pose
-and point is accepted if it is clearly nearer than the second (:func:`factorgraph_loc.vision.matching.match_guided`). Wrong matches
+and point is accepted if it is clearly nearer than the second (:func:`factorgraph_loc.vision.matching.match`). Wrong matches
 are rejected later, by consensus with other points.
 """
 
@@ -17,7 +17,7 @@ from factorgraph_loc.maps.common_error import carried
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.matching import match_guided
+from factorgraph_loc.vision.matching import gates, match
 from factors import se2
 from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, camera_pose, linearize_in_space
@@ -88,10 +88,8 @@ class PointViews:
         jacobian = by_camera[near]
         covariances = jacobian @ camera.covariance @ jacobian.transpose(0, 2, 1) + NOISE**2 * np.eye(2)
         descriptors, chosen = np.array([self._views[points[i]].descriptor for i in near.tolist()]), list(rows)
-        offered, pixels = frame.descriptors[chosen], frame.pixels[chosen]
-        matches = match_guided(
-            descriptors, offered, projected[near], covariances, pixels, binary=offered.dtype == np.uint8
-        )
+        allowed = gates(projected[near], covariances, frame.pixels[chosen])
+        matches = match(descriptors, frame.descriptors[chosen], allowed=allowed)
         return [(int(near[a]), rows[b]) for a, b in matches.indices.tolist()]
 
     def forget(self, points: Iterable[int]) -> None:

@@ -179,7 +179,7 @@ class Associator:
             views = self._places.views(frame.descriptors)
             owners, descriptors = owners[views], descriptors[views]
         owners, first = np.unique(owners, return_index=True)
-        distances = distance_matrix(frame.descriptors, descriptors, binary=self._binary)
+        distances = distance_matrix(frame.descriptors, descriptors)
         by_owner = np.minimum.reduceat(distances, first, axis=1)
         best, of_feature = by_owner.argmin(axis=1), np.arange(len(distances))
         positions = self._positions[owners]
@@ -201,7 +201,7 @@ class Associator:
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf
         rows = np.linspace(0, len(self._owners) - 1, min(SAMPLED, len(self._owners))).astype(np.int64)
-        costs = distance_matrix(self._descriptors[rows], self._descriptors[rows], binary=self._binary)
+        costs = distance_matrix(self._descriptors[rows], self._descriptors[rows])
         different = costs[self._owners[rows][:, None] != self._owners[rows]]
         if len(different) == 0:
             return math.inf

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.vision import descriptor, detector
 from factorgraph_loc.vision.colour import Float, colour_channels
-from factorgraph_loc.vision.images import as_image, as_mask, is_blank
+from factorgraph_loc.vision.images import as_image, is_blank
 from factorgraph_loc.vision.keypoints import Descriptors, Keypoints
 from factorgraph_loc.vision.scale_space import ScaleSpace
 
@@ -53,49 +53,33 @@ class ColourExtractor:
     size, so an extractor must be used by one thread only.
     """
 
-    name = "colour"
-    binary = False
-
     def __init__(self, count: int, *, everywhere: bool = False, paper_literal: bool = False) -> None:
         self._count = count
         self._everywhere = everywhere
         self._paper_literal = paper_literal
         self._space: ScaleSpace | None = None
 
-    def detect(self, image: object, mask: object = None) -> Keypoints:
-        return self._detect(image, mask)[1]
+    def detect(self, image: object) -> Keypoints:
+        return self._detect(image)[1]
 
-    def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
-        """The ``keypoints`` inside the image, and their descriptors; missing orientations are computed."""
-        kept, described = self.record(image, keypoints)
-        return kept, shipped_weights()(descriptor.values(described))
+    def detectAndCompute(self, image: object) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
+        keypoints, described = self.record(image)
+        return keypoints, shipped_weights()(descriptor.values(described))
 
-    def detectAndCompute(self, image: object, mask: object = None) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
-        space, keypoints = self._detect(image, mask)
-        return keypoints, shipped_weights()(descriptor.values(self._records(space, keypoints)))
+    def record(self, image: object) -> tuple[Keypoints, NDArray[np.void]]:
+        """The points of ``image``, and their raw values :data:`~factorgraph_loc.vision.descriptor.RECORD` (N,)."""
+        space, keypoints = self._detect(image)
+        if space is None:
+            return keypoints, np.empty(0, dtype=descriptor.RECORD)
+        return keypoints, descriptor.records(space, keypoints, paper_literal=self._paper_literal)
 
-    def record(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, NDArray[np.void]]:
-        """As :meth:`compute`, with the raw values :data:`~factorgraph_loc.vision.descriptor.RECORD` (N,)."""
+    def _detect(self, image: object) -> tuple[ScaleSpace | None, Keypoints]:
         pixels = as_image(image)
-        if len(keypoints) == 0 or is_blank(pixels):
-            return Keypoints.empty(), np.empty(0, dtype=descriptor.RECORD)
-        space = self._filled(colour_channels(pixels))
-        size = np.array(pixels.shape[1::-1])
-        inside = np.all((keypoints.points >= 0.0) & (keypoints.points <= size - 1.0), axis=1) & (keypoints.sizes > 0.0)
-        kept = keypoints[inside]
-        angles = detector.orientations(space, kept.points, kept.sizes / 2.0)
-        angles = np.where(np.isnan(kept.angles), angles, kept.angles)
-        kept = Keypoints(kept.points, kept.sizes, angles, kept.responses, kept.levels)
-        return kept, self._records(space, kept)
-
-    def _detect(self, image: object, mask: object) -> tuple[ScaleSpace | None, Keypoints]:
-        pixels = as_image(image)
-        where = as_mask(mask, pixels)
         if is_blank(pixels):
             return None, Keypoints.empty()
         channels = colour_channels(pixels)
         space = self._filled(channels)
-        return space, detector.detect(space, channels[1:], where, self._count, everywhere=self._everywhere)
+        return space, detector.detect(space, channels[1:], self._count, everywhere=self._everywhere)
 
     def _filled(self, channels: list[Float]) -> ScaleSpace:
         shape, colours = channels[0].shape, len(channels) - 1
@@ -103,8 +87,3 @@ class ColourExtractor:
             self._space = ScaleSpace(shape, colours)
         self._space.fill(channels[0])
         return self._space
-
-    def _records(self, space: ScaleSpace | None, keypoints: Keypoints) -> NDArray[np.void]:
-        if space is None:
-            return np.empty(0, dtype=descriptor.RECORD)
-        return descriptor.records(space, keypoints, paper_literal=self._paper_literal)

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from factorgraph_loc.vision.colour import Float
-from factorgraph_loc.vision.images import Mask
 from factorgraph_loc.vision.kernels import (
     Int32,
     corner_strength,
@@ -45,18 +44,13 @@ _OFFSETS: Float = _grid.reshape(-1, 2).astype(np.float32)
 _WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTATION_WINDOW**2)).astype(np.float32)
 
 
-def detect(
-    space: ScaleSpace, colours: list[Float], mask: Mask | None, count: int, *, everywhere: bool = False
-) -> Keypoints:
-    """At most ``count`` points of the image in ``space``, by descending strength, where ``mask`` (H, W) is not 0.
+def detect(space: ScaleSpace, colours: list[Float], count: int, *, everywhere: bool = False) -> Keypoints:
+    """At most ``count`` points of the image in ``space``, by descending strength.
 
     They are the strongest ones or, with ``everywhere``, those of all parts of the image. ``colours``: channels (H, W) in addition
     to E.
     """
     corners = np.vstack(_corners(space, colours))
-    if mask is not None:
-        x, y = np.rint(corners[:, :2]).astype(np.int64).T
-        corners = corners[mask[y, x] > 0]
     corners = corners[np.argsort(-corners[:, 3], kind="stable")]
     places, scales = corners[:, :2].astype(np.float32), corners[:, 2].astype(np.float32)
     alone = lonely(places, scales, CLEARANCE, STEP, len(corners) if everywhere else count)
@@ -66,7 +60,7 @@ def detect(
     corners = corners[np.sort(np.concatenate((best, crowded[: count - len(best)])))]
     points, sigmas = corners[:, :2], corners[:, 2]
     angles = orientations(space, points, sigmas)
-    return Keypoints(points, 2.0 * sigmas, angles, corners[:, 3], space.levels(sigmas))
+    return Keypoints(points, 2.0 * sigmas, angles, corners[:, 3])
 
 
 def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:

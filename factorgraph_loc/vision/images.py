@@ -12,7 +12,6 @@ from factorgraph_loc.files.bounded import IMAGE, foreign, quiet, read_bytes
 from factorgraph_loc.files.images import NO_IMAGE, image_size
 
 Image = NDArray[np.uint8]
-Mask = NDArray[np.uint8]
 
 MIN_SIDE = 16  # px: smaller images have no features
 
@@ -46,19 +45,6 @@ def as_image(array: object, source: object = "image") -> Image:
     if low < 0.0 or high > 1.0:
         raise InputError(f"{source}: has floating-point values from {low:g} to {high:g}, expected 0 to 1")
     return np.ascontiguousarray(np.rint(array * 255.0), dtype=np.uint8)
-
-
-def as_mask(mask: object, image: Image) -> Mask | None:
-    """Convert ``mask`` (H, W) of bool or ``uint8`` to ``uint8``, not 0 where features are wanted; None means everywhere. Raises
-    InputError for another type or a size different from ``image``."""
-    if mask is None:
-        return None
-    if not isinstance(mask, np.ndarray) or mask.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
-        kind = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise InputError(f"mask: is of {kind}, expected an array of bool or uint8")
-    if mask.shape != image.shape[:2]:
-        raise InputError(f"mask: has shape {mask.shape}, expected that of the image, {image.shape[:2]}")
-    return np.ascontiguousarray(mask != 0, dtype=np.uint8)
 
 
 def is_blank(image: Image) -> bool:

@@ -24,26 +24,22 @@ class Keypoints:
     ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``sizes`` (N,) [px]: for SIFT and the
     colour features twice the standard deviation of the Gaussian scale of a point, for ORB its patch. It is proportional to the
     size of the described region. ``angles`` (N,) [rad]: direction ``atan2(dy, dx)`` with y down, NaN if a point has none.
-    ``responses`` (N,): strength, comparable within one image and one extractor. ``levels`` (N,): scale level of a point; for
-    OpenCV's features its packed octave."""
+    ``responses`` (N,): strength, comparable within one image and one extractor."""
 
     points: Array
     sizes: Array
     angles: Array
     responses: Array
-    levels: Integers
 
     def __len__(self) -> int:
         return len(self.points)
 
     def __getitem__(self, index: Any) -> Keypoints:
-        return Keypoints(
-            self.points[index], self.sizes[index], self.angles[index], self.responses[index], self.levels[index]
-        )
+        return Keypoints(self.points[index], self.sizes[index], self.angles[index], self.responses[index])
 
     @classmethod
     def empty(cls) -> Keypoints:
-        return cls(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
+        return cls(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
 
     @classmethod
     def from_cv2(cls, keypoints: Sequence[cv2.KeyPoint]) -> Keypoints:
@@ -52,38 +48,26 @@ class Keypoints:
             return cls.empty()
         rows = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], dtype=float)
         angles = np.where(rows[:, 3] < 0.0, np.nan, np.radians(rows[:, 3]))
-        levels = np.array([k.octave for k in keypoints], dtype=np.int64)
-        return cls(rows[:, :2], rows[:, 2], angles, rows[:, 4], levels)
+        return cls(rows[:, :2], rows[:, 2], angles, rows[:, 4])
 
     def to_cv2(self) -> list[cv2.KeyPoint]:
-        """Convert to OpenCV's keypoints; ``class_id`` is the index of a point."""
+        """Convert to OpenCV's keypoints."""
         degrees = np.where(np.isnan(self.angles), -1.0, np.degrees(self.angles) % 360.0)
-        columns = (*self.points.T, self.sizes, degrees, self.responses, self.levels, np.arange(len(self)))
+        columns = (*self.points.T, self.sizes, degrees, self.responses)
         return list(map(cv2.KeyPoint, *(column.tolist() for column in columns)))
 
 
 class Extractor(Protocol):
     """Detector and descriptor of one kind of feature.
 
-    Images and masks are checked by :func:`~factorgraph_loc.vision.images.as_image` and ``as_mask``, which raise InputError; an
-    image that is blank or below 16 px has no features. Returns at most ``count`` points, the strongest first."""
+    Images are checked by :func:`~factorgraph_loc.vision.images.as_image`, which raises InputError; an image that is blank or
+    below 16 px has no features. Returns at most ``count`` points, the strongest first."""
 
-    @property
-    def name(self) -> str: ...
+    def detect(self, image: object) -> Keypoints:
+        """The points of ``image``."""
 
-    @property
-    def binary(self) -> bool:
-        """Whether descriptors are bits, (N, bytes) ``uint8`` with Hamming distance, rather than (N, D) ``float32`` with Euclidean
-        distance."""
-
-    def detect(self, image: object, mask: object = None) -> Keypoints:
-        """The points of ``image`` where ``mask`` (H, W) is not 0."""
-
-    def compute(self, image: object, keypoints: Keypoints) -> tuple[Keypoints, Descriptors]:
-        """The ``keypoints`` that can be described, and their descriptors."""
-
-    def detectAndCompute(self, image: object, mask: object = None) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
-        """:meth:`detect` and :meth:`compute` in one."""
+    def detectAndCompute(self, image: object) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
+        """The points of ``image``, and their descriptors: bits, (N, bytes) ``uint8``, or numbers, (N, D) ``float32``."""
 
 
 PARTS = 12  # of an image that has features everywhere: with more the weakest would be among them

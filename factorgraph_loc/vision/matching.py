@@ -1,8 +1,7 @@
 """Matching of descriptors: nearest neighbours that pass the ratio test.
 
-Ratio test and mutual check: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section 7.1. The
-paper accepts a match "if distance is less than 5 times the distance to the second closest", which always holds: ``paper_literal``
-does so; ``ratio=1 / PAPER_RATIO, mutual=False`` is the strict reading.
+Ratio test and mutual check: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section 7.1.
+Descriptors of type ``uint8`` are bits and have Hamming distances, others Euclidean ones.
 
 Descriptors are rounded to single precision. A neighbour must therefore be nearer than the second by more than :data:`ROUNDING`.
 """
@@ -19,7 +18,6 @@ from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factors.se2 import Array
 
 RATIO = 0.8
-PAPER_RATIO = 5.0
 GATE = 0.99  # probability that the true point lies in its gate
 ROUNDING = 1e-5  # relative difference of distances below which they are equal
 
@@ -41,24 +39,19 @@ def match(
     first: Descriptors,
     second: Descriptors,
     *,
-    binary: bool,
     ratio: float = RATIO,
     mutual: bool = True,
-    paper_literal: bool = False,
     allowed: Truths | None = None,
 ) -> Matches:
     """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if it passes the ratio test. Ties are no matches.
 
-    The distance must be below ``ratio`` times that to the second nearest, if there is one. ``binary``: Hamming distance, not
-    Euclidean. ``mutual``: both must be nearest to each other. ``paper_literal``: the paper's ratio of 5, without the mutual
-    check. ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or non-finite descriptors, and for a ratio
-    that is not positive.
+    The distance must be below ``ratio`` times that to the second nearest, if there is one. ``mutual``: both must be nearest to
+    each other. ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or non-finite descriptors, and for a
+    ratio that is not positive.
     """
-    if paper_literal:
-        ratio, mutual = PAPER_RATIO, False
     if not ratio > 0.0:
         raise InputError(f"matching: ratio is {ratio}, expected more than 0")
-    distances = distance_matrix(first, second, binary=binary)
+    distances = distance_matrix(first, second)
     if allowed is not None:
         if allowed.shape != distances.shape:
             raise InputError(f"matching: allowed pairs have shape {allowed.shape}, expected {distances.shape}")
@@ -74,27 +67,12 @@ def match(
     return Matches(np.stack([chosen, forward.index[chosen]], axis=1), forward.best[chosen])
 
 
-def match_guided(
-    first: Descriptors,
-    second: Descriptors,
-    predicted: Array,
-    covariances: Array,
-    points: Array,
-    *,
-    binary: bool,
-) -> Matches:
-    """:func:`match` of ``first`` (N, D) with ``second`` (M, D) at ``points`` (M, 2), inside the :func:`gates` of the predictions
-    only.
-
-    ``predicted`` (N, 2) [px] with ``covariances`` (N, 2, 2) [px^2] of prediction and measurement together."""
-    return match(first, second, binary=binary, allowed=gates(predicted, covariances, points))
-
-
 def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
-    """Whether ``points`` (M, 2) lie in the ellipses (N, M), of the probability :data:`GATE`, of Gaussians.
+    """Whether ``points`` (M, 2) lie in the ellipses (N, M), of the probability :data:`GATE`, of predictions: the pairs that
+    :func:`match` may allow.
 
-    ``predicted`` (N, 2): means; ``covariances`` (N, 2, 2). NaN predictions have empty gates. Raises InputError if a covariance is
-    not positive definite.
+    ``predicted`` (N, 2) [px]; ``covariances`` (N, 2, 2) [px^2]: of prediction and measurement together. NaN predictions have empty
+    gates. Raises InputError if a covariance is not positive definite.
     """
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     determinant = a * c - b * b
@@ -131,20 +109,19 @@ def nearest_neighbours(distances: Array) -> Nearest:
     return Nearest(index, best, second, second > (1.0 + ROUNDING) * best)
 
 
-def distance_matrix(first: Descriptors, second: Descriptors, *, binary: bool) -> Array:
+def distance_matrix(first: Descriptors, second: Descriptors) -> Array:
     """Distances (N, M), Hamming or Euclidean, between ``first`` (N, D) and ``second`` (M, D). Raises InputError for incompatible or
     non-finite descriptors."""
     for which, descriptors in (("first", first), ("second", second)):
-        if descriptors.ndim != 2 or (binary and descriptors.dtype != np.uint8):
-            kind = f"{descriptors.dtype} of shape {descriptors.shape}"
-            raise InputError(
-                f"matching: {which} descriptors are {kind}, expected {'uint8 of ' if binary else ''}(N, D)"
-            )
-        if not binary and not np.isfinite(descriptors).all():
+        if descriptors.ndim != 2:
+            raise InputError(f"matching: {which} descriptors have shape {descriptors.shape}, expected (N, D)")
+        if not np.isfinite(descriptors).all():
             raise InputError(f"matching: {which} descriptors have values that are not finite numbers")
     if first.shape[1] != second.shape[1]:
         raise InputError(f"matching: descriptors have {first.shape[1]} and {second.shape[1]} columns, expected as many")
-    if not binary:
+    if (first.dtype == np.uint8) != (second.dtype == np.uint8):
+        raise InputError(f"matching: descriptors are {first.dtype} and {second.dtype}, expected both or none as uint8")
+    if first.dtype != np.uint8:
         return np.asarray(cdist(first, second))
     left, right = (np.unpackbits(part, axis=1).astype(np.float32) for part in (first, second))
     differing = left.sum(axis=1)[:, None] + right.sum(axis=1) - 2.0 * left @ right.T

@@ -35,8 +35,8 @@ class _TrackedImage(NamedTuple):
 class FeatureTracker:
     """Numbers the tracks of features, image by image in order of time, keeping the last two images. Not thread-safe."""
 
-    def __init__(self, camera: CameraModel, *, binary: bool) -> None:
-        self._camera, self._binary = camera, binary
+    def __init__(self, camera: CameraModel) -> None:
+        self._camera = camera
         self._last: _TrackedImage | None = None
         self._before: _TrackedImage | None = None  # the last but one, with the features that the last one did not match
         self._count = 0  # of tracks
@@ -63,15 +63,13 @@ class FeatureTracker:
         """Continue tracks of an earlier image in the features without a number; the rest of the earlier image is returned."""
         rows = np.flatnonzero(image.numbers < 0)
         current = image.directions[rows], image.descriptors[rows]
-        matched = pairs(earlier[:2], current, self._camera, binary=self._binary)
+        matched = pairs(earlier[:2], current, self._camera)
         image.numbers[rows[matched[:, 1]]] = earlier.numbers[matched[:, 0]]
         missed = np.setdiff1d(np.arange(len(earlier.numbers)), matched[:, 0])
         return _TrackedImage(earlier.directions[missed], earlier.descriptors[missed], earlier.numbers[missed])
 
 
-def pairs(
-    first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel, *, binary: bool
-) -> Integers:
+def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel) -> Integers:
     """Pairs (M, 2) of features of two images, each given as directions (K, 2), i.e. (x, y) at depth 1, and descriptors (K, D)."""
     if len(first[0]) == 0 or len(second[0]) == 0:
         return np.empty((0, 2), dtype=np.int64)
@@ -79,7 +77,7 @@ def pairs(
     a, b = (np.asarray(directions * focal, dtype=np.float32) for directions, _ in (first, second))
     away = [np.square(a[:, None, axis] - b[None, :, axis]) for axis in (0, 1)]
     reach = (RADIUS * max(camera.width, camera.height)) ** 2
-    matched = match(first[1], second[1], binary=binary, allowed=away[0] + away[1] < reach).indices
+    matched = match(first[1], second[1], allowed=away[0] + away[1] < reach).indices
     if len(matched) < FEWEST:
         return matched
     a, b = a[matched[:, 0]], b[matched[:, 1]]

@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 from PIL import Image
 
-NAMES = "sift,orb,fast_hessian"
+NAMES = "sift,orb"
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_results_are_written_and_named(fgloc, images, tmp_path):
     )
     assert result.exit_code == 0, result.output
     assert f"results are in {out}: table.md, pairs.parquet, figure3.png" in result.stdout
-    assert [line.split()[0] for line in result.stdout.splitlines()[1:4]] == NAMES.split(",")
+    assert [line.split()[0] for line in result.stdout.splitlines()[1:3]] == NAMES.split(",")
 
     pairs = pl.read_parquet(out / "pairs.parquet")
     assert set(pairs["sequence"]) == {
@@ -49,11 +49,8 @@ def test_results_are_written_and_named(fgloc, images, tmp_path):
         f"{tmp_path.name}/photograph zoomed",
         f"{tmp_path.name}/photograph rotated",
     }
-    assert pairs.height == 3 * (1 + 6 + 6)
+    assert pairs.height == 2 * (1 + 6 + 6)
     assert pairs["features"].max() == 100
-    detector = pairs.filter(pl.col("feature") == "fast_hessian")
-    assert detector["matching_score"].null_count() == detector.height
-    assert detector["repeatability"].mean() > 0.5
     sift = pairs.filter((pl.col("feature") == "sift") & (pl.col("sequence") == "spots"))
     assert sift["precision"].item() > 0.8
 

@@ -4,27 +4,28 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.vision import descriptor
+from factorgraph_loc.vision.colour import colour_channels
 from factorgraph_loc.vision.colour_features import ColourExtractor
-from factorgraph_loc.vision.descriptor import LOG_SCALES, OWN_SCALE, RECORD, VALUES, values
+from factorgraph_loc.vision.descriptor import LOG_SCALES, OWN_SCALE, RECORD, VALUES, records, values
+from factorgraph_loc.vision.images import as_image
 from factorgraph_loc.vision.keypoints import Keypoints
+from factorgraph_loc.vision.scale_space import ScaleSpace
 
 
 def at(x: float, y: float, sigma: float, angle: float = 0.0) -> Keypoints:
-    return Keypoints(
-        np.array([[x, y]]), np.array([2.0 * sigma]), np.array([angle]), np.ones(1), np.zeros(1, dtype=np.int64)
-    )
+    return Keypoints(np.array([[x, y]]), np.array([2.0 * sigma]), np.array([angle]), np.ones(1))
 
 
-def record(image: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    kept, found = ColourExtractor(1).record(image, keypoints)
-    assert len(kept) == len(keypoints)
-    return found
+def record(image: np.ndarray, keypoints: Keypoints, *, paper_literal: bool = False) -> np.ndarray:
+    intensity, *_ = colour_channels(as_image(image))
+    space = ScaleSpace(intensity.shape, 0)
+    space.fill(intensity)
+    return records(space, keypoints, paper_literal=paper_literal)
 
 
 @pytest.fixture(scope="module")
 def described(picture: np.ndarray) -> tuple[Keypoints, np.ndarray]:
-    features = ColourExtractor(80)
-    return features.record(picture, features.detect(picture))
+    return ColourExtractor(80).record(picture)
 
 
 def test_position_and_scale_are_those_of_the_point(described: tuple[Keypoints, np.ndarray]) -> None:
@@ -80,7 +81,7 @@ def test_a_quarter_turn_leaves_the_values(picture: np.ndarray, described: tuple[
     keypoints, found = described
     x, y = keypoints.points.T
     points = np.stack([y, picture.shape[1] - 1.0 - x], axis=1)
-    turned = Keypoints(points, keypoints.sizes, keypoints.angles - np.pi / 2.0, keypoints.responses, keypoints.levels)
+    turned = Keypoints(points, keypoints.sizes, keypoints.angles - np.pi / 2.0, keypoints.responses)
     after = record(np.ascontiguousarray(np.rot90(picture)), turned)
     # where a gradient is weak its direction is not certain, and octaves count pixels from the other side
     change = np.abs(values(after) - values(found))
@@ -105,7 +106,7 @@ def test_literal_neighbours_are_the_nearest_points(
     picture: np.ndarray, described: tuple[Keypoints, np.ndarray]
 ) -> None:
     keypoints, found = described
-    _, literal = ColourExtractor(80, paper_literal=True).record(picture, keypoints)
+    _, literal = ColourExtractor(80, paper_literal=True).record(picture)
     away = np.linalg.norm(keypoints.points[:, None] - keypoints.points, axis=2)
     near = np.argsort(away, axis=1)[:, 1:5]
     assert np.array_equal(literal["scale_responses"][:, 0], found["scale_responses"][:, 0])
@@ -118,6 +119,6 @@ def test_literal_neighbours_are_the_nearest_points(
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_literal_neighbours_that_are_too_few(picture: np.ndarray, count: int) -> None:
     keypoints = ColourExtractor(5).detect(picture)[:count]
-    _, literal = ColourExtractor(5, paper_literal=True).record(picture, keypoints)
+    literal = record(picture, keypoints, paper_literal=True)
     assert len(literal) == count
     assert np.array_equal(literal["scale_responses"][:, 4], literal["scale_responses"][:, 0])

@@ -7,7 +7,6 @@ from scipy import ndimage
 
 from factorgraph_loc.vision.detector import CLEARANCE, orientations
 from factorgraph_loc.vision.features import extractor
-from factorgraph_loc.vision.keypoints import Keypoints
 from factorgraph_loc.vision.scale_space import STEP, ScaleSpace
 
 
@@ -84,22 +83,3 @@ def test_the_direction_is_that_of_the_gradient(angle: float) -> None:
     space.fill(ramp.astype(np.float32))
     (found,) = orientations(space, np.array([[80.0, 60.0]]), np.array([3.0]))
     assert abs(np.angle(np.exp(1j * (found - angle)))) < 0.02
-
-
-def test_points_of_another_detector_get_a_direction(picture: np.ndarray) -> None:
-    features = extractor("colour", 100)
-    own = features.detect(picture)
-    without = Keypoints(own.points, own.sizes, np.full(len(own), np.nan), own.responses, own.levels)
-    described, descriptors = features.compute(picture, without)
-    assert np.array_equal(described.angles, own.angles)
-    assert np.array_equal(descriptors, features.compute(picture, own)[1])
-
-
-def test_points_outside_the_image_are_not_described(picture: np.ndarray) -> None:
-    features = extractor("colour", 5)
-    own = features.detect(picture)
-    points = own.points.copy()
-    points[1], points[3] = (-5.0, 10.0), (np.nan, 10.0)
-    kept, descriptors = features.compute(picture, Keypoints(points, own.sizes, own.angles, own.responses, own.levels))
-    assert len(kept) == len(descriptors) == 3
-    assert np.array_equal(kept.points, own.points[[0, 2, 4]])

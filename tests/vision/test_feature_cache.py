@@ -96,7 +96,7 @@ def test_features_come_back(count, columns, kind, whole, seed):
     values = rng.uniform(0.0, 255.0, (count, columns))
     descriptors = (np.rint(values) if whole else values).astype(kind)
     points, nothing = rng.uniform(0.0, 4000.0, (count, 2)), np.zeros(count)
-    found = decode(encode(Keypoints(points, nothing, nothing, nothing, nothing.astype(np.int64)), descriptors))
+    found = decode(encode(Keypoints(points, nothing, nothing, nothing), descriptors))
     assert found.descriptors.dtype == kind
     np.testing.assert_array_equal(found.descriptors, descriptors)
     np.testing.assert_allclose(found.pixels, points, atol=2.5e-4)

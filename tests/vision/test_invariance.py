@@ -72,7 +72,7 @@ def check(image: np.ndarray, affine: np.ndarray) -> None:
     again = same.any(axis=1)
     assert np.count_nonzero(again) >= REPEATED * possible
 
-    i, j = match(first, second, binary=False).indices.T
+    i, j = match(first, second).indices.T
     i, j = i[again[i]], j[again[i]]
     assert len(i) >= MATCHED * np.count_nonzero(again)
     assert np.mean(same[i, j]) >= RIGHT

@@ -25,9 +25,7 @@ ZOOM = np.array(((0.5, 0.0, 80.0), (0.0, 0.5, 60.0), (0.0, 0.0, 1.0)))
 def points_at(points, sizes):
     n = len(points)
     nothing = np.zeros(n)
-    return Keypoints(
-        np.array(points, dtype=float), np.broadcast_to(sizes, n).astype(float), nothing, nothing, nothing.astype(int)
-    )
+    return Keypoints(np.array(points, dtype=float), np.broadcast_to(sizes, n).astype(float), nothing, nothing)
 
 
 def scattered(count, rng, low=4.0, high=5.0):

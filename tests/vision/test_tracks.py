@@ -28,14 +28,14 @@ def view(points, place, turn=0.0, noise=0.0, rng=None):
     return pixels if rng is None else pixels + rng.normal(scale=noise, size=pixels.shape)
 
 
-def followed(images, binary=False):
-    tracker = FeatureTracker(CAMERA, binary=binary)
+def followed(images):
+    tracker = FeatureTracker(CAMERA)
     return [tracker.follow(pixels, looks) for pixels, looks in images]
 
 
 def paired(first, first_looks, second, second_looks):
     views = ((undistorted(CAMERA, first), first_looks), (undistorted(CAMERA, second), second_looks))
-    return pairs(*views, CAMERA, binary=False)
+    return pairs(*views, CAMERA)
 
 
 def drive(rng, steps=8):
@@ -151,7 +151,7 @@ def test_bits_and_few_features():
     points, _ = scene(rng, 10)
     bits = rng.integers(0, 256, (10, 32), dtype=np.uint8)
     first, second = view(points, np.zeros(3)), view(points, np.array((0.05, 0.0, 0.0)))
-    tracks = followed([(first, bits), (second, bits)], binary=True)
+    tracks = followed([(first, bits), (second, bits)])
     np.testing.assert_array_equal(tracks[0], tracks[1])
 
 

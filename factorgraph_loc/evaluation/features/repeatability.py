@@ -11,6 +11,7 @@ The ``strict`` score compares regions in their own size: their position in units
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +33,7 @@ Truths = NDArray[np.bool_]
 Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both images
 
 
-@dataclass(frozen=True)
-class Repeatability:
+class Repeatability(NamedTuple):
     """Scores of a pair of images, 0 to 1.
 
     ``regions``: the smaller number of them in the common part; if it is 0, all scores are 0.
@@ -56,8 +56,16 @@ class Candidates:
 
     def best(self, chosen: Truths) -> Candidates:
         """The one-to-one pairs among ``chosen`` (M,), selected greedily by error."""
-        pairs = one_to_one(self.first[chosen], self.second[chosen], self.error[chosen])
-        rows = np.flatnonzero(chosen)[pairs]
+        taken_first: set[int] = set()
+        taken_second: set[int] = set()
+        rows = []
+        order = np.flatnonzero(chosen)
+        order = order[np.argsort(self.error[order], kind="stable")]
+        for row, i, j in zip(order.tolist(), self.first[order].tolist(), self.second[order].tolist(), strict=True):
+            if i not in taken_first and j not in taken_second:
+                taken_first.add(i)
+                taken_second.add(j)
+                rows.append(row)
         return Candidates(self.first[rows], self.second[rows], self.error[rows], self.ratio[rows])
 
 
@@ -147,20 +155,6 @@ def shared_area(centres: Array, ellipses: Array) -> Array:
     length = np.sqrt(np.maximum((xx * yy - xy**2) * (xx - u**2), 0.0)) / xx
     chords = np.minimum(half, middle + length) - np.maximum(-half, middle - length)
     return np.asarray(np.maximum(chords, 0.0) @ half * np.pi / _NODES)
-
-
-def one_to_one(first: Integers, second: Integers, error: Array) -> Integers:
-    """Rows of pairs, by increasing ``error``, such that no index of ``first`` or of ``second`` occurs twice."""
-    taken_first: set[int] = set()
-    taken_second: set[int] = set()
-    rows = []
-    order = np.argsort(error, kind="stable")
-    for row, i, j in zip(order.tolist(), first[order].tolist(), second[order].tolist(), strict=True):
-        if i not in taken_first and j not in taken_second:
-            taken_first.add(i)
-            taken_second.add(j)
-            rows.append(row)
-    return np.array(rows, dtype=np.int64)
 
 
 def distinct(keypoints: Keypoints) -> Keypoints:

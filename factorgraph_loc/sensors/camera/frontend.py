@@ -182,7 +182,7 @@ def _tracks(
     if stored is not None and len(stored) == 4 * sum(counts):
         numbers = np.frombuffer(stored, dtype="<i4").astype(np.int64)
     else:
-        tracker = FeatureTracker(camera, binary=_extractor(settings).binary)
+        tracker = FeatureTracker(camera)
         lists = [tracker.follow(features[i].pixels, features[i].descriptors) for i in order]
         numbers = np.concatenate([*lists, np.empty(0, dtype=np.int64)])
         kept.write(key, numbers.astype("<i4").tobytes())
@@ -288,7 +288,7 @@ class LiveFrontend:
     def __init__(self, settings: FrontendSettings, camera: CameraModel) -> None:
         self._feature, self._camera = settings.feature, camera
         self._extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
-        self._tracker = FeatureTracker(camera, binary=self._extractor.binary)
+        self._tracker = FeatureTracker(camera)
 
     def frame(self, t: float, image: object) -> CameraFrame:
         """The features of an image taken at ``t`` [s], an array as in :func:`~factorgraph_loc.vision.images.as_image`.

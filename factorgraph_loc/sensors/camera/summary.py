@@ -212,7 +212,7 @@ def _turned(files: Sequence[Path]) -> float | None:
         except InputError:
             return None
     (first, of_first), (second, of_second) = features
-    pairs = match(of_first, of_second, binary=finder.binary).indices
+    pairs = match(of_first, of_second).indices
     if len(pairs) < FEWEST_MATCHES:
         return None
     start, end = (keypoints.points[pairs[:, k]] for k, keypoints in enumerate((first, second)))

@@ -9,12 +9,11 @@ import numpy as np
 from benchmarking.report import Options, Report
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.features.feature_evaluation import Feature, feature
+from factorgraph_loc.evaluation.features.feature_evaluation import Feature
 from factorgraph_loc.evaluation.features.repeatability import distinct
 from factorgraph_loc.evaluation.features.scores import evaluate_all, summary, write_scores
 from factorgraph_loc.evaluation.features.sequences import Sequence, find_sequences
 from factorgraph_loc.files.data_root import find_data_root
-from factorgraph_loc.plugins import FEATURES
 from factorgraph_loc.vision.colour_features import ColourExtractor
 from factorgraph_loc.vision.features import EXTRACTORS, Keypoints, extractor
 
@@ -39,10 +38,10 @@ def sequences_section(options: Options) -> Report:
         Feature("sift, each once", each_once()),
         Feature("chance", chance()),
     ]
-    features = [*(feature(name, COUNT) for name in FEATURES), *others]
+    features = [*(Feature(name, extractor(name, COUNT).detectAndCompute) for name in EXTRACTORS), *others]
     scores = evaluate_all(sequences, features, report.tell)
     write_scores(scores, options.out / "sequences")
-    report.say(f"Means over {len(scores.of(STANDARD, scores.sequences()))} pairs of images.")
+    report.say(f"Means over {sum(len(sequence.others) for sequence in sequences)} pairs of images.")
     report.table(*summary(scores))
     return report
 
@@ -72,7 +71,7 @@ def chance():
         found = standard.detect(image)
         points = rng.uniform((0.0, 0.0), (image.shape[1] - 1.0, image.shape[0] - 1.0), (len(found), 2))
         sizes = rng.permutation(found.sizes)
-        return Keypoints(points, sizes, found.angles, found.responses, found.levels), None
+        return Keypoints(points, sizes, found.angles, found.responses), None
 
     return find
 
