@@ -38,10 +38,10 @@ def draw_ancestors(
     return np.asarray(
         _draw(
             predicted,
-            constants @ by_constants,
+            np.ascontiguousarray((constants @ by_constants).T),
             log_weights,
             later,
-            later_constants @ by_constants,
+            np.ascontiguousarray((later_constants @ by_constants).T),
             np.ascontiguousarray(whitener[size:, size:]),
             uniform,
         )
@@ -58,32 +58,33 @@ def _draw(
     whitener: Array,
     uniform: Array,
 ) -> Indices:
-    """``whitened`` (N, P+3) and ``whitened_later`` (M, P+3): the constants' part of the whitened states; ``whitener`` (3, 3): of
+    """``whitened`` (P+3, N) and ``whitened_later`` (P+3, M): the constants' part of the whitened states; ``whitener`` (3, 3): of
     the pose's error given the constants."""
     count = len(predicted)
-    size = whitened.shape[1] - 3
+    size = len(whitened) - 3
     cosine, sine = np.empty(count), np.empty(count)
     for i in range(count):
         cosine[i], sine[i] = math.cos(predicted[i, 2]), math.sin(predicted[i, 2])
     density = np.empty(count)
     rows = np.empty(len(later), np.int64)
     for j in range(len(later)):
-        highest = -np.inf
+        # one loop per term, so that each runs on several particles at once
         for i in range(count):
             dx, dy = later[j, 0] - predicted[i, 0], later[j, 1] - predicted[i, 1]
             along, lateral = cosine[i] * dx + sine[i] * dy, cosine[i] * dy - sine[i] * dx
             turn = later[j, 2] - predicted[i, 2]
-            turn -= 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
-            e0 = whitener[0, 0] * along
-            e1 = whitener[1, 0] * along + whitener[1, 1] * lateral
+            turn -= 2.0 * np.pi * np.floor((turn + np.pi) * (0.5 / np.pi))
+            e0 = whitener[0, 0] * along + (whitened_later[size, j] - whitened[size, i])
+            e1 = whitener[1, 0] * along + whitener[1, 1] * lateral + (whitened_later[size + 1, j] - whitened[size + 1, i])
             e2 = whitener[2, 0] * along + whitener[2, 1] * lateral + whitener[2, 2] * turn
-            e0 += whitened_later[j, size] - whitened[i, size]
-            e1 += whitened_later[j, size + 1] - whitened[i, size + 1]
-            e2 += whitened_later[j, size + 2] - whitened[i, size + 2]
-            squared = e0 * e0 + e1 * e1 + e2 * e2
-            for p in range(size):
-                squared += (whitened_later[j, p] - whitened[i, p]) ** 2
-            density[i] = log_weights[i] - 0.5 * squared
+            e2 += whitened_later[size + 2, j] - whitened[size + 2, i]
+            density[i] = log_weights[i] - 0.5 * (e0 * e0 + e1 * e1 + e2 * e2)
+        for p in range(size):
+            for i in range(count):
+                e0 = whitened_later[p, j] - whitened[p, i]
+                density[i] -= 0.5 * e0 * e0
+        highest = -np.inf
+        for i in range(count):
             highest = max(highest, density[i])
         if not highest > -np.inf:  # so far away that no density is left: by the weights alone
             for i in range(count):
@@ -92,7 +93,7 @@ def _draw(
         total = 0.0
         for i in range(count):
             # far below the highest nothing is drawn, and exp is what takes time
-            density[i] = np.exp(density[i] - highest) if density[i] > highest - 30.0 else 0.0
+            density[i] = np.exp(density[i] - highest) if density[i] > highest - 20.0 else 0.0
             total += density[i]
         threshold = uniform[j] * total
         reached = 0.0
