@@ -75,7 +75,11 @@ def _draw(
             turn = later[j, 2] - predicted[i, 2]
             turn -= 2.0 * np.pi * np.floor((turn + np.pi) * (0.5 / np.pi))
             e0 = whitener[0, 0] * along + (whitened_later[size, j] - whitened[size, i])
-            e1 = whitener[1, 0] * along + whitener[1, 1] * lateral + (whitened_later[size + 1, j] - whitened[size + 1, i])
+            e1 = (
+                whitener[1, 0] * along
+                + whitener[1, 1] * lateral
+                + (whitened_later[size + 1, j] - whitened[size + 1, i])
+            )
             e2 = whitener[2, 0] * along + whitener[2, 1] * lateral + whitener[2, 2] * turn
             e2 += whitened_later[size + 2, j] - whitened[size + 2, i]
             density[i] = log_weights[i] - 0.5 * (e0 * e0 + e1 * e1 + e2 * e2)
