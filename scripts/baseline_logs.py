@@ -12,6 +12,7 @@ import numpy as np
 from recorded_logs import recorded_log
 
 import factorgraph_loc as fgloc
+from factors import se2
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "benchmarks"))
 from field_benchmark.cases import CASES
@@ -77,9 +78,7 @@ def loops(reference: fgloc.Trajectory, rng: np.random.Generator) -> fgloc.LoopSt
         away = np.hypot(*(reference.poses[:, :2] - pose[:2]).T) + np.where(reference.t < t - 30.0, 0.0, np.inf)
         before = int(np.argmin(away))
         if away[before] < 2.0:
-            (dx, dy, turn), heading = pose - reference.poses[before], reference.poses[before, 2]
-            c, s = np.cos(heading), np.sin(heading)
-            relative = (c * dx + s * dy, c * dy - s * dx, np.arctan2(np.sin(turn), np.cos(turn)))
+            relative = se2.between(reference.poses[before], pose)
             rows.append((t, t - reference.t[before], *(relative + rng.standard_normal(3) * (0.05, 0.05, 0.02)), 1.0))
     return fgloc.LoopStream(*np.array(rows).T)
 
@@ -94,11 +93,6 @@ def camera(names: tuple[str, ...], logs: Path, _: Path) -> None:
             fgloc.simulate("office", 10 * seed + drive, changes=changes, images=True, out=folder)
         fgloc.build_map(first, world)
         fgloc.write_native(fgloc.read_log(second, world=world), logs / names[0])
-
-
-def lifted(names: tuple[str, ...], logs: Path, _: Path) -> None:
-    log = fgloc.simulate("office", int(names[0].rpartition("-")[2]), changes={"drive": {"duration": 140.0}})
-    fgloc.write_native(carried(log), logs / names[0])
 
 
 def halls(names: tuple[str, ...], logs: Path, programs: Path) -> None:
@@ -136,8 +130,7 @@ SOURCES: tuple[tuple[Callable[[tuple[str, ...], Path, Path], None], tuple[str, .
     *((recorded, (name,)) for name in (*RECORDED, *AISLES, *MOVED)),
     *((office, tuple(f"{name}{part}" for part in ("", "-ranges", "-bearings", "-carried"))) for name in OFFICES),
     *((camera, (name,)) for name in CAMERAS),
-    *((lifted, (name,)) for name in LIFTED),
     (halls, HALLS),
     (faulty, FAULTY),
-    *((broken, (name,)) for name in BROKEN),
+    *((broken, (name,)) for name in (*LIFTED, *BROKEN)),
 )

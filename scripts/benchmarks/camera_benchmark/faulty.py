@@ -14,6 +14,7 @@ import numpy as np
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream
+from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.simulation.filming import JPEG
 
@@ -79,8 +80,7 @@ def object_in_the_way(given: Given) -> Log:
     """A textured object covers a third of every image, and moves to and fro."""
     stream = images_of(given.log)
     given.folder.mkdir(parents=True, exist_ok=True)
-    camera = given.log.rig.camera
-    assert camera is not None
+    camera = camera_of(given.log)
     width = camera.width // 3
     noise = given.rng.integers(0, 256, (camera.height // 8, width // 8, 3), dtype=np.uint8)
     thing = cv2.resize(noise, (width, camera.height), interpolation=cv2.INTER_CUBIC)
@@ -122,8 +122,7 @@ def moved_landmark(given: Given) -> Log:
 
 
 def wrong_focal(given: Given) -> Log:
-    camera = given.log.rig.camera
-    assert camera is not None
+    camera = camera_of(given.log)
     return with_camera(given.log, fx=camera.fx * (1.0 + FOCAL), fy=camera.fy * (1.0 + FOCAL))
 
 
@@ -138,8 +137,7 @@ def estimated(change: Change, **uncertainty: float) -> Change:
 
     def changed(given: Given) -> Log:
         log = change(given)
-        assert log.rig.camera is not None
-        return with_camera(log, uncertainty=log.rig.camera.uncertainty.model_copy(update=uncertainty))
+        return with_camera(log, uncertainty=camera_of(log).uncertainty.model_copy(update=uncertainty))
 
     return changed
 
@@ -155,8 +153,7 @@ def out_of_order(given: Given) -> Log:
 
 def other_resolution(given: Given) -> Log:
     """The rig has the calibration of images of half the size."""
-    camera = given.log.rig.camera
-    assert camera is not None
+    camera = camera_of(given.log)
     halves = {name: getattr(camera, name) / 2.0 for name in ("fx", "fy", "cx", "cy")}
     return with_camera(given.log, width=camera.width // 2, height=camera.height // 2, **halves)
 
@@ -178,6 +175,11 @@ FAULTS: dict[str, Change] = {
 }
 
 
+def camera_of(log: Log) -> CameraSettings:
+    assert log.rig.camera is not None
+    return log.rig.camera
+
+
 def images_of(log: Log) -> ImageStream:
     stream = log.streams["camera"]
     assert isinstance(stream, ImageStream)
@@ -195,15 +197,12 @@ def with_stream(log: Log, stream: ImageStream | FeatureStream) -> Log:
 
 
 def with_camera(log: Log, **changes: Any) -> Log:
-    assert log.rig.camera is not None
-    return replace(log, rig=log.rig.model_copy(update={"camera": log.rig.camera.model_copy(update=changes)}))
+    return replace(log, rig=log.rig.model_copy(update={"camera": camera_of(log).model_copy(update=changes)}))
 
 
 def blank(log: Log, which: Sequence[int], value: int, folder: Path) -> Log:
     """Replace the images ``which`` by one grey value."""
-    stream = images_of(log)
-    camera = log.rig.camera
-    assert camera is not None
+    stream, camera = images_of(log), camera_of(log)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "blank.jpg"
     save(path, np.full((camera.height, camera.width, 3), value, dtype=np.uint8))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from unittest.mock import patch
 
 import numpy as np
 
@@ -14,9 +15,8 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.sensors.odometry import simulation
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
-from factorgraph_loc.sensors.odometry.simulation import ALONG, HEADING, LATERAL, RATE
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, extent
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
@@ -33,19 +33,13 @@ def without_constants(log: Log, seed: int) -> Log:
     the white noise of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference, expected one to make odometry from")
-    end = float(log.reference.t[-1])
-    t = log.reference.t[0] + np.arange(round((end - float(log.reference.t[0])) * RATE) + 1) / RATE
-    poses = log.reference.at(np.minimum(t, end))
-    steps = se2.between(poses[:-1], poses[1:])
-    root = np.sqrt(np.hypot(steps[:, 0], steps[:, 1]))
-    noise = np.random.default_rng(seed).standard_normal(steps.shape) * (ALONG, LATERAL, HEADING)
-    rows = np.zeros((len(t), 3))
-    rows[1:] = steps + root[:, None] * noise
+    with patch.multiple(simulation, SCALE_SIGMA=0.0, DRIFT_SIGMA=0.0):
+        wheels = simulation.wheel_odometry(log.reference, seed)
     odometry = log.rig.odometry.model_copy(update={"uncertainty": OdometryUncertainty()})
     return replace(
         log,
         rig=log.rig.model_copy(update={"odometry": odometry, "rfid": exact(log.rig.of(RfidSettings))}),
-        streams={**log.streams, "odometry": IncrementStream(t, *np.ascontiguousarray(rows.T))},
+        streams={**log.streams, "odometry": wheels},
     )
 
 
