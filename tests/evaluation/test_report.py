@@ -91,21 +91,6 @@ def eight(made):
     return made({"ekf": 0.1, "smoother": 0.1, "dead": 0.5}, LOGS, 2, count=200)
 
 
-@pytest.mark.usefixtures("blank_pictures")
-def test_names_the_best_and_what_is_not_significantly_different(eight, tmp_path):
-    words = words_of(page_of(eight, tmp_path, baseline="dead", title="Eight logs"))
-    assert words.startswith("Eight logs")
-    assert "3 estimators on 8 logs and up to 2 seeds each: 48 runs. All succeeded." in words
-    assert re.search(r"least causal position RMSE is that of (ekf|smoother) : [\d.]+ m \(95 % interval \[", words)
-    assert re.search(
-        r"is not significantly different from that of (ekf|smoother) \. "
-        r"It differs significantly from that of dead \(\+0\.\d+ m, p 0\.0\d+\)",
-        words,
-    )
-    assert "○" in words
-    assert "Differences from dead" in words
-
-
 def test_is_whole_and_the_same_each_time(eight, tmp_path):
     page = page_of(eight, tmp_path)
     elements = Elements(page).found

@@ -5,7 +5,7 @@ import pytest
 
 from factorgraph_loc.evaluation.inference import differences
 from factorgraph_loc.evaluation.statistics import pooled_rms
-from factorgraph_loc.evaluation.tables import ALL, comparison_cells, verdict
+from factorgraph_loc.evaluation.tables import ALL, comparison_cells
 
 METRIC = "causal.position_rmse"
 
@@ -68,13 +68,3 @@ def test_table_pools_seeds_and_logs():
     assert pooled[0] == ALL
     assert pooled[position] == f"{pooled_rms([pooled_rms([0.3, 0.4]), 0.1]):.3f}"
     assert pooled[runs] == "3/4"
-
-
-def test_verdict_names_the_best_that_can_be_compared():
-    rows = rows_of({(log, name, 0): value for log in ("one", "two") for name, value in (("a", 0.4), ("b", 0.2))})
-    rows += rows_of({("one", "c", 0): 0.1, ("one", "dead_reckoning", 0): 3.0, ("two", "dead_reckoning", 0): 4.0})
-    lines = verdict(rows)
-    assert f"least {METRIC.partition('.')[0]} position error: b, 0.200 m (dead_reckoning: 3.536 m)" in lines
-    assert verdict(rows_of({("one", "a", 0): None})) == []
-    (line,) = verdict(rows_of({("one", "a", 0): 0.201, ("one", "b", 0): 0.2, ("one", "c", 0): 0.203}))
-    assert line == "least causal position error: b, 0.200 m, within 1% of it a"

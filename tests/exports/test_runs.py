@@ -1,18 +1,14 @@
 """Runs are read back as they were written."""
 
-import io
-import shutil
 from dataclasses import replace
 
 import numpy as np
-import polars as pl
 import pytest
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
-from factorgraph_loc.io.results import NUMBERS
 
 
 def test_a_run_is_read_as_it_was(log, results):
@@ -44,39 +40,6 @@ def test_bad_folders(log, results, tmp_path):
         read_runs(find_runs(results), replace(log, name="hall"))
     with pytest.raises(InputError, match="is it a run of another log arc"):
         read_runs(find_runs(results), replace(log, t0_ns=0))
-
-
-def _parquet(**columns):
-    """The bytes of a table of estimates with other columns."""
-    usual = {name: [0.5] for name in NUMBERS} | {"kind": ["final"], "status": ["localized"], "t_ns": [10**18]}
-    content = io.BytesIO()
-    pl.DataFrame({name: column for name, column in (usual | columns).items() if column is not None}).write_parquet(
-        content
-    )
-    return content.getvalue()
-
-
-DAMAGE = [
-    ("config.toml", b"\xff"),
-    ("config.toml", b'log = "arc"\nestimator = "ekf"\nseed = "x"'),
-    ("learnt.json", b'{"landmarks": {"a": {"x": "y", "y": 1, "covariance": [1]}}}'),
-    ("learnt.json", b"[" * 5000),
-    ("events.csv", b"t_ns,event\nx,y\n"),
-    ("events.csv", b"t_ns,event\n5,\n"),
-    ("estimates.parquet", b"PAR1" + bytes(100) + b"PAR1"),
-    ("estimates.parquet", _parquet(x=None)),
-    ("estimates.parquet", _parquet(x=["0.5"])),
-    *(("estimates.parquet", _parquet(t_ns=[stamp])) for stamp in (None, 2**62)),
-]
-
-
-@pytest.mark.parametrize(("name", "content"), DAMAGE)
-def test_a_damaged_file_is_one_line_that_names_it(log, results, tmp_path, name, content):
-    run_folder = find_runs(results)[0].path
-    shutil.copytree(run_folder, tmp_path / "run")
-    (tmp_path / "run" / name).write_bytes(content)
-    with pytest.raises(InputError, match=name):
-        read_runs(find_runs(tmp_path / "run"), log)
 
 
 def test_of_an_estimator_without_causal_estimates_the_final_ones_are_played(log, tmp_path):

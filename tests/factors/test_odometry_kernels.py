@@ -8,7 +8,6 @@ import pytest
 from factors import se2
 from factors.motion import ChainState, Increment
 from factors.odometry import kernels as odometry_kernels
-from factors.odometry.factor import whitener
 from factors.odometry.model import (
     MINIMUM_HEADING_VARIANCE,
     MINIMUM_POSITION_VARIANCE,
@@ -61,19 +60,6 @@ def test_relative_motion(start, end):
     assert found.duration == pytest.approx(way[2])
 
 
-def test_a_covariance_is_carried_by_the_adjoint(rng):
-    delta, before, noise = rng.standard_normal(3), covariance(rng), covariance(rng)
-    adjoint = se2.adjoint(se2.inverse(delta))
-    carried = odometry_kernels.carried(before, delta, noise)
-    np.testing.assert_allclose(carried, adjoint @ before @ adjoint.T + noise)
-
-
-def test_an_increment_alone_is_recalibrated_as_with_its_jacobian(rng):
-    increment, changes = relative_motion(MODEL, START, END), 0.1 * rng.standard_normal(4)
-    alone = odometry_kernels.recalibrated(increment.delta, increment.duration, changes, np.arange(4))
-    np.testing.assert_allclose(alone, recalibrated(increment, changes)[0], atol=1e-12)
-
-
 @pytest.mark.parametrize("places", [(), (2,), (0, 3)])
 def test_a_gaussian_is_predicted_by_its_jacobians(rng, places):
     first, count = 5, len(places)
@@ -96,8 +82,3 @@ def test_a_gaussian_is_predicted_by_its_jacobians(rng, places):
     )
     for one, other in zip(found, (se2.compose(pose, delta), transition, expected), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-
-
-def test_a_whitener_is_the_inverse_of_the_root(rng):
-    spread = covariance(rng)
-    np.testing.assert_allclose(whitener(spread), np.linalg.inv(np.linalg.cholesky(spread)), rtol=1e-6, atol=1e-9)

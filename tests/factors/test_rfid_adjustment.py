@@ -123,9 +123,3 @@ def test_an_update_of_pose_and_parameters_is_that_of_the_pose_where_these_are_ex
     wide = RfidFactor(likelihood, looks, (0,)).correct(POSE, np.diag((0.01, 0.02, 0.01, 0.04)), np.zeros(1))
     assert wide.covariance[3, 3] < 0.04
     assert np.linalg.slogdet(wide.covariance[:3, :3])[1] > np.linalg.slogdet(alone.covariance)[1] - 0.5
-
-
-def test_another_number_of_parameters_is_refused() -> None:
-    likelihood, _, parameters = scene(1)
-    with pytest.raises(ValueError, match="parameters"):
-        likelihood.adjusted(parameters[:1])

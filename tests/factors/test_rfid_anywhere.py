@@ -6,7 +6,6 @@ import pytest
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.index import tag_index, within
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
-from factors.rfid.places import is_wide
 
 BEAM = BeamModel()
 ANTENNAS = tuple(Antenna(0.2, 0.1 * k, 1.2, 1.5 * k) for k in range(4))
@@ -72,13 +71,6 @@ def test_what_is_out_of_reach_tells_what_silence_and_false_reads_tell():
     assert together == pytest.approx(-likelihood.score(away[len(near) :], looks).nll, rel=1e-6)
 
 
-def test_only_tags_in_reach_are_counted_as_work():
-    likelihood, looks, near, anywhere = scene((1.2,))
-    assert likelihood.work(looks) < len(likelihood.tags.points)
-    assert is_wide(anywhere, likelihood._places.antennas.reach)
-    assert not is_wide(near, likelihood._places.antennas.reach)
-
-
 @pytest.mark.parametrize("size", [(30.0, 10.0), (0.0, 0.0), (1e6, 3.0)])
 def test_the_index_finds_all_tags_in_a_box(size):
     rng = np.random.default_rng(2)
@@ -93,7 +85,3 @@ def test_the_index_finds_all_tags_in_a_box(size):
         assert np.all(np.diff(found) > 0)
         apart = np.maximum(low - points[found, :2], points[found, :2] - high).max(initial=0.0)
         assert apart <= index.cell
-
-
-def test_a_map_without_tags_has_an_index():
-    assert len(within(tag_index(np.empty((0, 3))), np.zeros(2), np.ones(2))) == 0

@@ -20,7 +20,6 @@ CONFIGS = {
 }
 DEAD_RECKONING = RunConfig("dead_reckoning")
 EXACT = ("ekf", "smoother", "smoother_lag", "batch")  # no random numbers
-MAIN = ("ekf", "particle_filter", "smoother")  # of one graph, all solvers take the same measurements
 
 
 @pytest.fixture(scope="module")
@@ -37,24 +36,6 @@ def clean(log):
 def distance(a, b):
     """Largest distance [m] between two trajectories or results."""
     return np.hypot(*(a.poses - b.poses)[:, :2].T).max()
-
-
-@pytest.mark.parametrize("name", MAIN)
-def test_unknown_landmarks_are_ignored(name, log, clean):
-    """A ghost joins each stamp."""
-    stream = log.streams["bearing_range"]
-    first = np.flatnonzero(np.diff(stream.t, prepend=-1.0))
-    haunted = with_sightings(
-        log,
-        t=np.insert(stream.t, first, stream.t[first]),
-        landmark=np.insert(np.array(stream.landmark, dtype=object), first, "ghost").tolist(),
-        range=np.insert(stream.range, first, 1.0),
-        bearing=np.insert(stream.bearing, first, 0.0),
-    )
-    result = run(haunted, CONFIGS[name])
-    assert result.diagnostics.ignored == {"landmark not in the map": len(first)}
-    assert distance(result, clean(name)) == 0.0
-    assert distance(result.final, clean(name).final) == 0.0
 
 
 @pytest.mark.parametrize("name", EXACT)

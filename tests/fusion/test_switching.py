@@ -23,12 +23,6 @@ def office():
     return simulate_office(preset("office", changes), 3)
 
 
-@pytest.fixture(scope="module")
-def switched(office):
-    """The run that several tests look at."""
-    return run(office, RunConfig("switching", {"particles": 500}, sensors=BOTH))
-
-
 def switching(log, sensors=BOTH):
     return made("switching", log.rig, log.world, sensors)
 
@@ -46,16 +40,6 @@ def test_without_scans_it_is_the_ekf(office):
     # smoothed apart from each other, by the same equations
     assert np.abs(switched.final.poses[:, :2] - alone.final.poses[:, :2]).max() < 1e-3
     np.testing.assert_allclose(switched.final.covariances, alone.final.covariances, rtol=0.05, atol=1e-6)
-
-
-def test_while_tags_are_read_it_is_the_particle_filter(office, switched):
-    plain = {"self_calibration": False, "smooth": False, "particles": 500}
-    alone = run(office, RunConfig("particle_filter", plain, sensors=TAGS))
-    scans = list(office.measurements(("rfid",)))
-    silent = next(m.t for m in scans if not m.tags)
-    until = switched.t < silent
-    assert until.sum() > 10
-    np.testing.assert_array_equal(switched.poses[until], alone.poses[until])
 
 
 def test_it_hands_over_mean_and_covariance(office):

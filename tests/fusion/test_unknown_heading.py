@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from landmark_world import simulate, with_sightings
 
-from factorgraph_loc import IncrementOdometry, InputError, Rig, Trajectory
+from factorgraph_loc import IncrementOdometry, Rig, Trajectory
 from factorgraph_loc.evaluation.metrics import errors
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.belief import PosePrior
@@ -105,26 +105,6 @@ def test_before_anything_is_seen_the_position_is_known_as_far_as_it_can_be(log):
             error[2] = se2.wrap_scalar(error[2])
             assert error @ np.linalg.solve(result.covariances[i], error) < UNLIKELY
         check(late, result, 14.0)
-
-
-def test_a_reference_without_headings_is_a_position(log):
-    vague = replace(log, reference=replace(log.reference, has_heading=False))
-    known, found = run(log, RunConfig("smoother")), run(vague, RunConfig("smoother"))
-    assert found.config["prior"] == "reference"
-    assert np.hypot(*(known.final.poses - found.final.poses)[:, :2].T).max() < 0.1
-
-
-@pytest.mark.parametrize(
-    ("config", "who"),
-    [
-        (RunConfig("dead_reckoning"), "dead_reckoning"),
-        (RunConfig("smoother", {"landmarks": "unknown"}), "smoother"),
-        (RunConfig("smoother", sensors=("odometry",)), "smoother"),
-    ],
-)
-def test_who_cannot_find_it_says_so(config, who, log):
-    with pytest.raises(InputError, match=f"^{who} cannot find an unknown heading .*, expected a prior X,Y,HEADING$"):
-        run(log, replace(config, prior="0,0"))
 
 
 def test_the_start_as_a_constraint():

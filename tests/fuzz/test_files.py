@@ -88,7 +88,7 @@ FORMATS = {
     "images": Format(sound_files.images, use_images, ("png", "jpg", "camera.csv", "rig.toml")),
     "grid": Format(sound_files.grid, use_rig),
     "world": Format(sound_files.world, use_world),
-    "result": Format(sound_files.result, use_result, ("json", "run.toml", "run/estimates.parquet")),
+    "result": Format(sound_files.result, use_result, ("json", "events.csv", "run.toml", "run/estimates.parquet")),
     "experiment": Format(sound_files.experiment, use_experiment, ("e.toml",)),
     "tables": Format(sound_files.tables, partial(use_log, path="m.toml"), (".csv", "m.toml")),
     **{name: Format(sound_files.bag(name), partial(use_bag, path=name)) for name in BAGS},

@@ -53,16 +53,3 @@ def test_the_rig_comes_first(table):
         assert moved.w.tolist() == pytest.approx([0.0, 0.4, 0.8])
     ways = fgloc.read_log(table("_speed"), rig=rig).streams["odometry"]
     assert ways.v.tolist() == pytest.approx([0.0, 3.0, 6.0])
-
-
-@pytest.mark.parametrize(
-    ("column", "more", "message"),
-    [
-        ("_rate", "track = 0.5", r"left_rate needs radius \[m\], here or in \[odometry.wheels\] of the rig"),
-        ("_speed", "", r"left_speed needs track \[m\]"),
-        ("_angle", "radius = 0.1", r"left_angle needs track \[m\]"),
-    ],
-)
-def test_sizes_that_are_missing(table, column, more, message):
-    with pytest.raises(fgloc.InputError, match=message):
-        fgloc.read_log(table(column, more))

@@ -5,17 +5,13 @@ import math
 import numpy as np
 import pytest
 from by_hand import started
-from refusal import refusal
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import (
-    BearingRange,
     IncrementOdometry,
     InputError,
     RfidRead,
     RfidScan,
-    Tick,
-    VelocityOdometry,
 )
 from factorgraph_loc.sensors.rfid.stream import scan_of
 
@@ -24,28 +20,6 @@ from factorgraph_loc.sensors.rfid.stream import scan_of
 def log():
     """The rig and map of an office."""
     return fgloc.simulate("office", 3, changes={"drive": {"duration": 1.0}, "world": {"tags": 12, "landmarks": 6}})
-
-
-ONE = np.ones(1)
-BAD = [
-    (VelocityOdometry(1.0, "fast", 0.0), "v is 'fast', expected numbers"),
-    (BearingRange(1.0, ("a", "b"), ONE, ONE), "range has shape (1,), expected (2,)"),
-    (BearingRange(1.0, "ab", ONE, ONE), "landmarks is 'ab', expected names"),
-    (
-        RfidScan(1.0, ("a",), np.array([1]), ("e",), ONE, ONE, ONE, ONE),
-        "antenna is [1], expected indices of its 1 ant",
-    ),
-    (Tick(1.0), "Tick is not a measurement, expected one of VelocityOdometry, "),
-]
-
-
-@pytest.mark.parametrize(("measurement", "message"), BAD)
-def test_what_cannot_be_is_refused_and_changes_nothing(log, measurement, message):
-    localizer = started(log, "ekf")
-    localizer.push(IncrementOdometry(0.5, 0.1, 0.0, 0.0))
-    before = localizer.estimate()
-    refusal(lambda: localizer.push(measurement), message)
-    assert np.array_equal(localizer.estimate().pose, before.pose)
 
 
 def test_clocks_that_go_back_or_are_others_are_refused(log):
@@ -63,23 +37,6 @@ def test_clocks_that_go_back_or_are_others_are_refused(log):
         localizer.estimate(math.nan)
     localizer.push(IncrementOdometry(5.1, 0.1, 0.0, 0.0))
     assert localizer.estimate().t == 5.1
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"pose": (1.0, 2.0)}, r"pose is \[1.0, 2.0\], expected finite x, y \[m\] and heading"),
-        (
-            {"pose": (0, 0, 0), "covariance": np.diag((1.0, 0.0, 1.0))},
-            r"expected \(3, 3\), symmetric and positive definite",
-        ),
-        ({}, "ekf cannot start from an unknown pose with this rig and map, expected a pose"),
-    ],
-)
-def test_a_start_that_cannot_be_is_refused(log, given, message):
-    localizer = fgloc.Localizer(log.rig, log.world, "ekf")
-    with pytest.raises(InputError, match=message):
-        localizer.initialize(**given)
 
 
 def test_reads_of_an_antenna_that_did_not_listen_are_refused(log):

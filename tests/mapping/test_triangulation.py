@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from factorgraph_loc.mapping.triangulation import Cameras, Tracks, parallax, reproject, triangulate
+from factorgraph_loc.mapping.triangulation import Cameras, Tracks, parallax, triangulate
 
 
 def test_without_noise_the_points_come_back(look):
@@ -62,14 +62,3 @@ def test_parallax_is_the_greatest_angle():
     none = np.zeros((3, 2))
     tracks = Tracks(np.zeros(3, dtype=int), np.arange(3), np.zeros(3, dtype=int), none)
     assert parallax(cameras, np.array([(0.0, 0.0, 1.0)]), tracks)[0] == pytest.approx(np.pi / 4)
-
-
-def test_jacobians_of_the_reprojection(look):
-    sight = look(np.random.default_rng(5), count=4, points=10)
-    tracks, old = sight.tracks()
-    points, step = sight.points[old], 1e-6
-    _, _, by_point, _ = reproject(sight.model, sight.cameras, points, tracks)
-    for axis in range(3):
-        change = step * np.eye(3)[axis]
-        ahead, behind = (reproject(sight.model, sight.cameras, points + s * change, tracks)[0] for s in (1.0, -1.0))
-        np.testing.assert_allclose(by_point[..., axis], (ahead - behind) / (2.0 * step), rtol=1e-5, atol=1e-4)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from by_hand import made
 from camera_world import CAMERA, frame, room, simulate, with_views
-from on_a_line import GROWTH, STEP, WHEELS, drive, kalman
 
-from factorgraph_loc import CameraFrame, PixelSightings, PointMap, Rig, Tick, World
+from factorgraph_loc import CameraFrame, PixelSightings, Rig, Tick, World
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING
@@ -22,58 +21,6 @@ from factors.camera.factor import image_update
 @pytest.fixture(scope="module")
 def log():
     return simulate(seconds=15.0)
-
-
-# A camera that looks along y at points 5 m away on a robot that moves along x: u measures x, linearly.
-FAR = np.column_stack((np.linspace(-3.0, 3.0, 9), np.full(9, 5.0), np.zeros(9)))
-SIGMAS = np.array((0.2, 1e-5, 1e-6))
-
-
-def side_camera():
-    settings = CAMERA.model_copy(
-        update={
-            "distortion": (0.0, 0.0, 0.0, 0.0),
-            "x": 0.0,
-            "y": 0.0,
-            "z": 0.0,
-            "pitch": 0.0,
-            "yaw": np.pi / 2,
-            "pixel_sigma": 20.0,
-            "robust": 100.0,
-        }
-    )
-    return Rig(sensors=("odometry", "sightings"), odometry=WHEELS, camera=settings)
-
-
-@pytest.mark.parametrize("name", ["ekf", "smoother", "batch", "particle_filter"])
-def test_a_linear_gaussian_run_is_that_of_the_kalman_filter_and_smoother(name):
-    rig, points = side_camera(), PointMap.of(tuple(f"p{i}" for i in range(9)), FAR)
-    model, rng = rig.camera.model(), np.random.default_rng(4)
-    many = {"particles": 5000, "smoothing_interval": 0.5, "smoothing_trajectories": 300}
-    settings = many if name == "particle_filter" else {}
-    estimator = made(name, rig, World(points=points), rig.sensors, 7, **settings)
-    x, images = 0.1, []
-    for i in range(1, 16):
-        x += 0.1 + np.sqrt(0.1 * GROWTH) * rng.standard_normal()
-        pixels = reprojection.predict(model, np.array((x, 0.0, 0.0)), FAR)[0]
-        pixels += model.sigma * rng.standard_normal(pixels.shape)
-        images.append(PixelSightings(STEP * i, points.names, pixels))
-    causal = drive(estimator, SIGMAS, 0.1, images)
-    places = [np.mean(FAR[:, 0] - (m.pixels[:, 0] - model.cx) * 5.0 / model.fx) for m in images]
-    noise = (model.sigma * 5.0 / model.fx) ** 2 / 9.0  # of x from all points
-    filtered, smoothed = kalman(places, SIGMAS, 0.1, noise)
-    final = estimator.trajectory()
-    if name == "particle_filter":
-        # the mean of particles of spread s is off by s / sqrt(N_eff): 6 sigma of 500 effective ones, below 1e-7 of false alarms
-        assert np.all(np.abs(causal[:, 0] - filtered[:, 0]) < 6.0 * np.sqrt(filtered[:, 1] / 500.0))
-        np.testing.assert_allclose(causal[:, 1], filtered[:, 1], rtol=0.25)
-        assert np.all(np.abs(final.poses[:, 0] - smoothed[:, 0]) < 6.0 * np.sqrt(smoothed[:, 1] / 80.0))
-        return
-    if name != "batch":
-        np.testing.assert_allclose(causal[:, 0], filtered[:, 0], atol=5e-4)  # a thirtieth of a standard deviation
-        np.testing.assert_allclose(causal[:, 1], filtered[:, 1], rtol=1e-2)
-    np.testing.assert_allclose(final.poses[:, 0], smoothed[:, 0], atol=5e-4)
-    np.testing.assert_allclose(final.covariances[:, 0, 0], smoothed[:, 1], rtol=1e-2)
 
 
 def test_images_that_are_too_late_are_counted(log):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.sensors.rfid.calibration.fields import Kind, choose, design_of, fit_grid
-from factorgraph_loc.sensors.rfid.calibration.pairs import Floor, TagPairs, terms, view_of
-from factorgraph_loc.sensors.rfid.calibration.parametric import FACING, beam, features, fit_model, logistic
+from factorgraph_loc.sensors.rfid.calibration.pairs import Floor, TagPairs, view_of
+from factorgraph_loc.sensors.rfid.calibration.parametric import FACING, beam, fit_model, logistic
 from factorgraph_loc.sensors.rfid.calibration.rounds import rounds_of
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
 from factors.rfid.model import BeamModel, GridModel, LogisticModel, logits, probability
@@ -46,19 +46,6 @@ def fit_logistic(pairs, floor, with_facing):
 def rms_error(model, truth, pairs):
     error = probability(model, pairs.points, pairs.facing) - probability(truth, pairs.points, pairs.facing)
     return float(np.sqrt(np.mean(error**2)))
-
-
-def test_features_are_those_of_the_model(pairs):
-    expected, _ = logits(TRUTH, pairs.points, pairs.facing)
-    np.testing.assert_allclose(features(pairs.points, pairs.facing) @ TRUTH.coefficients, expected, atol=1e-9)
-
-
-def test_derivatives_of_the_likelihood():
-    z = np.linspace(-6.0, 6.0, 25)
-    hits, count, step = np.full(25, 2.0), np.full(25, 5.0), 1e-5
-    floor = Floor(0.02, 0.03)
-    numeric = (terms(z + step, hits, count, floor).nll - terms(z - step, hits, count, floor).nll) / (2.0 * step)
-    np.testing.assert_allclose(terms(z, hits, count, floor).gradient, numeric, atol=1e-6)
 
 
 def test_a_logistic_model_is_found(pairs):
