@@ -127,3 +127,7 @@ def test_what_cannot_be_calibrated_is_said(read_tags, tmp_path):
     log = read_tags(seconds=20.0)
     with pytest.raises(InputError, match=r"reads-1: has 79 inventory rounds .* expected 100 rounds and 2 tags or more"):
         learn_rfid([log], log.rig, tmp_path / "cart")
+    antennas = {f"{name} of the rig": antenna for name, antenna in log.rig.rfid.antennas.items()}
+    renamed = log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"antennas": antennas})})
+    with pytest.raises(InputError, match=r"reads-1: .* same names in \[rfid.antennas\]"):
+        learn_rfid([log], renamed, tmp_path / "cart")

@@ -16,6 +16,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
+from factorgraph_loc.text import listed
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
 
@@ -64,6 +65,11 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     t = stream.t[first] + log.rig.time_offset("rfid") - _middle(stream.age, inverse, read, len(first))
     antennas = {name: i for i, name in enumerate(settings.all_antennas())}
     antenna = np.array([antennas.get(stream.antenna[i], -1) for i in first], dtype=np.int64)
+    if np.all(antenna < 0):
+        raise InputError(
+            f"{log.name}: its antennas are {listed(dict.fromkeys(stream.antenna))}, those of the rig {listed(antennas)}: "
+            "give them the same names in [rfid.antennas]"
+        )
     epcs = set(stream.epc)
     names = tuple(name for name in log.world.tags if name in epcs)
     index = {name: i for i, name in enumerate(names)}
