@@ -52,6 +52,23 @@ def test_runs_are_made_once_and_can_be_looked_at(fgloc, file, tmp_path):
     assert "<html" in (tmp_path / "out" / "lags" / "report.html").read_text().lower()
 
 
+def test_damage_is_told_and_repaired(fgloc, file, tmp_path):
+    assert fgloc("experiment", "run", file, "--jobs", 1).exit_code == 0
+    for path in (tmp_path / "out/lags/store").glob("??/*/estimates.parquet"):
+        before = path.stat()
+        path.write_bytes(b"?" + path.read_bytes()[1:])
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        break
+    (name,) = json.loads(fgloc("experiment", "status", file, "--verify", "--json").stdout)["damaged"]
+    assert f"damaged: {name}" in fgloc("experiment", "status", file, "--verify").stdout
+    report = fgloc("experiment", "report", file)
+    assert report.exit_code == 0, report.output
+    assert f"damaged, left out: {name}" in report.stdout
+    assert json.loads(fgloc("experiment", "report", file, "--json").stdout)["damaged"] == [name]
+    assert fgloc("experiment", "run", file, "--verify", "--jobs", 1).exit_code == 0
+    assert json.loads(fgloc("experiment", "report", file, "--json").stdout)["damaged"] == []
+
+
 def test_a_failure_is_named_and_the_exit_code_is_1(fgloc, file, tmp_path):
     result = fgloc("experiment", "run", file, "--jobs", 1, "--set", "prior=log")
     assert result.exit_code == 1, result.output

@@ -8,7 +8,7 @@ from evo.core.trajectory import PosePath3D
 from scipy.stats import binom, chi2
 
 from factorgraph_loc import Log, Rig, Trajectory, World
-from factorgraph_loc.evaluation.metrics import accuracy, score
+from factorgraph_loc.evaluation.metrics import accuracy, errors, score
 from factorgraph_loc.evaluation.pairing import Pairs
 from factorgraph_loc.evaluation.scores import OF_FREE_MAP
 from factorgraph_loc.evaluation.trajectories.association import in_plane
@@ -178,6 +178,14 @@ def test_without_a_reference_nis_counts_and_times_are_reported():
     assert scores["timing.real_time_factor"] == 10.0
 
 
+def test_learnt_constants_are_scores():
+    t = np.arange(5) * 0.1
+    learnt = Learnt({"scale_distance": (1.02, 0.01), "bearing_range.x": (0.2, 0.003)})
+    scores = score(result_of(t, np.zeros((5, 3)), ("localized",) * 5, learnt=learnt), log_of(t, None))
+    assert (scores["learnt.scale_distance.value"], scores["learnt.scale_distance.sigma"]) == (1.02, 0.01)
+    assert (scores["learnt.bearing_range.x.value"], scores["learnt.bearing_range.x.sigma"]) == (0.2, 0.003)
+
+
 @pytest.mark.parametrize("landmarks", ["known", "unknown"])
 def test_aligned_figures_only_where_the_map_was_free(landmarks):
     t, truth, _ = drive()
@@ -210,3 +218,10 @@ def test_innovations_without_degrees_of_freedom_say_nothing():
         None,
         None,
     )
+
+
+def test_a_covariance_that_is_hardly_positive_is_scored():
+    poses = np.zeros((3, 3))
+    covariances = np.tile(np.diag((1e-300, 1.0, 1.0)), (3, 1, 1))
+    e = errors(Trajectory(np.arange(3.0), poses, covariances), Trajectory(np.arange(3.0), poses))
+    assert np.all(np.isfinite(e.nees))

@@ -159,6 +159,23 @@ def test_the_table_has_a_row_a_run_and_names_stay_what_they_are(experiment, out,
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.toml", "log", "out"]
 
 
+def test_failures_are_rows_and_are_tried_again_if_told(experiment, fake, monkeypatch):
+    def fail(*_):
+        raise FglocError("cannot go on")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fake, "process", fail)
+        done = run_experiment(experiment())
+    assert done.rows["status"].to_list() == ["failed", "ok"]
+    assert done.rows["reason"].to_list() == ["cannot go on", None]
+    assert done.failures == [f"{NASTY}, fake, seed 0: cannot go on"]
+    assert experiment().todo() == []
+    (again,) = experiment().todo(again=True)
+    assert again.label == "fake"
+    done = run_experiment(experiment(), again=True)
+    assert done.rows["status"].to_list() == ["ok", "ok"]
+
+
 def test_a_damaged_result_is_found_and_done_again(experiment, out):
     first = run_experiment(experiment()).rows
     key = first["key"][1]

@@ -84,6 +84,20 @@ def test_robots_go_their_ways(log, results, recording):
         assert np.allclose(np.array(path)[:, :2], run.final.poses[:, :2], atol=1e-6)
 
 
+def test_tags_are_lit_while_they_are_read(recording):
+    rows = recording("/world/tags/lit", "labels")
+    assert [(t, v) for t, v in rows if t is not None] == [
+        (1.0, ["A"]),
+        (1.5, []),
+        (1.8, ["A"]),
+        (2.0, ["A", "B"]),
+        (2.3, ["B"]),
+        (2.5, []),
+    ]
+    places = dict(recording("/world/tags/lit", "positions"))
+    assert np.allclose(places[2.3], [(1.5, 1.0, 0.4)])
+
+
 def test_errors_and_events(log, results, recording):
     ekf = next(run for run in read_runs(find_runs(results), log) if run.name == "ekf")
     t, errors = ekf.series["error_position"]

@@ -55,3 +55,12 @@ def test_without_curvature_it_is_the_root_of_the_cost() -> None:
     residual, jacobian = compressed(2.0, gradient, np.zeros((2, 2)))
     assert 0.5 * residual @ residual == pytest.approx(2.0)
     assert np.allclose(jacobian.T @ jacobian, np.outer(gradient, gradient) / 4.0, atol=1e-8)
+
+
+def test_nothing_known_pulls_nowhere() -> None:
+    residual, jacobian = compressed(3.0, np.zeros(3), np.zeros((3, 3)))
+    assert residual == pytest.approx([0.0, 0.0, 0.0, 6.0**0.5])
+    assert np.abs(jacobian).max() < 1e-4
+    residual, jacobian = compressed(0.0, np.zeros(3), np.zeros((3, 3)))
+    assert not residual.any()
+    assert np.isfinite(jacobian).all()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from factors import gaussian, positive
+from factors.rfid import factor
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7])
@@ -25,6 +26,14 @@ def test_products_and_solutions(size, width):
 def test_what_has_no_inverse_is_an_error(value):
     with pytest.raises(np.linalg.LinAlgError):
         gaussian.inverse(np.array(((1.0, 2.0), (value, value))))
+
+
+def test_telling_directions_are_counted_as_by_eigenvalues():
+    rng = np.random.default_rng(1)
+    for rank in (0, 1, 2, 3):
+        for _ in range(20):
+            rows = rng.normal(size=(rank, 3)) * 10.0 ** rng.uniform(-1.0, 3.0)
+            assert factor._rank(rows.T @ rows) == rank
 
 
 @pytest.mark.parametrize("size", [1, 3, 9])

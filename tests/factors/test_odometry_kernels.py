@@ -60,6 +60,12 @@ def test_relative_motion(start, end):
     assert found.duration == pytest.approx(way[2])
 
 
+def test_an_increment_alone_is_recalibrated_as_with_its_jacobian(rng):
+    increment, changes = relative_motion(MODEL, START, END), 0.1 * rng.standard_normal(4)
+    alone = odometry_kernels.recalibrated(increment.delta, increment.duration, changes, np.arange(4))
+    np.testing.assert_allclose(alone, recalibrated(increment, changes)[0], atol=1e-12)
+
+
 @pytest.mark.parametrize("places", [(), (2,), (0, 3)])
 def test_a_gaussian_is_predicted_by_its_jacobians(rng, places):
     first, count = 5, len(places)

@@ -8,6 +8,7 @@ import pytest
 
 from factors import se2
 from factors.camera import model as reprojection
+from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import camera_pose, predict
 
@@ -58,3 +59,25 @@ def test_whitened_residuals_are_those_of_the_model_with_its_noise(rng, inexact, 
     alone, (of_pose, of_tilt) = factor.whitened([pose])
     np.testing.assert_array_equal(alone, error)
     np.testing.assert_array_equal(np.concatenate((of_pose, of_tilt), axis=2), np.concatenate(blocks[::2], axis=2))
+
+
+def test_the_camera_of_a_robot_moves_as_the_robot_does(rng):
+    pose, step = rng.standard_normal(3), 1e-6
+    root = rng.standard_normal((3, 3))
+    position, rotation, covariance = pixel_kernels.placed(MODEL.position, MODEL.rotation, 0.0, pose, root @ root.T)
+    np.testing.assert_allclose(position, camera_pose(MODEL, pose)[0])
+    np.testing.assert_allclose(rotation, camera_pose(MODEL, pose)[1])
+    lift = np.empty((6, 3))
+    for i, moved in enumerate(step * np.eye(3)):
+        there, turned = camera_pose(MODEL, se2.compose(pose, se2.exp(moved)))
+        turn = (rotation.T @ turned - np.eye(3)) / step
+        lift[:3, i] = turn[2, 1], turn[0, 2], turn[1, 0]
+        lift[3:, i] = rotation.T @ (there - position) / step
+    np.testing.assert_allclose(covariance, lift @ root @ root.T @ lift.T, atol=1e-4)
+
+
+def test_pixels_of_uncertain_points_scatter_with_both(rng):
+    factor, pose = seen(rng, inexact=True)
+    _, _, by_point = reprojection.linearize_in_space(MODEL, *camera_pose(MODEL, pose), factor.points)
+    expected = MODEL.sigma**2 * np.eye(2) + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
+    np.testing.assert_allclose(pixel_kernels.pixel_noise(by_point, factor.point_covariances, MODEL.sigma), expected)

@@ -71,6 +71,16 @@ def test_information_and_expectation_are_those_of_drawn_reads() -> None:
     assert abs(squares.mean() - scores[0].variance[0]) < 5.0 * squares.std() / root
 
 
+def test_tables_of_grids_are_the_same_from_their_planes_as_cell_by_cell() -> None:
+    """They are made cell by cell for antennas with a pitch, here one of no consequence; at most a rounding may differ."""
+    planes, cells = (scene(MODELS["grid"], pitch=pitch)[0]._tables for pitch in (0.0, 1e-12))
+    np.testing.assert_array_equal(planes.level, cells.level)
+    off = np.abs(planes.rows.astype(int) - cells.rows)
+    assert len(np.unique(cells.rows)) > 500
+    assert off.max() <= 1
+    assert (off > 0).mean() < 1e-4
+
+
 @pytest.mark.parametrize("tempering", [0.3, 1.0])
 def test_what_is_left_out_of_many_tags_does_not_matter(tempering: float) -> None:
     """Looks at tags that cannot have been read, and reads from out of reach, of a dense map: tables are as wrong by their cells."""

@@ -16,6 +16,7 @@ from factors.landmarks.model import BearingRangeModel
 from factors.landmarks.model import predict as predict_landmarks
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
+from factors.rfid.index import moved
 from factors.rfid.model import Antenna, BeamModel, RfidModel
 from factors.update import update_state
 
@@ -141,6 +142,11 @@ def test_by_what_antennas_read_and_did_not_read(rng, iterations):
             np.testing.assert_allclose(
                 np.linalg.inv(found.covariance), information + there, rtol=0.1, atol=0.2 * information.max()
             )
+
+
+def test_offsets_of_looks_are_moved_as_poses_are(rng):
+    offset, offsets = rng.standard_normal(3), rng.standard_normal((4, 3))
+    np.testing.assert_allclose(moved(offset, offsets), se2.compose(offset, offsets), atol=1e-12)
 
 
 def seen(covariance, sigma, iterations=3):

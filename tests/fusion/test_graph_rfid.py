@@ -8,8 +8,9 @@ import numpy as np
 from by_hand import made
 
 from factorgraph_loc import IncrementOdometry, IncrementStream, Log, RfidScan, Tick
-from factorgraph_loc.evaluation.metrics import score
+from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.simulation import preset, simulate
 
 DURATION = 80.0
@@ -34,6 +35,19 @@ def test_landmarks_of_a_track_that_was_lost_are_forgotten() -> None:
     assert len(lost) == 1
     assert "since 20.0 s" in lost[0]
     assert score(result, log)["final.position_rmse"] < 0.15
+
+
+def test_a_robot_that_is_carried_far() -> None:
+    """The way that it is carried tells nothing of the odometry's constants, and these nothing of that way."""
+    hall = {"world": {"width": 60.0, "depth": 36.0, "tags": 180}, "drive": {"duration": 20.0}}
+    world = preset("warehouse", hall).model_copy(update={"world_seed": 1})
+    carried = join(cut(simulate(world, 10), 0.0, 12.0), cut(simulate(world, 11), 0.0, 14.0))
+    result = run(carried, RunConfig("smoother"))
+    ((found, what),) = result.diagnostics.events
+    assert what.startswith("lost")
+    causal = errors(result.causal(), carried.reference)
+    assert np.nanmax(causal.position[causal.t > found]) < 0.6
+    assert np.nanmax(errors(result.final, carried.reference).position) < 0.5
 
 
 def test_belief_while_it_seeks_has_particles_that_move_with_the_odometry() -> None:

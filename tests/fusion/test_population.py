@@ -8,6 +8,7 @@ import pytest
 from factorgraph_loc import Rig, VelocityOdometry
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.population import CHUNK, PARTICLE, Population
+from factorgraph_loc.fusion.tracking import laplace_evidence
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
@@ -16,6 +17,7 @@ from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor
+from factors.update import Correction
 
 NOISE = OdometryNoise(
     along=GrowthSettings(per_distance=0.01),
@@ -181,6 +183,16 @@ def test_number_of_particles_follows_the_places_left():
     assert len(kld.prefix(narrow, rng, 5000)) == 5000
     # Fox (2003), eq. 7 at k = 101, epsilon 0.05: chi-square quantile 135.8 of 100 degrees of freedom over 0.1
     assert kld.enough(np.array(101)) == pytest.approx(1358.0, rel=2e-3)
+
+
+def test_an_evidence_of_zero_is_an_evidence():
+    class Unasked:
+        def log_likelihood(self, poses, values):
+            raise AssertionError("the correction has it")
+
+    spread = np.eye(3)
+    known = Correction(np.ones(3), spread, np.empty((0, 1)), 1.0, 1, evidence=0.0)
+    assert laplace_evidence(Unasked(), np.zeros(3), spread, known) == 0.0
 
 
 def test_slices_of_any_size_tell_the_same():

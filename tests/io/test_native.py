@@ -312,6 +312,12 @@ def test_a_write_that_fails_leaves_nothing(native, one, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["hall"]
 
 
+def test_the_name_of_a_log_is_no_path(native, one, tmp_path):
+    write_native(dataclasses.replace(one(native), name="../up"), tmp_path / "out")
+    assert one(tmp_path / "out").name == "../up"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["hall", "out"]
+
+
 def test_the_example_of_the_documentation(tmp_path, one, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "log-format.md").read_text()
     blocks = re.findall(r"^`([a-z_.]+)`:\n\n```[a-z]+\n(.*?)```", page, re.DOTALL | re.MULTILINE)

@@ -46,6 +46,20 @@ def test_rounds_from_gaps(hall, one):
     assert log.warnings == ()
 
 
+@pytest.mark.parametrize(
+    ("header", "row", "rssi"), [("t_ns,antenna,epc", "", np.nan), ("epc,antenna,t_ns,rssi", ",-60", -60.0)]
+)
+def test_readers_that_tell_less(hall, one, header, row, rssi):
+    """Without strength or phase, and with the columns in another order."""
+    first = ("1100000000", "left", "E1") if header.startswith("t_ns") else ("E1", "left", "1100000000")
+    (hall / "rfid.csv").write_text(f"{header}\n{','.join(first)}{row}\n")
+    reads = one(hall).streams["rfid"]
+    assert (reads.antenna, reads.epc) == (["left"], ["E1"])
+    np.testing.assert_array_equal(reads.rssi, (rssi,))
+    assert np.isnan(reads.phase).all()
+    assert np.isnan(reads.frequency).all()
+
+
 def test_the_gap_is_the_rigs(hall, one):
     rig = "[rig.rfid]\nround_gap = 0.1\nantennas.left = {}\nantennas.right = {}\n"
     (hall / "run.toml").write_text(rig)

@@ -16,6 +16,7 @@ from factorgraph_loc import (
     IncrementOdometry,
     InputError,
     RfidRead,
+    Rig,
     RunFailedError,
     VelocityOdometry,
     YawRate,
@@ -236,6 +237,18 @@ def test_offsets_of_the_clocks_are_added(log):
         localizer.push(replace(seen, t=t))
     assert shifted.estimate().t == pytest.approx(2.0)
     assert shifted.estimate().pose == pytest.approx(plain.estimate().pose)
+
+
+@pytest.mark.parametrize("name", ["dead_reckoning", "ekf", "smoother"])
+@pytest.mark.parametrize("pulled", [False, True])
+def test_increments_of_one_stamp_follow_one_another(log, name, pulled):
+    localizer = fgloc.Localizer(Rig(), log.world, name)
+    localizer.initialize((0.0, 0.0, 0.0), t=0.0)
+    for t, dx in ((0.0, 0.0), (1.0, 1.0), (1.0, 1.0), (2.0, 1.0)):
+        localizer.push(IncrementOdometry(t, dx, 0.0, 0.0))
+        if pulled:
+            localizer.estimate()
+    assert localizer.estimate().pose == pytest.approx((3.0, 0.0, 0.0))
 
 
 def test_an_estimator_that_fails_stays_lost_until_it_begins_anew(log, monkeypatch):

@@ -39,6 +39,23 @@ def test_clocks_that_go_back_or_are_others_are_refused(log):
     assert localizer.estimate().t == 5.1
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"pose": (1.0, 2.0)}, r"pose is \[1.0, 2.0\], expected finite x, y \[m\] and heading"),
+        (
+            {"pose": (0, 0, 0), "covariance": np.diag((1.0, 0.0, 1.0))},
+            r"expected \(3, 3\), symmetric and positive definite",
+        ),
+        ({}, "ekf cannot start from an unknown pose with this rig and map, expected a pose"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(log, given, message):
+    localizer = fgloc.Localizer(log.rig, log.world, "ekf")
+    with pytest.raises(InputError, match=message):
+        localizer.initialize(**given)
+
+
 def test_reads_of_an_antenna_that_did_not_listen_are_refused(log):
     localizer = started(log)
     with pytest.raises(InputError, match="antenna is 'left', expected one of the active antennas: front, back"):

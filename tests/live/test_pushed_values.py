@@ -14,6 +14,7 @@ import factorgraph_loc as fgloc
 from factorgraph_loc import (
     BearingRange,
     CameraFrame,
+    CameraImage,
     IncrementOdometry,
     InputError,
     Localizer,
@@ -156,6 +157,14 @@ def test_a_localizer_is_made_or_refused_in_one_line():
         for value in ABSURD:
             options = {"rig": Rig(), argument: value, "estimator": "ekf"}
             outcome(lambda options=options: Localizer(**options))
+
+
+def test_times_of_estimates_and_images():
+    localizer = Localizer(Rig(), estimator="ekf")
+    localizer.initialize((0.0, 0.0, 0.0))
+    for value in ABSURD:
+        outcome(lambda value=value: localizer.estimate(value))
+        outcome(lambda value=value: localizer.push(CameraImage(value, np.zeros((4, 4), np.uint8))))
 
 
 def test_descriptors_of_another_length_are_refused():

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from factorgraph_loc import InputError, Log, Tag, World
 from factorgraph_loc.mapping.tag_mapping import map_tags
-from factorgraph_loc.mapping.tag_search import search
+from factorgraph_loc.mapping.tag_search import merged, search
 from factorgraph_loc.mapping.tag_slam import INTERVAL, _keyframes
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
@@ -184,6 +184,18 @@ def test_a_few_false_reads_are_no_tag():
     (found,) = search(model, looks, np.ones(1), np.full(1, np.nan))
     assert found.reads == 2
     assert not found.is_explained
+
+
+def test_merged_looks_count_the_same():
+    model = RfidModel(SIDEWAYS, (BeamModel(),))
+    tags = TagArray(np.array([(4.0, 1.5, 1.0), (2.0, -2.0, 1.0)]), np.full(2, np.nan))
+    looks = drawn(model, tags, straight(), [0, 1], np.random.default_rng(5))
+    fewer = merged(looks, 0.25, 0.1)
+    assert len(fewer.rounds) < len(looks.rounds) / 2
+    assert fewer.rounds.sum() == looks.rounds.sum()
+    for antenna in (0, 1):
+        before, after = looks.hits[looks.antennas == antenna], fewer.hits[fewer.antennas == antenna]
+        np.testing.assert_array_equal(before.sum(axis=0), after.sum(axis=0))
 
 
 def test_tags_that_were_never_read_are_listed_and_kept(room):

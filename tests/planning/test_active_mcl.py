@@ -109,6 +109,12 @@ def test_a_corridor_tells_the_heading_and_leaves_both_its_directions():
     assert 0.1 < weights[up].sum() / (weights[up].sum() + weights[down].sum()) < 0.9
 
 
+def test_what_is_seen_before_the_first_scan_is_left():
+    estimator, robot, _ = made()
+    estimator.see(robot.proximity, robot.read_proximity())
+    assert estimator.belief().particles is None
+
+
 def test_particles_that_have_lost_the_robot_find_it_again_where_tags_are_read():
     """All particles but those that are drawn anywhere are at the other end of the building."""
     estimator, robot, space = made()

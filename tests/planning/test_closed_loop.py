@@ -8,6 +8,7 @@ import pytest
 
 from factorgraph_loc import InputError, World
 from factorgraph_loc.maps.free_space import distance_to_walls
+from factorgraph_loc.model.belief import Belief, Mode
 from factorgraph_loc.planning import closed_loop
 from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -42,6 +43,12 @@ def test_a_corner_between_two_poses_of_a_way_is_seen() -> None:
     """A patrol that begins beside a corner does not try to go through it for ever."""
     run = run_active(preset("symmetric"), "patrol", "active_mcl", 1110, ActiveSettings(max_metres=40.0, particles=200))
     assert run.localized or run.metres > 39.0
+
+
+def test_runs_of_one_seed_share_world_and_start() -> None:
+    one, other = office(), office("patrol")
+    assert one.world == other.world
+    assert np.array_equal(one.truth.poses[0], other.truth.poses[0])
 
 
 def test_the_robot_never_comes_near_walls() -> None:
@@ -97,6 +104,15 @@ def test_a_start_in_a_wall_is_an_error(start: tuple[float, float, float], messag
         run_active(simulation, "random", "active_mcl", 1, settings)
 
 
+@pytest.mark.parametrize(
+    ("policy", "estimator", "message"),
+    [("informaton", "active_mcl", "did you mean information"), ("random", "ekf", "no estimator of active runs")],
+)
+def test_wrong_names(policy: str, estimator: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        run_active(preset("office"), policy, estimator, 1)
+
+
 def test_two_places_that_look_alike_are_told_apart() -> None:
     """Beside the tag in the middle of the corridors the robot may be at two places, turned by half. It has to go where the arms
     differ to find out, and to say nothing before. Four runs in a hundred claim a wrong place (8 of seeds 1 to 200), so two of
@@ -111,3 +127,29 @@ def test_two_places_that_look_alike_are_told_apart() -> None:
         turned = se2.compose(np.array((30.0, 24.0, math.pi)), early.truth)
         for place in (early.truth, turned):
             assert np.mean(np.hypot(*(early.particles - place)[:, :2].T) < 2.0) > 0.1
+
+
+def test_modes_that_are_next_to_each_other_are_one_place() -> None:
+    covariance = np.diag((0.04, 0.04, 0.01))
+    at = {"here": (5.0, 5.0, 0.0), "beside": (6.5, 5.0, 0.3), "turned": (5.0, 5.0, 3.0), "rare": (20.0, 5.0, 0.0)}
+    weights = (0.5, 0.3, 0.17, 0.03)
+    modes = tuple(Mode(w, np.array(pose), covariance) for w, pose in zip(weights, at.values(), strict=True))
+    places = closed_loop._places(Belief(modes))
+    assert [place.weight for place in places] == [0.8, 0.17]
+    assert [tuple(place.pose) for place in places] == [at["here"], at["turned"]]
+
+
+def test_the_belief_is_of_where_the_robot_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports of odometry come five times as often as scans: what is known by them is in the belief that the policy sees."""
+    seen = []
+    choose = closed_loop._ClosedLoop._choose
+
+    def watched(loop):
+        out = choose(loop)
+        seen.append((loop._estimator.estimate().t, loop._robot.t))
+        return out
+
+    monkeypatch.setattr(closed_loop._ClosedLoop, "_choose", watched)
+    run_active(preset("symmetric"), "information", "active_mcl", 3, ActiveSettings(max_metres=3.0, particles=200))
+    assert len(seen) > 3
+    assert all(known == now for known, now in seen)

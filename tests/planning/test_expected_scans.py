@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from factorgraph_loc.planning import particle_kernels
 from factorgraph_loc.sensors.rfid import forecast as expected_scans
+from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray
 from factors.rfid.model import Antenna, BeamModel, LogisticModel, RfidModel, bake
 
@@ -75,3 +77,84 @@ def test_who_is_stopped_scans_no_more():
     np.testing.assert_array_equal(one[:, 0], weighed(found, poses[:1], (4,), (1, 1), 2, range(5))[:, 0])
     assert not np.allclose(one[:, 0], two[:, 0])
     np.testing.assert_array_equal(one[:, 1], two[:, 1])
+
+
+def test_draws_are_uniform_and_rounds_binomial():
+    """Kolmogorov's bound at a false-alarm rate of 10^-6."""
+    u = np.sort([expected_scans._uniform(np.uint64(7), n) for n in range(20_000)])
+    assert abs(u - (np.arange(20_000) + 0.5) / 20_000).max() < 2.7 / math.sqrt(20_000)
+    n, q = 6, 0.3
+    found = [expected_scans._binomial(n, q, x) for x in u.tolist()]
+    counts = np.bincount([k for k, _ in found], minlength=n + 1) / len(u)
+    expected = [math.comb(n, k) * q**k * (1.0 - q) ** (n - k) for k in range(n + 1)]
+    np.testing.assert_allclose(counts, expected, atol=0.005)
+    # what is left of a draw is uniform once more, whatever it gave
+    for k in range(4):
+        left = np.sort([rest for got, rest in found if got == k])
+        even = (np.arange(len(left)) + 0.5) / len(left)
+        assert abs(left - even).max() < 2.7 / math.sqrt(len(left))
+
+
+def stations(noise=0.0, seed=0):
+    along = se2.exp(np.column_stack((0.25 * np.arange(21), np.zeros(21), 0.1 * np.arange(21))))
+    steps = np.array((0, 3, 9, 15, 20))
+    rng = np.random.default_rng(seed)
+    particles = np.column_stack((rng.normal(size=(4000, 2)), rng.uniform(-3.0, 3.0, 4000)))
+    sigmas = noise * np.array(((0.0, 0.0, 0.0), *[(0.02, 0.01, 0.03)] * 4))
+    return along, steps, particles, sigmas, rng.standard_normal((5, 4000, 3))
+
+
+def test_particles_follow_the_path_until_they_are_stopped():
+    along, steps, particles, sigmas, normals = stations()
+    last = np.arange(4000) % 25
+    out = np.empty((5, 4000, 3))
+    particle_kernels.look_poses(particles, along, steps, last, sigmas, normals, out)
+    for k, step in enumerate(steps.tolist()):
+        expected = se2.compose(particles, along[np.minimum(step, last)])
+        np.testing.assert_allclose(out[k, :, :2], expected[:, :2], atol=1e-9)
+        np.testing.assert_allclose(se2.wrap(out[k, :, 2] - expected[:, 2]), 0.0, atol=1e-9)
+
+
+def test_noise_on_the_way_adds_up_as_small_motions_do():
+    """Against exact composition, draw by draw, and the standard deviations of 4000 draws to 6 % (5 of their own)."""
+    along, steps, particles, sigmas, normals = stations(noise=1.0)
+    out = np.empty((5, 4000, 3))
+    particle_kernels.look_poses(particles, along, steps, np.full(4000, 99), sigmas, normals, out)
+    exact = particles
+    for k in range(1, 5):
+        exact = se2.compose(exact, se2.between(along[steps[k - 1]], along[steps[k]]))
+        exact = se2.compose(exact, se2.exp(sigmas[k] * normals[k]))
+        error = se2.between(exact, out[k])
+        assert abs(error).max() < 0.03  # second order in the noise
+    spread = se2.log(se2.between(se2.compose(particles, along[-1]), out[-1])).std(axis=0)
+    assert spread[2] == pytest.approx(0.06, rel=0.06)
+    assert spread[1] > 0.06
+
+
+def test_covariances_are_those_of_weighted_particles():
+    rng = np.random.default_rng(0)
+    poses = rng.normal((0.0, 5.0, 3.1), (1.0, 2.0, 0.3), (2, 300, 3))  # headings about the seam
+    wrapped = poses.copy()
+    wrapped[..., 2] = se2.wrap(poses[..., 2])
+    weights = rng.random((4, 300)).astype(np.float32)
+    index = np.array((0, 1, 1, 0))
+    out = np.empty((4, 3, 3))
+    particle_kernels.covariances(wrapped, index, weights, out)
+    for n, k in enumerate(index):
+        np.testing.assert_allclose(out[n], np.cov(poses[k].T, aweights=weights[n], ddof=0), rtol=1e-4, atol=1e-5)
+
+
+def test_histograms_count_particles_in_cells():
+    rng = np.random.default_rng(0)
+    poses = rng.uniform((-2.0, -2.0, -9.0), (2.0, 2.0, 9.0), (2, 500, 3))
+    weights = rng.random((3, 500)).astype(np.float32)
+    index, cell = np.array((1, 0, 1)), np.array((0.5, 0.8, 2.0 * math.pi / 6.0))
+    for dims in (1, 2, 3):
+        out = np.empty(3)
+        particle_kernels.cell_entropies(poses, index, weights, cell, dims, out)
+        for n, k in enumerate(index):
+            at = poses[k].copy()
+            at[:, 2] %= 2.0 * math.pi
+            _, which = np.unique(np.floor(at / cell)[:, :dims], axis=0, return_inverse=True)
+            p = np.bincount(which.ravel(), weights[n]) / weights[n].sum()
+            assert out[n] == pytest.approx(-np.sum(p * np.log(p)) + np.log(cell[:dims]).sum(), abs=1e-5)

@@ -89,6 +89,17 @@ def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow(dims):
     assert np.ptp(closed) > 0.3
 
 
+def test_the_gain_is_the_fall_of_entropy():
+    sensors = Sensors.of(tagged((4.8, 3.0), (-1.5, 5.5)), RIG)
+    (gain,) = fisher_gain(MEAN, COVARIANCE, [STRAIGHT], sensors)
+    after = expected_covariance(MEAN, COVARIANCE, STRAIGHT, sensors)
+    # of what is not finer than counts
+    fine = np.diag(FINEST**2)
+    before, left = (gaussian_entropy(covariance + fine, ("x", "y")) for covariance in (COVARIANCE, after))
+    assert gain == pytest.approx(before - left)
+    assert fisher_gain(MEAN, COVARIANCE, [], sensors).shape == (0,)
+
+
 def test_only_sensors_that_find_something_are_taken():
     nothing = Sensors.of(World(), RIG)
     assert nothing.forecasts == ()

@@ -42,6 +42,14 @@ def test_two_drives_through_one_world_see_the_same_building(made):
     assert elsewhere.renderer.scene.texels.tobytes() != made.renderer.scene.texels.tobytes()
 
 
+def test_brightness_wanders(made):
+    """By as much as three waves of the drift's size can."""
+    gains = [made._gain(t) for t in np.linspace(0.0, 300.0, 400)]
+    assert 1.1 < max(gains) < np.exp(0.3)
+    assert np.exp(-0.3) < min(gains) < 0.9
+    assert np.abs(np.diff(gains)).max() < 0.15
+
+
 def sift(image):
     keypoints, descriptors = cv2.SIFT_create(400).detectAndCompute(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), None)
     return np.array([k.pt for k in keypoints]).reshape(-1, 2), descriptors

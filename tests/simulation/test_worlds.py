@@ -1,5 +1,7 @@
 """Worlds: as many tags as asked for, on the surfaces asked for, and nothing within a wall."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,9 @@ def test_tags_are_spread_wider_than_at_random():
         distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1)) + 1e9 * np.eye(40)
         gaps.append(np.median(distance.min(axis=1)))
     assert min(gaps) > 1.5
+
+
+def test_landmarks_are_in_the_map():
+    made = world(landmarks=7)
+    assert len(made.landmarks) == 7
+    assert all(math.isfinite(m.x) for m in made.landmarks.values())

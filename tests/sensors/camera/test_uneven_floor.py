@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
+from factorgraph_loc.sensors.camera.known_points import lifted
 from factors.camera import model as reprojection
 from factors.camera.factor import ReprojectionFactor
 
@@ -53,6 +54,20 @@ def test_roll_and_pitch_are_found_with_the_points_of_an_image():
     # some 30 points tell an angle to 1 px / 500 px / sqrt(30) or twice that: five of these
     np.testing.assert_allclose(model.tilt * tilt, (0.02, -0.015), atol=0.004)
     assert np.sqrt(np.mean(error**2)) < 1.5  # px, of 1 and of what the prior of the tilt leaves; of 12 px without it
+
+
+def test_the_camera_moves_with_a_robot_that_tilts():
+    model, pose = CAMERA.model(), np.array((1.0, 2.0, 0.7))
+    position, rotation = standing(pose, 0.0, 0.0)
+    columns = []
+    for tilts in ((model.tilt, 0.0), (0.0, model.tilt)):
+        there, turned = standing(pose, *tilts)
+        turn = Rotation.from_matrix(rotation.T @ turned).as_rotvec()
+        columns.append(np.concatenate((turn, rotation.T @ (there - position))))
+
+    np.testing.assert_allclose(
+        lifted(model, pose, np.zeros((3, 3))).covariance, np.transpose(columns) @ columns, atol=2e-6
+    )
 
 
 def test_covariances_hold_where_the_points_are_estimated_too():

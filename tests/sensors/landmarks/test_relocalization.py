@@ -65,6 +65,14 @@ def test_late_and_repeated_sightings_change_nothing(log):
     assert once.relocalizer.best.t == again.relocalizer.best.t
 
 
+def test_nothing_is_left_to_search(log):
+    relocalizer = Seeker(log).stamps(12)
+    assert relocalizer.best is not None
+    relocalizer.forget(np.inf)
+    relocalizer.search()
+    assert (relocalizer.best, relocalizer.hypotheses) == (None, ())
+
+
 def test_a_wrong_track_is_suspected_and_refuted_and_a_right_one_is_not(log):
     seeker, covariance = Seeker(log, 10.0), np.diag((0.05, 0.05, 0.02)) ** 2
     right, wrong = TrackMonitor(), TrackMonitor()

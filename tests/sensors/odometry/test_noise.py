@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from factorgraph_loc.sensors.motion import integrated
 from factorgraph_loc.sensors.odometry.calibrator import cut, fit_noise
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
+from factors.odometry.chain import OdometryChain
 from factors.odometry.model import OdometryModel
 
 
@@ -28,6 +30,18 @@ def test_noise_is_that_of_the_robot(simulate):
 def test_odometry_that_is_the_reference_has_the_noise_of_the_best_wheels(simulate):
     fits = fit_noise([simulate(along=0.0, heading=0.0)], OdometryModel())
     assert fits.floored == ("along", "lateral", "heading")
+
+
+def test_a_log_at_once_is_what_its_rows_give_one_by_one(simulate):
+    log = simulate(seconds=60.0)
+    model = OdometryModel(scale_distance=0.9, delay=0.07, lag=0.2)
+    chain = OdometryChain(model, horizon=np.inf)
+    odometry = log.streams["odometry"]
+    for row in zip(odometry.t.tolist(), odometry.v.tolist(), odometry.w.tolist(), strict=True):
+        chain.add_velocity(*row)
+    times = np.linspace(-1.0, 61.0, 200)
+    rows = [(s.t, s.x, s.y, s.heading, s.path, s.turn, s.unknown, s.still) for s in map(chain.state, times.tolist())]
+    np.testing.assert_allclose(integrated(log, model).states(times), rows, atol=1e-9)
 
 
 def test_no_window_spans_a_gap_of_the_odometry(simulate):

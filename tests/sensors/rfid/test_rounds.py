@@ -19,6 +19,11 @@ def test_a_gap_and_another_antenna_begin_a_round():
     assert ends_of(t_ns, number, 0.05).tolist() == [110_000_000, 112_000_000, 163_000_000]
 
 
+def test_no_reads():
+    number = rounds_from_gaps(ns(), [], 0.05)
+    assert (len(number), len(ends_of(ns(), number, 0.05))) == (0, 0)
+
+
 def test_reads_of_inventories():
     ends, antennas, durations = ns(100, 100, 200, 150), list("abab"), ns(50, 100, 100, 10)
     reads = [(50, "a"), (49, "a"), (100, "a"), (100, "b"), (150, "b"), (101, "a"), (139, "b"), (201, "a"), (60, "c")]
