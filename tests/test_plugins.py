@@ -114,9 +114,9 @@ def test_all_that_ours_name_is_there(name):
     assert sensor.name == name
     for channel in sensor.channels:
         assert channel.section in (*sensor.settings, "")
-        for place in channel.streams:
-            assert callable(load(place).measurements)
-            measurement = load(place).kind
+        for stream in channel.streams:
+            assert callable(stream.measurements)
+            measurement = stream.kind
             assert isinstance(measurement.sensor, property) or measurement.sensor == channel.name
             assert isinstance(measurement.is_motion, bool)
     for section in (*sensor.settings.values(), *sensor.layers.values()):

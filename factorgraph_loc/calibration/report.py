@@ -122,8 +122,8 @@ def page(calibration: Calibration) -> str:
         content["Accuracy"] = [explained, accuracy_table(calibration)]
     for name, sensor in calibration.knowledge.sensors.items():
         parts = [*_tables(sensor.figures), *calibrators()[name].pictures(sensor)]
-        if residuals := calibrators()[name].residuals(sensor):
-            parts.append(_residuals_figure(residuals))
+        if sensor.residuals:
+            parts.append(_residuals_figure(sensor.residuals))
         if parts:
             content[name.capitalize()] = parts
     lead = f"From {', '.join(calibration.logs)}."

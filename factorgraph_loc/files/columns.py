@@ -6,9 +6,8 @@ Readers and :class:`~factorgraph_loc.live.localizer.Localizer` reject them.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -21,9 +20,7 @@ from factorgraph_loc.files.models import FARTHEST
 from factorgraph_loc.files.settings import bound_text
 from factorgraph_loc.plugins import Place
 from factorgraph_loc.text import quoted
-from factors.se2 import Array
-
-Integers = NDArray[np.int64]
+from factors.se2 import Array, Integers
 
 LENGTH = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 SPEED = {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "km/h": 1.0 / 3.6, "ft/s": 0.3048}
@@ -137,27 +134,31 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a sensor. ``rows_of_one_stamp``: whether these form one measurement, or one each.
+    """A table of a sensor. ``stream``: class of the stream that it describes, "" for none.
 
-    ``stream``: class of the stream, whose fields are the columns; "" if a function creates it. ``optional``: groups of optional
-    columns; the first available group is used. ``("rssi",), ()``: rssi or none.
+    ``is_scan``: whether rows of one timestamp form one measurement. ``optional``: groups of columns that a file may lack, each
+    group as a whole.
     """
 
     name: str
     columns: tuple[Column, ...]
-    rows_of_one_stamp: Literal["one measurement", "one each"]
     stream: Place = ""
-    optional: tuple[tuple[tuple[str, ...], ...], ...] = ()
+    is_scan: bool = False
+    optional: tuple[tuple[str, ...], ...] = ()
 
     def __getitem__(self, name: str) -> Column:
         return next(column for column in self.columns if column.name == name)
 
     @property
-    def shapes(self) -> tuple[tuple[str, ...], ...]:
-        """The possible sets of column names of a file, largest first."""
-        left_out = {name for choices in self.optional for choice in choices for name in choice}
-        always = tuple(column.name for column in self.columns if column.name not in left_out)
-        return tuple((*always, *(n for c in choices for n in c)) for choices in itertools.product(*self.optional))
+    def header(self) -> str:
+        """The columns of a file, with optional groups in brackets: ``epc,x,y[,sigma]``."""
+        optional = [f"[,{','.join(group)}]" for group in self.optional]
+        return ",".join(column.name for column in self.in_file(())) + "".join(optional)
+
+    def in_file(self, header: Collection[str]) -> tuple[Column, ...]:
+        """The columns that a file with this ``header`` must have: all except the optional groups of which it has no column."""
+        omitted = {name for group in self.optional if not set(group) & set(header) for name in group}
+        return tuple(column for column in self.columns if column.name not in omitted)
 
 
 def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
@@ -215,7 +216,6 @@ POSES = Table(
         *(within(name, PURE, 1e3, "of a quaternion, whose length must be 1") for name in ("qx", "qy", "qz", "qw")),
         within("heading", ANGLE, 1e5, "direction of the robot's x axis, or accumulated rotation"),
     ),
-    "one each",
 )
 POINTS = Table(
     "points",
@@ -231,5 +231,4 @@ POINTS = Table(
             )
         ),
     ),
-    "one each",
 )

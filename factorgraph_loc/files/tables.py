@@ -27,7 +27,6 @@ SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
 ISO = "iso"
 MOST_DIGITS = 20  # of a timestamp before its decimal point
 NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
-Shape = tuple[str, ...]  # the names of columns
 KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.String, "file": pl.String}
 T = TypeVar("T")
 
@@ -184,33 +183,37 @@ def rows_of_length(
     return np.array(numbers, dtype=np.int64), columns
 
 
-def read_cells(path: Path, shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
-    """The cells of a CSV, and the first of ``shapes`` whose columns it has. InputError names file and row of invalid content."""
+def read_cells(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column, ...]]:
+    """The cells of a CSV, and the columns of the one of ``tables`` that it has. InputError names file and row of invalid
+    content."""
     lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
     parsed = csv_rows(path, lines)
     header = [name.strip() for name in next(parsed, (1, []))[1]]
     if not any(header):
-        raise InputError(f"{path}: is empty, expected a header {' or '.join(','.join(s) for s in shapes)}")
-    shape = shape_of(path, header, shapes)
+        raise InputError(f"{path}: is empty, expected a header {' or '.join(table.header for table in tables)}")
+    columns = columns_in(path, header, tables)
     filled = ((row, parts) for row, parts in parsed if len(parts) > 1 or "".join(parts).strip())
-    rows, columns = rows_of_length(path, header, filled)
-    return Cells(path, rows, columns, left_out=tuple(name for name in header if name not in shape)), shape
+    rows, cells = rows_of_length(path, header, filled)
+    return Cells(path, rows, cells, left_out=_others(header, columns)), columns
 
 
-def shape_of(path: Path, header: Sequence[str], shapes: Sequence[Shape]) -> Shape:
-    """The one of ``shapes`` with most columns in ``header``, the first one if several have all.
-
-    InputError if a column is missing: the best match is what was intended, even if a smaller shape is complete.
-    """
+def columns_in(path: Path, header: Sequence[str], tables: Sequence[Table]) -> tuple[Column, ...]:
+    """The columns in ``header`` of the one of ``tables`` with most of them. InputError if one is missing."""
     if len(set(header)) < len(header):
         raise bad_field(path, "header", ",".join(header), "each column once", row=1)
-    meant = max(shapes, key=lambda shape: (len(set(shape) & set(header)), set(shape) <= set(header)))
-    if set(meant) <= set(header):
-        return meant
-    missing = next(column for column in meant if column not in header)
-    hint = nearest(missing, [column for column in header if column not in meant])
-    expected = " or ".join(",".join(shape) for shape in shapes)
+    columns = max((table.in_file(header) for table in tables), key=lambda found: sum(c.name in header for c in found))
+    missing = next((column.name for column in columns if column.name not in header), None)
+    if missing is None:
+        return columns
+    hint = nearest(missing, list(_others(header, columns)))
+    expected = " or ".join(table.header for table in tables)
     raise InputError(f"{path}:1: column {missing} is missing{hint if 'mean' in hint else ''}, expected {expected}")
+
+
+def _others(header: Sequence[str], columns: Sequence[Column]) -> tuple[str, ...]:
+    """The names in ``header`` of none of the ``columns``."""
+    known = {column.name for column in columns}
+    return tuple(name for name in header if name not in known)
 
 
 def rows_by_name(
@@ -304,26 +307,21 @@ def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
 
     InputError names file, row and field of a value that is missing, is not a number, or is out of bounds.
     """
-    shapes = [shape for table in tables for shape in table.shapes]
-    columns = {column.name: column for table in tables for column in table.columns}
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
-        if path.suffix == ".parquet":
-            cells, shape = _cells_of_parquet(path, columns, shapes)
-        else:
-            cells, shape = read_cells(path, shapes)
-        return TableRows.of(cells, (columns[name] for name in shape), cells.nanoseconds())
+        cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables)
+        return TableRows.of(cells, columns, cells.nanoseconds())
 
 
-def _cells_of_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequence[Shape]) -> tuple[Cells, Shape]:
-    """The cells of a Parquet file, and the one of ``shapes`` whose columns it has."""
+def _cells_of_parquet(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column, ...]]:
+    """The cells of a Parquet file, and the columns of the one of ``tables`` that it has."""
     frame = read_parquet(path)
-    shape = shape_of(path, frame.columns, shapes)
+    columns = columns_in(path, frame.columns, tables)
     cells: dict[str, Any] = {}
-    for name in shape:
-        kind = frame[name].dtype
-        if columns[name].kind in NAMES:
+    for column in columns:
+        name, kind = column.name, frame[column.name].dtype
+        if column.kind in NAMES:
             cells[name] = text_column(frame, name, path)
-        elif columns[name].kind in NUMBERS:
+        elif column.kind in NUMBERS:
             if not kind.is_numeric() and kind != pl.Null:
                 raise InputError(f"{path}: {name} is of type {kind}, expected numbers")
             cells[name] = frame[name].cast(pl.Float64).to_numpy().copy()
@@ -332,7 +330,7 @@ def _cells_of_parquet(path: Path, columns: Mapping[str, Column], shapes: Sequenc
         else:
             cells[name] = frame[name].to_list()
     rows = np.arange(1, frame.height + 1, dtype=np.int64)
-    return Cells(path, rows, cells, left_out=tuple(name for name in frame.columns if name not in shape)), shape
+    return Cells(path, rows, cells, left_out=_others(frame.columns, columns)), columns
 
 
 def write_parquet(frame: pl.DataFrame, path: Path) -> None:

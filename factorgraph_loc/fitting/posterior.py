@@ -14,10 +14,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.least_squares import minimum
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 LOSS_SCALE = 2.0  # standard deviations at which the loss changes from quadratic to linear
 MAD_TO_SIGMA = 1.4826  # of a Gaussian
@@ -26,8 +25,6 @@ STEP = 1e-4  # of numerical derivatives, in the same
 LEAST_SHARE = 1e-3
 DETERMINED = 0.7  # of the prior's standard deviation; above it the logs hardly determine a parameter
 CORRELATED = 0.8  # correlation of two parameters that is reported
-
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

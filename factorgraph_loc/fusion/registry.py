@@ -70,8 +70,7 @@ def describe(name: str) -> Description:
 def _takes(kind: type[Any], channel: Channel) -> bool:
     modalities = getattr(kind, "modalities", EVERY)
     streams = channels()[parent_of(channel.name) or channel.name].streams
-    measured = [load(place).kind for place in streams]
-    return any(k.is_motion or k.modality in modalities for k in measured)
+    return any(stream.kind.is_motion or stream.kind.modality in modalities for stream in streams)
 
 
 def check_names(names: Sequence[str]) -> None:

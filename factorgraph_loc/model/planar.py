@@ -5,14 +5,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+import scipy
 from pydantic import AfterValidator, Field
 
 from factorgraph_loc.errors import InputError, require
 from factorgraph_loc.files.models import FileModel, InUnit
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
-Integers = NDArray[np.int64]
 RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a warning and for an error
 TILT = math.radians(10.0)  # of the robot's z axis against the world's: limit for a warning
 NEGLIGIBLE = 1e-9  # of an axis
@@ -54,14 +53,8 @@ class Mounting(FileModel):
 
     def rotation(self) -> Array:
         """The rotation matrix (3, 3) from the sensor frame to the robot frame."""
-        (cr, cp, cy), (sr, sp, sy) = (f((self.roll, self.pitch, self.yaw)) for f in (np.cos, np.sin))
-        return np.array(
-            [
-                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                [-sp, cp * sr, cp * cr],
-            ]
-        )
+        turn = scipy.spatial.transform.Rotation.from_euler("xyz", (self.roll, self.pitch, self.yaw))
+        return np.asarray(turn.as_matrix())
 
 
 class Turned(FileModel):
@@ -90,22 +83,13 @@ AS_IT_IS = Turned()
 
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
     """Rotations (N, 3, 3) of quaternions (N, 4), (x, y, z, w); InputError if one is not a unit quaternion."""
-    require_unit(source, rows, quaternions)
-    x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    matrix = [
-        [w * w + x * x - y * y - z * z, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-        [2.0 * (x * y + z * w), w * w - x * x + y * y - z * z, 2.0 * (y * z - x * w)],
-        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), w * w - x * x - y * y + z * z],
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.array(matrix), 2, 0))
-
-
-def require_unit(source: object, rows: Integers, quaternions: Array) -> None:
-    """InputError if one of the quaternions (N, 4) is not a unit quaternion."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     valid = np.abs(length - 1.0) <= UNIT
     require(valid, source, rows, "length of the quaternion", length, "1, a unit quaternion")
+    if not len(quaternions):  # older versions of scipy refuse none
+        return np.empty((0, 3, 3))
+    return np.asarray(scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix())
 
 
 def on_floor(

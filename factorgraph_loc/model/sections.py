@@ -3,10 +3,10 @@
 Classes and functions are given as places, ``package.module:name``, and loaded when they are first used.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Protocol
+from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.plugins import SENSORS, Place
@@ -38,28 +38,11 @@ class Layer:
     suffix: str = ""
 
 
-class _Channel(Protocol):
-    @property
-    def name(self) -> str: ...
-    @property
-    def section(self) -> str: ...
-
-
-class HasSections(Protocol):
-    """The part of a registered sensor that is used here."""
-
-    @property
-    def channels(self) -> Sequence[_Channel]: ...
-    @property
-    def settings(self) -> Mapping[str, Section]: ...
-    @property
-    def layers(self) -> Mapping[str, Layer]: ...
-
-
 @cache
-def registered() -> Mapping[str, HasSections]:
-    """The registered sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
-    known: dict[str, HasSections] = dict(SENSORS)
+def registered() -> Mapping[str, Any]:
+    """The registered sensors by name, each a :class:`~factorgraph_loc.sensors.registry.SensorType`, built-in ones first.
+    InputError if one cannot be loaded or two share a name."""
+    known = dict(SENSORS)
     owners: dict[tuple[str, str], str] = {}
     for name, sensor in known.items():
         names = {"channel": [c.name for c in sensor.channels], "setting": sensor.settings, "layer": sensor.layers}

@@ -52,8 +52,8 @@ class Residuals:
 class SensorKnowledge:
     """The result for a sensor.
 
-    ``sections`` of the rig; the ``constants``; ``notes``: warnings, one line each; ``figures``: plain values for the report;
-    ``details``: the data that its pictures show; ``correlations``: see
+    ``sections`` of the rig; the ``constants``; ``notes``: warnings, one line each; ``figures``: plain values, and ``residuals`` of
+    each log, for the report; ``details``: the data that its pictures show; ``correlations``: see
     :meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`.
     """
 
@@ -61,6 +61,7 @@ class SensorKnowledge:
     constants: Sequence[FittedConstant] = ()
     notes: Sequence[str] = ()
     figures: Mapping[str, Any] = field(default_factory=dict)
+    residuals: Sequence[Residuals] = ()
     details: Any = None
     correlations: Sequence[tuple[str, str, float]] = ()
 
@@ -107,10 +108,6 @@ class Calibrator:
         """Whether a rig has everything that the sensor needs."""
         return self.channel not in rig.sensors or getattr(rig, self.section) is not None
 
-    def residuals(self, _knowledge: SensorKnowledge) -> Sequence[Residuals]:
-        """The residuals of each log, which the report shows."""
-        return ()
-
     def pictures(self, _knowledge: SensorKnowledge) -> Sequence[Part]:
         """Further pictures of the report."""
         return ()
@@ -134,11 +131,8 @@ class ConstantsCalibrator(Calibrator):
         """Data and settings with the noise that the residuals have with these constants."""
         return parts, settings
 
-    def finished(
-        self, _logs: Sequence[Log], _parts: Sequence[Any], rig: Rig, knowledge: SensorKnowledge
-    ) -> SensorKnowledge:
-        """Complete the result for a ``rig`` that has the constants."""
-        del rig
+    def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
+        """Complete the result for a rig that has the constants."""
         return knowledge
 
     def learn(
@@ -149,8 +143,8 @@ class ConstantsCalibrator(Calibrator):
             return SensorKnowledge()
         if traced[0].constants is not None:
             return self._pooled(traced, rig, first)
-        logs = [replace(trace.log, rig=rig) for trace in traced]
-        parts, settings, posterior = self.estimated([self.part(log) for log in logs], self.settings(rig))
+        data = [self.part(replace(trace.log, rig=rig)) for trace in traced]
+        parts, settings, posterior = self.estimated(data, self.settings(rig))
         constants = [] if posterior is None else self._constants(parts, settings, self.settings(rig), posterior)
         if self.uncertain and len(parts) > 1:
             uncertainties = {
@@ -162,7 +156,7 @@ class ConstantsCalibrator(Calibrator):
         knowledge = SensorKnowledge(
             {self.section: settings}, constants, correlations=posterior.correlations() if posterior else ()
         )
-        return self.finished(logs, parts, rig.model_copy(update=dict(knowledge.sections)), knowledge)
+        return self.finished(parts, rig.model_copy(update=dict(knowledge.sections)), knowledge)
 
     def estimated(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any, Posterior | None]:
         """Data and settings with constants and noise of maximal posterior density."""

@@ -9,7 +9,7 @@ group ``factorgraph_loc.sensors``.
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
@@ -23,19 +23,17 @@ from factorgraph_loc.text import quoted
 class Channel:
     """A name in ``--sensors`` and of a log's streams.
 
-    ``streams``: the classes of its streams, whose ``kind`` is the class of their measurements. There are none for an optional
-    column of the sensor's first channel, as ``rssi`` and ``phase`` are of ``rfid``. ``section``: the rig's section with the
-    ``time_offset``.
+    ``section``: the rig's section with the ``time_offset``. ``tables``: the descriptions
+    (:class:`~factorgraph_loc.files.columns.Table`) of its tables in a log; ``described``: of further tables, for measurements that
+    differ from those. An optional column of the sensor's first channel has none, as ``rssi`` and ``phase`` of ``rfid``.
 
-    ``tables``: the descriptions (:class:`~factorgraph_loc.files.columns.Table`) of its tables in a log; ``described``: of further
-    tables, for measurements that differ from those. If stream fields are not columns: ``assemble``: ``(rows by table, reading) ->
+    If stream fields are not columns: ``assemble``: ``(rows by table, reading) ->
     stream`` and ``disassemble``: ``(stream, writing) -> columns by table``, see :mod:`factorgraph_loc.sensors.tables`. For pushed
     measurements whose fields are not columns: ``check``: ``(measurement, where) -> validated fields``. ``intake``: the class of an
     :class:`~factorgraph_loc.sensors.tables.Intake`, made of (rig, world).
     """
 
     name: str
-    streams: tuple[Place, ...] = ()
     section: str = ""
     tables: tuple[Place, ...] = ()
     described: tuple[Place, ...] = ()
@@ -43,6 +41,12 @@ class Channel:
     disassemble: Place = ""
     check: Place = ""
     intake: Place = ""
+
+    @property
+    def streams(self) -> list[type[Any]]:
+        """The classes of its streams, whose ``kind`` is the class of their measurements."""
+        tables = [load(place) for place in (*self.tables, *self.described)]
+        return [load(table.stream) for table in tables if table.stream]
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ class SensorType:
 
 def sensors() -> Mapping[str, SensorType]:
     """All sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
-    return cast(Mapping[str, SensorType], registered())
+    return registered()
 
 
 def sensor(name: str) -> SensorType:
@@ -131,13 +135,13 @@ def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
     """The channels among ``names`` that measure motion on the floor; with ``rank``
     :data:`~factorgraph_loc.model.measurement.TURN` also those that measure rotation alone."""
     streams = {name: channels()[name].streams for name in names if name in channels()}
-    return tuple(name for name, places in streams.items() if places and load(places[0]).rank <= rank)
+    return tuple(name for name, kinds in streams.items() if kinds and kinds[0].rank <= rank)
 
 
 def parent_of(channel: str) -> str:
     """The channel with ``channel`` as an optional column, or ""."""
     known = channels().get(channel)
-    return "" if known is None or known.streams else sensor_of(channel).channels[0].name
+    return "" if known is None or known.tables else sensor_of(channel).channels[0].name
 
 
 def detecting(world: Any, names: Collection[str]) -> list[SensorType]:

@@ -7,7 +7,7 @@ A sensor whose stream fields are columns needs only a description, a :class:`~fa
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -84,8 +84,9 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
         made: Stream = load(channel.assemble)(rows, reading)
         return made
     ((name, only),) = rows.items()
+    known = {STAMP.name, *only.numbers, *only.names}
     table = next(
-        t for t in tables_of(channel) if t.name == name and {*only.numbers, *only.names} >= set(t.shapes[0][1:])
+        t for t in tables_of(channel) if t.name == name and all(column.name in known for column in t.in_file(known))
     )
     return stream_of(table, only, reading.t0_ns, reading.warnings)
 
@@ -105,7 +106,7 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[str]) ->
         raise bad_field(rows.path, "row", "", expected, row=int(rows.rows[nothing[0]]))
     for column in measured:
         values[column.name] = _without_small(column, rows, warnings)
-    if table.rows_of_one_stamp == "one each":
+    if not table.is_scan:
         keep = checks.in_order(rows.path, rows.rows, rows.t_ns, warnings)
     else:
         names = next(iter(rows.names.values()), None) or [str(row) for row in rows.rows]
@@ -155,8 +156,9 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
     """The columns that describe a stream's numbers, named by its fields."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):
-        if table.stream == f"{type(stream).__module__}:{type(stream).__qualname__}":
-            yield from (column.measured for column in table.columns if column.kind == "number")
+        if table.stream and load(table.stream) is type(stream):
+            measured = [column.measured for column in table.columns if column.kind == "number"]
+            yield from (column for column in measured if hasattr(stream, column.name))
 
 
 M = TypeVar("M", bound=Measurement)
@@ -176,7 +178,7 @@ class Intake:
 @cache
 def kinds() -> Mapping[type[Any], Channel]:
     """The measurement classes, each with its channel."""
-    return {load(place).kind: channel for channel in channels().values() for place in channel.streams}
+    return {stream.kind: channel for channel in channels().values() for stream in channel.streams}
 
 
 def channel_of(kind: type[Any]) -> Channel:
@@ -216,7 +218,7 @@ def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] 
         return None
     table = _table_of(kind, channel)
     columns = [column.measured for column in table.columns[1:]]
-    if table.rows_of_one_stamp == "one measurement" or any(c.kind != "number" or c.may_lack for c in columns):
+    if table.is_scan or any(c.kind != "number" or c.may_lack for c in columns):
         return None
     return ("t", SECONDS.low, SECONDS.high), *((c.name, c.low, c.high) for c in columns)
 
@@ -231,16 +233,11 @@ def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[s
             count = len(values)
         else:
             value = getattr(m, column.measured.name)
-            if count is None and table.rows_of_one_stamp == "one measurement":
+            if count is None and table.is_scan:
                 count = numbers(where, column.name, value).size
             yield column.measured.name, within(where, column, value, () if count is None else (count,))
 
 
 @cache
 def _table_of(kind: type[Any], channel: Channel) -> Table:
-    members = {field.name for field in fields(kind)}
-    return next(
-        table
-        for table in tables_of(channel)
-        if all((f"{c.name}s" if c.kind == "name" else c.measured.name) in members for c in table.columns[1:])
-    )
+    return next(table for table in tables_of(channel) if table.stream and load(table.stream).kind is kind)

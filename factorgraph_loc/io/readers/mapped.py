@@ -1,6 +1,5 @@
 """The reader of folders of foreign tables, described by column mappings in a manifest."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -177,7 +176,7 @@ def read(path: Path | None, options: Options) -> Log:
 
 def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) -> TableRows:
     """A file in ``folder`` as one of ``tables`` of the native format."""
-    shapes = tuple(shape for table in tables for shape in _shapes(table))
+    shapes = tuple(_fields(table, mapping) for table in tables)
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):
         shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
@@ -226,12 +225,9 @@ def _names(path: Path, naming: NamesFile) -> dict[str, str]:
     return known
 
 
-def _shapes(table: Table) -> tuple[tuple[str, ...], ...]:
-    """The sets of fields that may be mapped: all columns, with or without the optional ones."""
-    needed = ("t", *(column.name for column in table.columns[1:] if not column.may_lack))
-    optional = [column.name for column in table.columns if column.may_lack]
-    some = (names for count in range(1, len(optional) + 1) for names in itertools.combinations(optional, count))
-    return tuple((*needed, *names) for names in some) or (needed,)
+def _fields(table: Table, mapping: TimedMapping) -> tuple[str, ...]:
+    """The fields of a table that have to be mapped, and those of the others that are."""
+    return "t", *(c.name for c in table.columns[1:] if not c.may_lack or c.name in mapping.columns)
 
 
 def _about_z(rows: TableRows, mapping: ImuFile, numbers: dict[str, Array]) -> Array:

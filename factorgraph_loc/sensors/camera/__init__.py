@@ -19,10 +19,6 @@ SENSOR = SensorType(
     channels=(
         Channel(
             "camera",
-            streams=(
-                "factorgraph_loc.sensors.camera.measurement:ImageStream",
-                "factorgraph_loc.sensors.camera.measurement:FeatureStream",
-            ),
             tables=("factorgraph_loc.sensors.camera.measurement:CAMERA",),
             described=("factorgraph_loc.sensors.camera.measurement:FEATURES",),
             assemble="factorgraph_loc.sensors.camera.measurement:assemble",
@@ -33,7 +29,6 @@ SENSOR = SensorType(
         ),
         Channel(
             "sightings",
-            streams=("factorgraph_loc.sensors.camera.measurement:SightingStream",),
             tables=("factorgraph_loc.sensors.camera.measurement:SIGHTINGS",),
             check="factorgraph_loc.sensors.camera.measurement:check_sightings",
             section="camera",

@@ -22,8 +22,6 @@ from factors.se2 import Array
 if TYPE_CHECKING:
     from factorgraph_loc.files.tables import TableRows
 
-    pass
-
 
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
@@ -104,7 +102,11 @@ class FeatureStream(Stream):
             yield replace(frame, t=t, source=self.source or frame.source)
 
 
-CAMERA = Table("camera", (STAMP, named("file", "the name of an image", "file")), "one each")
+CAMERA = Table(
+    "camera",
+    (STAMP, named("file", "the name of an image", "file")),
+    stream="factorgraph_loc.sensors.camera.measurement:ImageStream",
+)
 SIGHTINGS = Table(
     "sightings",
     (
@@ -113,8 +115,8 @@ SIGHTINGS = Table(
         within("u", PIXELS, LARGEST_PIXEL, "to the right; may lie outside of the image"),
         within("v", PIXELS, LARGEST_PIXEL, "down"),
     ),
-    "one measurement",
     stream="factorgraph_loc.sensors.camera.measurement:SightingStream",
+    is_scan=True,
 )
 # features of images, as pushed by a program
 FEATURES = Table(
@@ -125,7 +127,8 @@ FEATURES = Table(
         within("descriptors", PURE, 1e6, "descriptor of the feature"),
         Column("tracks", "whole", PURE, -(2.0**53), 2.0**53, False, "number of the track that the feature belongs to"),
     ),
-    "one measurement",
+    stream="factorgraph_loc.sensors.camera.measurement:FeatureStream",
+    is_scan=True,
 )
 
 

@@ -10,7 +10,6 @@ SENSOR = SensorType(
     channels=(
         Channel(
             "bearing_range",
-            streams=("factorgraph_loc.sensors.landmarks.measurement:BearingRangeStream",),
             tables=("factorgraph_loc.sensors.landmarks.measurement:BEARING_RANGE",),
             section="bearing_range",
         ),

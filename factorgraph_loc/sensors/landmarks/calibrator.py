@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.files.models import bounds
 from factorgraph_loc.fitting.posterior import (
     Parameter,
     Posterior,
@@ -76,12 +75,6 @@ class Sightings:
         return out
 
 
-def _bounded(values: Mapping[str, float]) -> dict[str, float]:
-    """Standard deviations within the bounds of the settings."""
-    kind = BearingRangeSettings.model_fields
-    return {name: float(np.clip(value, *bounds(kind[name].metadata))) for name, value in values.items()}
-
-
 def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]:
     """Standard deviation of errors (K,), constant and relative to ``ranges`` (K,), and the probability (K,) of each not to be
     gross; NaN is not measured.
@@ -115,15 +108,6 @@ def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, f
     root = np.sqrt(weights) / (design @ np.square(start))
     constant, relative = np.sqrt(nnls(design * root[:, None], errors**2 * root)[0])
     return max(float(constant), SMALLEST), float(relative)
-
-
-@dataclass(frozen=True)
-class SensorFit:
-    """The ``sightings``, the settings with their ``scatter`` as noise, and the ``share`` of independent ones."""
-
-    sightings: Sequence[Sightings]
-    scatter: BearingRangeSettings
-    share: float
 
 
 class LandmarkCalibrator(ConstantsCalibrator):
@@ -182,7 +166,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
             (sigmas["bearing_sigma"], _), sound[:, 1] = separated(errors[:, 1], 0.0 * ranges)
         ends = np.cumsum([len(part.t) for part in parts])[:-1]
         weighted = [replace(part, sound=rows) for part, rows in zip(parts, np.split(sound, ends), strict=True)]
-        return weighted, settings.model_copy(update=_bounded(sigmas))
+        return weighted, settings.model_copy(update=sigmas)
 
     def estimated(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
@@ -196,30 +180,24 @@ class LandmarkCalibrator(ConstantsCalibrator):
         new, old = (robust_sigma(np.concatenate([p.errors(fit[1]) for p in parts]))[0] for fit in (changed, given))
         return changed if new < BETTER_KIND * old else given
 
-    def finished(
-        self, _logs: Sequence[Log], parts: Sequence[Sightings], rig: Rig, knowledge: SensorKnowledge
-    ) -> SensorKnowledge:
+    def finished(self, parts: Sequence[Sightings], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
         """The result with the scatter widened for errors that are correlated."""
-        scatter = rig.bearing_range
-        share = pose_share(parts, scatter)
-        wider = _bounded({name: share**-0.5 * getattr(scatter, name) for name in SIGMAS})
+        scatter: BearingRangeSettings = rig.bearing_range
+        factor = pose_share(parts, scatter) ** -0.5
+        wider = {name: factor * getattr(scatter, name) for name in SIGMAS}
         return replace(
             knowledge,
             sections={self.section: scatter.model_copy(update=wider)},
-            figures={"noise_factor": share**-0.5},
-            details=SensorFit(parts, scatter, share),
+            figures={"noise_factor": factor},
+            residuals=[_residuals(part, scatter) for part in parts],
         )
 
-    def residuals(self, knowledge: SensorKnowledge) -> list[Residuals]:
-        """The errors of ranges and bearings."""
-        if knowledge.details is None:
-            return []
-        fit = knowledge.details
-        units, model, out = {"range": "m", "bearing": "rad"}, fit.scatter.model(), []
-        for part in fit.sightings:
-            sigmas = bearing_range.sigmas(model, part.ranges)
-            out.append(Residuals(part.log.name, units, part.t, part.ranges, part.errors(fit.scatter), sigmas))
-        return out
+
+def _residuals(part: Sightings, settings: BearingRangeSettings) -> Residuals:
+    """The errors of ranges and bearings."""
+    sigmas = bearing_range.sigmas(settings.model(), part.ranges)
+    units = {"range": "m", "bearing": "rad"}
+    return Residuals(part.log.name, units, part.t, part.ranges, part.errors(settings), sigmas)
 
 
 CALIBRATOR = LandmarkCalibrator()

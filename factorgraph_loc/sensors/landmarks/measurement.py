@@ -45,8 +45,8 @@ BEARING_RANGE = Table(
         ),
         number("bearing", ANGLE, -FULL_TURN, FULL_TURN, "direction in the sensor frame", may_lack=True),
     ),
-    "one measurement",
     stream="factorgraph_loc.sensors.landmarks.measurement:BearingRangeStream",
+    is_scan=True,
 )
 
 
@@ -180,7 +180,6 @@ LANDMARKS = Table(
         within("y", LENGTH, FARTHEST, "position in the world"),
         *(number(name, LENGTH, 0.0, 100.0, "standard deviation of the survey", may_lack=True) for name in SIGMAS),
     ),
-    "one each",
 )
 
 

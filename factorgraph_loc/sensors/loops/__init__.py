@@ -10,7 +10,6 @@ SENSOR = SensorType(
     channels=(
         Channel(
             "loops",
-            streams=("factorgraph_loc.sensors.loops.measurement:LoopStream",),
             tables=(
                 "factorgraph_loc.sensors.loops.measurement:LOOPS",
                 "factorgraph_loc.sensors.loops.measurement:LOOPS_BY_STAMP",

@@ -61,19 +61,19 @@ _TOLD = (
     number("heading", ANGLE, -FULL_TURN, FULL_TURN, "heading in the frame of the earlier pose", may_lack=True),
     number("score", PURE, 0.0, 1.0, "how sure the other program is; 1 if it is empty", may_lack=True),
 )
-_OPTIONAL = ((("x", "y", "heading"), ()), (("score",), ()))
+_OPTIONAL = (("x", "y", "heading"), ("score",))
 
 LOOPS = Table(
     "loops",
     (STAMP, number("age", DURATION, LEAST_AGE, MAX_SPAN, "time since the earlier pose"), *_TOLD),
-    "one measurement",
     stream="factorgraph_loc.sensors.loops.measurement:LoopStream",
+    is_scan=True,
     optional=_OPTIONAL,
 )
 LOOPS_BY_STAMP = Table(
     "loops",
     (STAMP, number("before_ns", STAMPS, -LATEST, LATEST, "time of the earlier pose, by the same clock"), *_TOLD),
-    "one measurement",
+    is_scan=True,
     optional=_OPTIONAL,
 )
 

@@ -10,10 +10,6 @@ SENSOR = SensorType(
     channels=(
         Channel(
             "odometry",
-            streams=(
-                "factorgraph_loc.sensors.odometry.measurement:VelocityStream",
-                "factorgraph_loc.sensors.odometry.measurement:IncrementStream",
-            ),
             tables=(
                 "factorgraph_loc.sensors.odometry.measurement:VELOCITIES",
                 "factorgraph_loc.sensors.odometry.measurement:INCREMENTS",
@@ -28,7 +24,6 @@ SENSOR = SensorType(
         ),
         Channel(
             "imu",
-            streams=("factorgraph_loc.sensors.odometry.measurement:YawRateStream",),
             tables=("factorgraph_loc.sensors.odometry.measurement:IMU",),
             section="imu",
         ),

@@ -262,14 +262,12 @@ class OdometryCalibrator(ConstantsCalibrator):
         weighted = [replace(part, sigmas=sigmas[rows.astype(int)]) for part, rows in zip(parts, moves, strict=True)]
         return weighted, settings
 
-    def finished(
-        self, logs: Sequence[Log], parts: Sequence[Windows], rig: Rig, knowledge: SensorKnowledge
-    ) -> SensorKnowledge:
+    def finished(self, parts: Sequence[Windows], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
         """The result with the noise that remains."""
-        noise = fit_noise(logs, odometry_model(rig))
+        noise = fit_noise([part.log for part in parts], odometry_model(rig))
         growth = {error: GrowthSettings.bounded(**asdict(g)) for error, g in noise.growth.items()}
         settings = rig.odometry.model_copy(update={"noise": OdometryNoise(**growth)})
-        rig = rig.model_copy(update={self.section: settings})
+        model = odometry_model(rig.model_copy(update={self.section: settings}))
         return replace(
             knowledge,
             sections={self.section: settings},
@@ -280,19 +278,15 @@ class OdometryCalibrator(ConstantsCalibrator):
                 **_wheels(settings),
                 "noise": [{"error": error} | asdict(g) for error, g in noise.growth.items()],
             },
-            details=[replace(part, log=replace(part.log, rig=rig)) for part in parts],
+            residuals=[_residuals(part, model) for part in parts],
         )
 
-    def residuals(self, knowledge: SensorKnowledge) -> list[Residuals]:
-        """The errors of the odometry over the windows."""
-        out = []
-        for windows in knowledge.details or ():
-            model = odometry_model(windows.log.rig)
-            start, end = windows.states(model)
-            sigmas = np.sqrt(np.diagonal(windows.covariances(model), axis1=1, axis2=2))
-            distance = end[:, 4] - start[:, 4]
-            out.append(Residuals(windows.log.name, ERRORS, windows.t, distance, windows.errors(model), sigmas))
-        return out
+
+def _residuals(windows: Windows, model: OdometryModel) -> Residuals:
+    """The errors of the odometry over the windows."""
+    start, end = windows.states(model)
+    sigmas = np.sqrt(np.diagonal(windows.covariances(model), axis1=1, axis2=2))
+    return Residuals(windows.log.name, ERRORS, windows.t, end[:, 4] - start[:, 4], windows.errors(model), sigmas)
 
 
 def _warnings(noise: NoiseFit) -> list[str]:

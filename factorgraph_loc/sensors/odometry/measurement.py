@@ -133,7 +133,6 @@ VELOCITIES = Table(
         within("v", SPEED, FASTEST, "forward speed, held until the next row"),
         within("w", RATE, FASTEST_TURN, "turn rate, held until the next row"),
     ),
-    "one each",
     stream="factorgraph_loc.sensors.odometry.measurement:VelocityStream",
 )
 INCREMENTS = Table(
@@ -144,13 +143,11 @@ INCREMENTS = Table(
         within("dy", LENGTH, LONGEST_WAY, "motion to the left since the row before"),
         within("dtheta", ANGLE, MOST_TURNED, "rotation since the row before"),
     ),
-    "one each",
     stream="factorgraph_loc.sensors.odometry.measurement:IncrementStream",
 )
 IMU = Table(
     "imu",
     (STAMP, within("w", RATE, FASTEST_TURN, "turn rate of a gyro")),
-    "one each",
     stream="factorgraph_loc.sensors.odometry.measurement:YawRateStream",
 )
 # wheel counters, which are converted to increments
@@ -163,7 +160,6 @@ WAYS = Table(
             for side in ("left", "right")
         ),
     ),
-    "one each",
 )
 # measured speeds or turns of wheels, which are converted to velocities or increments
 WHEELS = Table(
@@ -174,7 +170,6 @@ WHEELS = Table(
         *(within(f"{side}_angle", ANGLE, 1e9, "how far that wheel turned") for side in ("left", "right")),
         *(within(f"{side}_rate", RATE, 1e4, "how fast that wheel turns") for side in ("left", "right")),
     ),
-    "one each",
 )
 
 

@@ -19,7 +19,6 @@ SENSOR = SensorType(
     channels=(
         Channel(
             "rfid",
-            streams=("factorgraph_loc.sensors.rfid.stream:RfidStream",),
             tables=(
                 "factorgraph_loc.sensors.rfid.stream:RFID",
                 "factorgraph_loc.sensors.rfid.stream:INVENTORIES",

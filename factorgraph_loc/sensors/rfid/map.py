@@ -15,8 +15,6 @@ from factorgraph_loc.model.settings import Covariance, spread_of
 from factors.se2 import Array
 
 TAGS_SUFFIX = ".tags.csv"
-TAG_COLUMNS = ("epc", "x", "y", "z", "facing")
-TAG_COLUMNS_WITH_SIGMA = (*TAG_COLUMNS, "sigma")
 TAGS = Table(
     "tags",
     (
@@ -27,7 +25,7 @@ TAGS = Table(
         number("facing", ANGLE, -FULL_TURN, FULL_TURN, "direction that its front faces", may_lack=True),
         number("sigma", LENGTH, 0.0, 100.0, "standard deviation of its survey in x and y", may_lack=True),
     ),
-    "one each",
+    optional=(("sigma",),),
 )
 
 
@@ -79,8 +77,8 @@ def read_tags(path: Path) -> dict[str, Tag]:
 
     InputError names file, row and field of an invalid value, or of a duplicate EPC.
     """
-    cells, shape = read_cells(path, (TAG_COLUMNS_WITH_SIGMA, TAG_COLUMNS))
-    numbers = {name: cells.numbers(name, TAGS[name]) for name in shape[1:]}
+    cells, columns = read_cells(path, (TAGS,))
+    numbers = {column.name: cells.numbers(column.name, column) for column in columns[1:]}
     return rows_by_name(Tag, path, cells.rows, TAGS["epc"], cells.texts("epc"), numbers)
 
 
@@ -93,6 +91,5 @@ def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
 
 
 def write_tags(tags: Mapping[str, Tag], path: Path) -> None:
-    names = TAG_COLUMNS_WITH_SIGMA[1:]
-    numbers = {name: [getattr(tag, name) for tag in tags.values()] for name in names}
+    numbers = {column.name: [getattr(tag, column.name) for tag in tags.values()] for column in TAGS.columns[1:]}
     write_table(path, (TAGS,), {"epc": list(tags), **numbers})

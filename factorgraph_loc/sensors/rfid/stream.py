@@ -46,13 +46,13 @@ RFID = Table(
         number("frequency", FREQUENCY, 1e8, 1e10, "of the carrier", may_lack=True),
         Column("inventory", "whole", PURE, 1.0, 2.0**53, False, "the row of the round in inventories"),
     ),
-    "one measurement",
-    optional=((("rssi", "phase", "frequency"), ("rssi",), ()), (("inventory",), ())),
+    is_scan=True,
+    optional=(("rssi",), ("phase", "frequency"), ("inventory",)),
 )
 INVENTORIES = Table(
     "inventories",
     (STAMP, ANTENNA, number("duration", DURATION, 0.0, 3600.0, "duration of the round, which ends at the timestamp")),
-    "one measurement",
+    is_scan=True,
 )
 # the place of an antenna in a scan
 PLACE = Column("antenna", "whole", PURE, -(2.0**53), 2.0**53, False, "index in antennas")
@@ -63,8 +63,8 @@ READS = Table(
         number("age", DURATION, 0.0, 3600.0, "time from the read to the end of its round"),
         *(RFID[name] for name in ("rssi", "phase", "frequency")),
     ),
-    "one measurement",
     stream="factorgraph_loc.sensors.rfid.stream:RfidStream",
+    is_scan=True,
 )
 
 

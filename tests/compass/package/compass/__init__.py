@@ -8,7 +8,6 @@ SENSOR = SensorType(
     channels=(
         Channel(
             "compass",
-            streams=("compass.stream:HeadingStream",),
             tables=("compass.stream:HEADINGS",),
             section="compass",
         ),

@@ -10,7 +10,6 @@ from factors.se2 import Array
 HEADINGS = Table(
     "compass",
     (STAMP, within("heading", ANGLE, FULL_TURN, "heading including the compass's bias")),
-    "one each",
     stream="compass.stream:HeadingStream",
 )
 
