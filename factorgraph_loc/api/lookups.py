@@ -9,7 +9,7 @@ from pathlib import Path
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.columns import Column
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.files.settings import Setting, settings_in
+from factorgraph_loc.files.settings import Setting, first_sentence, settings_in
 from factorgraph_loc.files.shipped import rigs as shipped
 from factorgraph_loc.fusion.registry import Description, describe
 from factorgraph_loc.io.native import rig_file as first
@@ -61,8 +61,8 @@ def known_readers() -> list[NamedSettings]:
 
 def describe_reader(name: str) -> NamedSettings:
     """The description of a reader; InputError for an unknown one."""
-    described = reader(name)
-    return NamedSettings(name, described.about, tuple(settings_in(described.options)))
+    module = reader(name)
+    return NamedSettings(name, first_sentence(module), tuple(settings_in(module.Options)))
 
 
 def known_sensors() -> list[SensorDescription]:

@@ -156,7 +156,7 @@ class Table:
         return ",".join(column.name for column in self.in_file(())) + "".join(optional)
 
     def in_file(self, header: Collection[str]) -> tuple[Column, ...]:
-        """The columns that a file with this ``header`` must have: all except the optional groups of which it has no column."""
+        """The columns that a file with this ``header`` must have: all except optional groups that it wholly lacks."""
         omitted = {name for group in self.optional if not set(group) & set(header) for name in group}
         return tuple(column for column in self.columns if column.name not in omitted)
 

@@ -194,23 +194,25 @@ def read_cells(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column
     columns = columns_in(path, header, tables)
     filled = ((row, parts) for row, parts in parsed if len(parts) > 1 or "".join(parts).strip())
     rows, cells = rows_of_length(path, header, filled)
-    return Cells(path, rows, cells, left_out=_others(header, columns)), columns
+    return Cells(path, rows, cells, left_out=_unread(header, columns)), columns
 
 
 def columns_in(path: Path, header: Sequence[str], tables: Sequence[Table]) -> tuple[Column, ...]:
     """The columns in ``header`` of the one of ``tables`` with most of them. InputError if one is missing."""
     if len(set(header)) < len(header):
         raise bad_field(path, "header", ",".join(header), "each column once", row=1)
-    columns = max((table.in_file(header) for table in tables), key=lambda found: sum(c.name in header for c in found))
+    columns = max(
+        (table.in_file(header) for table in tables), key=lambda columns: sum(c.name in header for c in columns)
+    )
     missing = next((column.name for column in columns if column.name not in header), None)
     if missing is None:
         return columns
-    hint = nearest(missing, list(_others(header, columns)))
+    hint = nearest(missing, list(_unread(header, columns)))
     expected = " or ".join(table.header for table in tables)
     raise InputError(f"{path}:1: column {missing} is missing{hint if 'mean' in hint else ''}, expected {expected}")
 
 
-def _others(header: Sequence[str], columns: Sequence[Column]) -> tuple[str, ...]:
+def _unread(header: Sequence[str], columns: Sequence[Column]) -> tuple[str, ...]:
     """The names in ``header`` of none of the ``columns``."""
     known = {column.name for column in columns}
     return tuple(name for name in header if name not in known)
@@ -330,7 +332,7 @@ def _cells_of_parquet(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple
         else:
             cells[name] = frame[name].to_list()
     rows = np.arange(1, frame.height + 1, dtype=np.int64)
-    return Cells(path, rows, cells, left_out=_others(frame.columns, columns)), columns
+    return Cells(path, rows, cells, left_out=_unread(frame.columns, columns)), columns
 
 
 def write_parquet(frame: pl.DataFrame, path: Path) -> None:

@@ -52,8 +52,8 @@ class Residuals:
 class SensorKnowledge:
     """The result for a sensor.
 
-    ``sections`` of the rig; the ``constants``; ``notes``: warnings, one line each; ``figures``: plain values, and ``residuals`` of
-    each log, for the report; ``details``: the data that its pictures show; ``correlations``: see
+    ``sections`` of the rig; the ``constants``; ``notes``: warnings, one line each; ``figures``: plain values for the report;
+    ``residuals``: of each log; ``details``: the data that its pictures show; ``correlations``: see
     :meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`.
     """
 

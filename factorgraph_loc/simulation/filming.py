@@ -20,7 +20,7 @@ from factorgraph_loc.simulation.renderer import Image, Renderer
 from factorgraph_loc.simulation.scene import make_scene
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.simulate import drive, generator, with_sensors
-from factorgraph_loc.simulation.worlds import make_plan, make_world
+from factorgraph_loc.simulation.worlds import LOWEST_BOX, make_plan, make_world
 from factors import se2
 from factors.camera import model as reprojection
 from factors.se2 import Array
@@ -87,11 +87,16 @@ class Film:
 def film(settings: SimulationSettings, seed: int) -> Film:
     """The images of the log that :func:`~factorgraph_loc.simulation.simulate` makes of the same settings and seed.
 
-    Raises InputError if the rig has no camera.
+    Raises InputError if the rig has no camera, or one above the furniture.
     """
     camera = settings.rig.find(CameraSettings)
     if camera is None:
         raise InputError(f"rig {settings.rig.name}: has no camera, expected one to take images with")
+    if camera.z > LOWEST_BOX:
+        raise InputError(
+            f"rig {settings.rig.name}: camera.z is {camera.z:g}, expected at most {LOWEST_BOX:g} m for simulated images, "
+            "as furniture has no top side"
+        )
     world_seed = seed if settings.world_seed is None else settings.world_seed
     world = make_world(settings.world, generator(world_seed, "world"))
     plan = make_plan(settings.world, generator(world_seed, "world"))

@@ -9,7 +9,7 @@ from scipy.special import ndtri
 
 from factorgraph_loc.simulation import raycasting
 from factorgraph_loc.simulation.raycasting import Surroundings
-from factorgraph_loc.simulation.scene import LEVELS, TexturedScene
+from factorgraph_loc.simulation.scene import TexturedScene
 from factorgraph_loc.simulation.settings import ImageSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
@@ -70,7 +70,7 @@ class Renderer:
         """The world points (K, 3) shown by ``pixels`` (K, 2), NaN if there is none."""
         directions = reprojection.undistorted(self.model, np.asarray(pixels, dtype=float).reshape(-1, 2))
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
-        distance = self._distances(position, rays)
+        distance: Array = raycasting.cast_all(self._surroundings(position), rays)
         distance[np.isinf(distance)] = np.nan
         return np.asarray(position + distance[:, None] * rays)
 
@@ -96,42 +96,6 @@ class Renderer:
         around = self._surroundings(position)
         view = self._directions, rotation, pixel_at_one
         raycasting.expose(around, scene.texels, scene.layout, *view, self._found, light)
-        if len(self._below(position)):
-            self._lay_lids(position, rotation, pixel_at_one, light)
-
-    def _distances(self, position: Array, rays: Array) -> Array:
-        """Distances (K,) to the first hit of ``rays`` (K, 3), in lengths of the rays."""
-        distance: Array = raycasting.cast_all(self._surroundings(position), rays)
-        for lid in self._below(position):
-            t, _, on = _on_lid(lid, position, rays)
-            distance = np.where(on & (t < distance), t, distance)
-        return distance
-
-    def _lay_lids(self, position: Array, rotation: Array, pixel_at_one: float, light: NDArray[np.float32]) -> None:
-        """Draw the top sides of furniture into ``light``, replacing what is behind them. Only needed for a camera above some
-        furniture; inside of :func:`raycasting.cast` it would take a third of the time.
-        """
-        scene, shape = self.scene, self._directions.shape[:2]
-        below = np.zeros_like(light)
-        view = self._directions, rotation, pixel_at_one
-        raycasting.expose(self._surroundings(position), scene.texels, scene.layout, *view, self._found, below)
-        directions = self._directions.reshape(-1, 2)
-        rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
-        nearest = self._distances(position, rays)
-        for lid in self._below(position):
-            t, shares, on = _on_lid(lid, position, rays)
-            visible = on & (t <= nearest)
-            if not visible.any():
-                continue
-            level = int(np.clip(np.round(np.log2(np.median(t[visible]) * pixel_at_one)), 0, LEVELS - 1))
-            first, width, height = scene.layout[int(lid[5]), level].tolist()
-            column, row = (np.minimum(shares[visible] * (width, height), (width - 1, height - 1)).astype(np.int64)).T
-            pixels = visible.reshape(shape)
-            light[pixels] += scene.texels[first + row * width + column] - below[pixels]
-
-    def _below(self, position: Array) -> Array:
-        """The lids (B, 6) below the camera."""
-        return np.asarray(self.scene.lids[self.scene.lids[:, 4] < position[2]])
 
     def _surroundings(self, position: Array) -> Surroundings:
         scene = self.scene
@@ -140,17 +104,6 @@ class Renderer:
             raise ValueError(f"the camera's position is {place}, expected finite numbers")
         around: Surroundings = raycasting.surroundings(scene.faces, scene.bottoms, scene.tops, place, self._size)
         return around
-
-
-def _on_lid(lid: Array, position: Array, rays: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Intersections of ``rays`` (K, 3) with the plane of a lid: distances (K,) in ray lengths, coordinates (K, 2) relative to
-    the lid's sides, and whether the hit is on the lid and ahead (K,).
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = (lid[4] - position[2]) / rays[:, 2]
-        shares = (position[:2] + t[:, None] * rays[:, :2] - lid[:2]) / (lid[2:4] - lid[:2])
-        on = (t > 0.0) & ((shares >= 0.0) & (shares <= 1.0)).all(axis=1)
-    return t, shares, on
 
 
 def _turned(rotation: Array, turn: Array) -> Array:

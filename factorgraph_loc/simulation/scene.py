@@ -1,6 +1,7 @@
 """A textured building for rendering: vertical faces, floor and ceiling.
 
-A face is a rectangle above a segment in the plan, visible from the segment's left side. Furniture is lower than the room.
+A face is a rectangle above a segment in the plan, visible from the segment's left side. Furniture is lower than the room, but
+higher than cameras, so that its top is never visible.
 Textures have mip levels (Williams, "Pyramidal parametrics", SIGGRAPH 1983).
 """
 
@@ -28,8 +29,7 @@ LEVELS = 7  # mip levels of a texture, including the first
 
 @dataclass(frozen=True, eq=False)
 class TexturedScene:
-    """``faces`` (F, 4) [m]: segments visible from the left; ``bottoms`` and ``tops`` (F,) [m] of them. ``lids`` (B, 6): top
-    sides of boxes: x1, y1, x2, y2, height [m], and the index of the face whose texture they share.
+    """``faces`` (F, 4) [m]: segments visible from the left; ``bottoms`` and ``tops`` (F,) [m] of them.
 
     ``width``, ``depth``, ``height`` [m]: of floor and ceiling. ``texels`` (T, 3): BGR of all textures and levels; ``layout`` (F
     + 2, LEVELS, 3): first texel, width and height of each level, floor and ceiling last. Columns run along a face, left to
@@ -39,7 +39,6 @@ class TexturedScene:
     faces: Array
     bottoms: Array
     tops: Array
-    lids: Array
     width: float
     depth: float
     height: float
@@ -80,9 +79,7 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
         yield textures.ceiling(rng, *across, texel)
 
     texels, layout = _stored([*sizes, across, across], drawn())
-    sides = w + 4 * np.arange(len(plan.boxes))
-    lids = np.column_stack((np.array(plan.boxes).reshape(-1, 4), tops[sides], sides))
-    return TexturedScene(faces, bottoms, tops, lids, plan.width, plan.depth, ROOM_HEIGHT, texels, layout, texel)
+    return TexturedScene(faces, bottoms, tops, plan.width, plan.depth, ROOM_HEIGHT, texels, layout, texel)
 
 
 def _is_outer(plan: Plan, face: Array) -> bool:

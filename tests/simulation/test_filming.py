@@ -100,3 +100,8 @@ def test_several_processes_write_the_same_files(tmp_path, monkeypatch):
 def test_a_rig_without_a_camera_takes_no_images():
     with pytest.raises(InputError, match="has no camera"):
         film(preset("office", {"rig": {"camera": None}}), 0)
+
+
+def test_a_camera_above_furniture_takes_no_images():
+    with pytest.raises(InputError, match=r"camera\.z is 1\.5, expected at most 1\.4 m"):
+        film(preset("office", {"rig": {"camera": {"z": 1.5}}}), 0)

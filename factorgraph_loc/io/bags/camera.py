@@ -3,7 +3,6 @@
 Compressed images are written unchanged, others as PGM or PPM without loss.
 """
 
-import csv
 import hashlib
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -30,11 +29,11 @@ RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
-INDEX = "images.csv"
 LOCK = ".lock"  # held while a folder of images is moved into place
-COLUMNS = ("row", "header", "received", "file")
 Pixels = NDArray[Any]
-_Row = tuple[int, int, int, str]  # number, timestamp of the header [ns], time of receipt [ns], file
+_Row = tuple[
+    int, int, int, str
+]  # number, timestamp of the header [ns], time of receipt [ns]; file, whose name has these
 
 
 # conversion of channels to red, green, blue
@@ -68,14 +67,15 @@ class Images:
 
     def __init__(self, bag: Bag, name: str, stamper: Stamper, stack: ExitStack) -> None:
         self._source = f"{bag.path} {name}"
-        self._compressed = bag.topic(name, RAW, COMPRESSED).type == COMPRESSED
+        topic = bag.topic(name, RAW, COMPRESSED)
+        self._compressed, self._count = topic.type == COMPRESSED, topic.count
         self._folder = cache_folder() / "bags" / _key(bag.path, name)
         self._stamper = stamper
         self._t_ns: list[int] = []
         self._written: Path | None = None  # folder of newly extracted images
         self._stack = stack
         sweep(self._folder.parent)
-        self._rows = _read_whole(self._folder)
+        self._rows = _images_in(self._folder, self._count)
         self.known = bool(self._rows)
         self._t_ns = [stamper.choose(header, received) for _, header, received, _ in self._rows]
 
@@ -93,25 +93,22 @@ class Images:
                 raise InputError(f"{where}: format is {quoted(item.message.format)}, expected JPEG, PNG, WebP or BMP")
         else:
             content, suffix = netpbm(item.message, where)
-        file = f"{item.row:06d}{suffix}"
+        header = as_nanoseconds(item.message.header.stamp, 1)
+        file = f"{item.row:06d}_{header}_{item.received}{suffix}"
         with writing(self._folder):
             (self._written / file).write_bytes(content)
-        self._rows.append((item.row, as_nanoseconds(item.message.header.stamp, 1), item.received, file))
+        self._rows.append((item.row, header, item.received, file))
         self._t_ns.append(t_ns)
 
     def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
         """The images; newly extracted ones are moved to the cache folder."""
         if self._written is not None:
-            with writing(self._folder):
-                with (self._written / INDEX).open("w", newline="", encoding="utf-8") as file:
-                    csv.writer(file).writerows([COLUMNS, *self._rows])
-                with locked(self._folder.parent / LOCK):
-                    if not _read_whole(
-                        self._folder
-                    ):  # otherwise another process was faster, and may be using its files
-                        if self._folder.exists():
-                            self._folder.rename(self._written.with_name("damaged"))
-                        self._written.rename(self._folder)
+            with writing(self._folder), locked(self._folder.parent / LOCK):
+                # otherwise another process was faster, and may be using its files
+                if not _images_in(self._folder, self._count):
+                    if self._folder.exists():
+                        self._folder.rename(self._written.with_name("damaged"))
+                    self._written.rename(self._folder)
         rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
         keep = checks.last_in_order(self._source, rows, t_ns, warnings)
         return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
@@ -181,14 +178,13 @@ def _key(path: Path, topic: str) -> str:
     return hashlib.sha256(repr((facts, topic)).encode()).hexdigest()[:24]
 
 
-def _read_whole(folder: Path) -> list[_Row]:
-    """The rows of the index; empty if it is damaged or an image is missing."""
+def _images_in(folder: Path, count: int) -> list[_Row]:
+    """The images in a folder; none if there are not ``count``, or the folder has other files."""
+    rows = []
     try:
-        with (folder / INDEX).open(newline="", encoding="utf-8") as file:
-            rows = [
-                (int(row["row"]), int(row["header"]), int(row["received"]), str(row["file"]))
-                for row in csv.DictReader(file)
-            ]
-    except (OSError, ValueError, KeyError, TypeError):
+        for file in folder.iterdir():
+            row, header, received = map(int, file.stem.split("_"))
+            rows.append((row, header, received, file.name))
+    except (OSError, ValueError):
         return []
-    return rows if all((folder / file).is_file() for *_, file in rows) else []
+    return sorted(rows) if len(rows) == count else []

@@ -2,17 +2,16 @@
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.column_mapping import JSON_SUFFIXES
 from factorgraph_loc.files.data_root import EXPECTED, RUN_FILE, find_data_root, named_path
-from factorgraph_loc.files.models import FileModel, nearest, parse_model, read_toml
-from factorgraph_loc.files.settings import first_sentence
+from factorgraph_loc.files.models import nearest, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.io.bags.file import is_bag, require_metadata
 from factorgraph_loc.io.checks import look_over, require_bounds
@@ -32,35 +31,31 @@ RigLike = Rig | str | Path
 WorldLike = World | str | Path
 MOST = 1000  # maximum number of logs from lists of options
 TABLES = (".csv", *JSON_SUFFIXES)
+T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class Reader:
-    """A reader: the model of its options, ``read(path, options)``, which returns the log, and one sentence ``about`` its format."""
-
-    options: type[FileModel]
-    read: Callable[[Path | None, Any], Log]
-    about: str
-
-
-def reader(name: str) -> Reader:
-    """The reader of a format; InputError with the most similar name if it is unknown."""
+def reader(name: str) -> Any:
+    """The module of a reader; InputError with the most similar name if it is unknown."""
     if name not in READERS:
         raise InputError(f"there is no reader {quoted(name)}{nearest(name, list(READERS))}")
-    module = READERS[name]
-    return Reader(module.Options, module.read, first_sentence(module))
+    return READERS[name]
 
 
 @dataclass(frozen=True)
 class _Source:
-    """A reader, its input, and additions to its log; ``name``: None for the reader's name."""
+    """A reader, its input, the name of its log, None for that of the reader, and the manifest in ``file`` that describes it."""
 
     reader: str
     path: Path | None
     name: str | None = None
-    rig: Rig | None = None
-    world: World | None = None
     manifest: Manifest | None = None
+    file: Path = Path()
+
+    def named(self, what: str, data_root: str | Path | None) -> Path | None:
+        """The file of the rig or world, as ``what`` says, that the manifest names."""
+        name = getattr(self.manifest, what, None)
+        expected = f"{EXPECTED}; or `--{what} FILE` in its place"
+        return None if name is None else named_path(self.file.parent, name, self.file, data_root, expected)
 
 
 def load(
@@ -79,13 +74,12 @@ def load(
     and ``world``, values or files, replace those of the log. ``data_root``: a folder that a manifest may lead to besides its own,
     by default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
     """
-    new_rig = read_rig(rig) if isinstance(rig, str | Path) else rig
-    new_world = read_world(world) if isinstance(world, str | Path) else world
     if isinstance(log, Log):
-        return [replace(log, rig=new_rig or log.rig, world=new_world or log.world)]
+        return [replace(log, rig=_value(rig, read_rig) or log.rig, world=_value(world, read_world) or log.world)]
+    source = _find(str(log), data_root, reader)
+    new_rig = _value(source.named("rig", data_root) if rig is None else rig, read_rig)
+    new_world = _value(source.named("world", data_root) if world is None else world, read_world)
     given = dict(options or {})
-    given_files = [what for what, file in (("rig", rig), ("world", world)) if file is not None]
-    source = _find(str(log), data_root, reader, given_files)
     described = source.manifest.options if source.manifest else {}
     choices = {key: _choices(value) for key, value in described.items()}
     # lists are given as text with commas on the command line
@@ -102,9 +96,8 @@ def load(
         for key, values in choices.items()
         if (key in given or len(values) > 1) and not any(isinstance(value, Mapping) for value in values)
     ]
-    replaced = replace(source, rig=new_rig or source.rig, world=new_world or source.world)
     return [
-        _read(replaced, dict(zip(choices, values, strict=True)), naming)
+        _read(source, new_rig, new_world, dict(zip(choices, values, strict=True)), naming)
         for values in itertools.product(*choices.values())
     ]
 
@@ -133,12 +126,17 @@ def read_log(
     return logs[0]
 
 
+def _value(given: T | str | Path | None, read: Callable[[str | Path], T]) -> T | None:
+    """A value, or that in a file."""
+    return read(given) if isinstance(given, str | Path) else given
+
+
 def _choices(value: Any) -> list[Any]:
     """The values of an option, which may be a list."""
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
-def _find(log: str, data_root: str | Path | None, named: str | None, given: Collection[str]) -> _Source:
+def _find(log: str, data_root: str | Path | None, named: str | None) -> _Source:
     path = Path(log)
     if named is not None:
         reader(named)  # report a wrong reader before a wrong path
@@ -153,21 +151,21 @@ def _find(log: str, data_root: str | Path | None, named: str | None, given: Coll
     if path.exists() and is_bag(path):
         raise InputError(f"{log}: is a ROS bag: `fgloc manifest {log} > run.toml` proposes how to read it")
     if path.is_file():
-        return _from_file(log, path, data_root, given)
+        return _from_file(log, path, data_root)
     known = manifests()
     if log in known:
-        return _from_manifest(known[log], data_root, given)
+        return _from_manifest(known[log], data_root)
     if path.is_dir():
         require_metadata(path)
         raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
     raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
 
 
-def _from_file(log: str, path: Path, data_root: str | Path | None, given: Collection[str]) -> _Source:
+def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
     if path.name == RUN_FILE and "reader" not in read_toml(path):  # a manifest may have this name too
         return _Source("native", path.parent)
     if path.suffix == ".toml":
-        return _from_manifest(path, data_root, given)
+        return _from_manifest(path, data_root)
     if is_pose_file(path):
         raise InputError(
             f"{log}: is a file of poses, expected a log: name it as odometry or reference in a manifest with the reader mapped, "
@@ -182,9 +180,9 @@ def _name(path: Path) -> str:
     return path.resolve().stem if path.is_file() else path.resolve().name
 
 
-def _from_manifest(file: Path, data_root: str | Path | None, given: Collection[str]) -> _Source:
-    """The source that a manifest describes, without its ``rig`` and ``world`` if these are among the ``given`` replacements."""
-    manifest: Manifest = read_manifest(file)
+def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
+    """The source that a manifest describes."""
+    manifest = read_manifest(file)
     path = None
     if manifest.path is not None:
         path = named_path(file.parent, manifest.path, file, data_root)
@@ -192,36 +190,24 @@ def _from_manifest(file: Path, data_root: str | Path | None, given: Collection[s
             missing = file if file in manifests().values() else f"{file} (which has no {manifest.path} in its folder)"
             root = find_data_root(data_root, missing)
             raise InputError(f"{file}: its data {manifest.path} does not exist, neither in its folder nor below {root}")
-    named = {what: name for what, name in (("rig", manifest.rig), ("world", manifest.world)) if what not in given}
-    files = {
-        what: named_path(file.parent, name, file, data_root, f"{EXPECTED}; or `--{what} FILE` in its place")
-        for what, name in named.items()
-        if name is not None
-    }
-    return _Source(
-        manifest.reader,
-        path,
-        None if file.name == RUN_FILE else file.stem,
-        read_rig(files["rig"]) if "rig" in files else None,
-        read_world(files["world"]) if "world" in files else None,
-        manifest,
-    )
+    return _Source(manifest.reader, path, None if file.name == RUN_FILE else file.stem, manifest, file)
 
 
-def _read(source: _Source, options: Mapping[str, Any], naming: list[str]) -> Log:
-    """One log; ``naming``: options that are appended to its name to make it unique."""
+def _read(source: _Source, rig: Rig | None, world: World | None, options: Mapping[str, Any], naming: list[str]) -> Log:
+    """One log, with ``rig`` and ``world`` instead of the reader's if given; ``naming``: options that are appended to its name to
+    make it unique."""
     chosen, manifest = reader(source.reader), source.manifest
-    options = with_wheels_of(source.rig, options)
-    log = chosen.read(source.path, parse_model(chosen.options, options, f"options of reader {source.reader}"))
+    options = with_wheels_of(rig, options)
+    log: Log = chosen.read(source.path, parse_model(chosen.Options, options, f"options of reader {source.reader}"))
     name = "-".join([source.name or log.name, *(f"{key}{options[key]}" for key in naming)])
-    metadata = {key: text for key, text in log.metadata.items() if source.rig is None or key != RIG_NOTES}
+    metadata = {key: text for key, text in log.metadata.items() if rig is None or key != RIG_NOTES}
     if manifest is not None:
         metadata |= {"title": manifest.title, "licence": manifest.licence, "origin": manifest.origin}
     log = replace(
         log,
         name=name,
-        rig=source.rig or log.rig,
-        world=source.world or log.world,
+        rig=rig or log.rig,
+        world=world or log.world,
         start=manifest.start.pose(log.t0_ns) if manifest and manifest.start else log.start,
         metadata=metadata,
     )
