@@ -52,7 +52,6 @@ from factorgraph_loc.model.measurement import Measurement as Measurement, Tick a
 from factorgraph_loc.model.rig import Rig as Rig
 from factorgraph_loc.model.trajectory import Trajectory as Trajectory
 from factorgraph_loc.model.pose_path import PosePath as PosePath
-from factorgraph_loc.model.trajectory3 import Trajectory3 as Trajectory3
 from factorgraph_loc.model.world import World as World
 from factorgraph_loc.sensors.camera.measurement import PixelSightings as PixelSightings
 from factorgraph_loc.sensors.camera.measurement import (

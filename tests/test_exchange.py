@@ -13,16 +13,26 @@ T0 = 1_700_000_000 * 10**9
 RNG = np.random.default_rng(8)
 T = np.cumsum(RNG.uniform(0.05, 0.2, 30)).round(9)
 FLAT = fgloc.Trajectory(T, RNG.uniform(-3.0, 3.0, (30, 3)))
-SPACE = fgloc.Trajectory3(T, RNG.uniform(-3.0, 3.0, (30, 3)), Rotation.random(30, random_state=1).as_matrix())
+TURNS = Rotation.random(30, random_state=1).as_matrix()
+SPACE = fgloc.PosePath("space", RNG.uniform(-3.0, 3.0, (30, 3)), TURNS, np.rint(T * 1e9).astype(np.int64) + T0)
 BOTH = pytest.mark.parametrize("trajectory", [FLAT, SPACE], ids=["floor", "space"])
+
+
+def of(kind, path):
+    """A path as a trajectory of its kind."""
+    if kind is fgloc.Trajectory:
+        return fgloc.Trajectory.of(path, T0)
+    path.stamps()
+    return path
 
 
 def require_alike(found, trajectory, atol=1e-8):
     assert type(found) is type(trajectory)
-    assert found.t == pytest.approx(trajectory.t, abs=1e-6)
     if isinstance(found, fgloc.Trajectory):
+        assert found.t == pytest.approx(trajectory.t, abs=1e-6)
         assert found.poses == pytest.approx(trajectory.poses, abs=atol)
     else:
+        np.testing.assert_allclose(found.t_ns - T0, trajectory.t_ns - T0, rtol=0.0, atol=1000)
         assert found.positions == pytest.approx(trajectory.positions, abs=atol)
         assert found.rotations == pytest.approx(trajectory.rotations, abs=atol)
 
@@ -30,11 +40,11 @@ def require_alike(found, trajectory, atol=1e-8):
 @BOTH
 def test_a_trajectory_comes_back_from_its_file(tmp_path, trajectory):
     fgloc.write_trajectory(trajectory, tmp_path / "poses.tum", T0)
-    require_alike(type(trajectory).of(fgloc.read_trajectory(tmp_path / "poses.tum"), T0), trajectory)
+    require_alike(of(type(trajectory), fgloc.read_trajectory(tmp_path / "poses.tum")), trajectory)
     fgloc.write_trajectory(trajectory, tmp_path / "poses.kitti")
     assert (tmp_path / "poses.times.txt").is_file()
     with pytest.raises(fgloc.InputError, match=r"poses.kitti: has poses without times, expected poses with times"):
-        type(trajectory).of(fgloc.read_trajectory(tmp_path / "poses.kitti"))
+        of(type(trajectory), fgloc.read_trajectory(tmp_path / "poses.kitti"))
 
 
 def test_a_floor_is_no_staircase(tmp_path):
@@ -78,10 +88,10 @@ def test_evo_takes_and_gives_a_trajectory(trajectory):
     made = fgloc.to_evo(trajectory, T0)
     assert isinstance(made, evo.PoseTrajectory3D)
     assert made.check()[0]
-    require_alike(type(trajectory).of(fgloc.from_evo(made), T0), trajectory)
+    require_alike(of(type(trajectory), fgloc.from_evo(made)), trajectory)
     alone = evo.PosePath3D(made.positions_xyz, made.orientations_quat_wxyz)
     with pytest.raises(fgloc.InputError, match="the trajectory of evo: has poses without times"):
-        type(trajectory).of(fgloc.from_evo(alone))
+        of(type(trajectory), fgloc.from_evo(alone))
     with pytest.raises(fgloc.InputError, match="expected one of evo"):
         fgloc.from_evo([1, 2])
 
@@ -93,8 +103,8 @@ def test_ros_takes_and_gives_a_trajectory(trajectory):
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     again = store.deserialize_cdr(store.serialize_cdr(path, "nav_msgs/msg/Path"), "nav_msgs/msg/Path")
     assert {pose.header.frame_id for pose in (again, *again.poses)} == {"hall"}
-    require_alike(type(trajectory).of(fgloc.from_ros(again), T0), trajectory)
-    require_alike(type(trajectory).of(fgloc.from_ros(again.poses), T0), trajectory)
+    require_alike(of(type(trajectory), fgloc.from_ros(again)), trajectory)
+    require_alike(of(type(trajectory), fgloc.from_ros(again.poses)), trajectory)
 
 
 def stamped(i, **content):

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,10 +22,9 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factorgraph_loc.text import listed, quoted
 
-TrajectoryLike = Trajectory | Trajectory3 | str | Path
+TrajectoryLike = Trajectory | PosePath | str | Path
 FORMATS = (".mcap", ".tum", ".kitti", ".g2o", ".ply")
 L = TypeVar("L", bound=LogLike)
 
@@ -181,4 +181,6 @@ def score(
 
 
 def _path(trajectory: TrajectoryLike, name: str) -> PosePath:
-    return read_trajectory(trajectory) if isinstance(trajectory, str | Path) else path_of(trajectory, name)
+    if isinstance(trajectory, str | Path):
+        return read_trajectory(trajectory)
+    return trajectory.path(name) if isinstance(trajectory, Trajectory) else replace(trajectory, name=name)

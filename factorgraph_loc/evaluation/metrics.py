@@ -26,7 +26,6 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, Alignment
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import path_of
 from factors import chi_squared, positive, se2
 from factors.se2 import Array
 
@@ -139,7 +138,7 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
 def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap: float) -> dict[str, float | None]:
     if trajectory is None or log.reference is None or not len(trajectory):
         return {}
-    paths = path_of(trajectory, log.name), path_of(log.reference, "the reference")
+    paths = trajectory.path(log.name), log.reference.path("the reference")
     scored = score_paths(*paths, align, "interpolate", max_gap=max_gap).figures
     return {name: scored[f"ape.{name.removeprefix('aligned_')}"] for name in ALIGNED}
 

@@ -21,9 +21,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_loc.files import checks
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.scoring import MAX_GAP
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.model.trajectory import Trajectory, neighbours
 from factors import se2
 from factors.se2 import Array, Integers
 
@@ -69,14 +70,14 @@ def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GA
     return Pairs(reference.t[rows], trajectory.at(at, max_gap=max_gap), covariances, reference.poses[rows])
 
 
-def pairs_in_space(
-    estimate: Trajectory3, reference: Trajectory3, max_gap: float = MAX_GAP
-) -> tuple[Trajectory3, Trajectory3]:
+def pairs_in_space(estimate: PosePath, reference: PosePath, max_gap: float = MAX_GAP) -> tuple[PosePath, PosePath]:
     """The same in space: estimates and true poses, only where both exist."""
-    rows = thinned(reference.t)
-    at = _within(reference.t[rows], estimate.t)
-    valid = estimate.spans(at, max_gap=max_gap)
-    return estimate.at(at[valid]), reference.rows(rows[valid])
+    t0_ns = int(estimate.stamps()[0])
+    own, t = (checks.seconds(path.stamps(), t0_ns) for path in (estimate, reference))
+    rows = thinned(t)
+    at = _within(t[rows], own)
+    *_, valid = neighbours(own, at, max_gap)
+    return estimate.at(checks.absolute(at[valid], t0_ns)), reference.rows(rows[valid])
 
 
 def pauses(t: Array) -> Integers:

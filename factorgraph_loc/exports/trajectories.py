@@ -21,9 +21,8 @@ from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import TURN
-from factorgraph_loc.model.pose_path import upright
+from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
-from factorgraph_loc.model.trajectory3 import Trajectory3
 from factorgraph_loc.sensors.landmarks.summary import located_landmarks
 from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.registry import moving
@@ -35,35 +34,28 @@ TIMES_SUFFIX = ".times.txt"
 LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, to keep its information finite
 
 
-def matrices(trajectory: Trajectory | Trajectory3) -> Array:
-    """The poses (N, 3, 4) of the robot in the world: rotation and position."""
-    if isinstance(trajectory, Trajectory3):
-        return np.concatenate((trajectory.rotations, trajectory.positions[:, :, None]), axis=2)
-    out = np.zeros((len(trajectory), 3, 4))
-    out[:, :, :3] = upright(trajectory.poses[:, 2])
-    out[:, :2, 3] = trajectory.poses[:, :2]
-    return out
-
-
-def write_trajectory(trajectory: Trajectory | Trajectory3, path: str | Path, t0_ns: int = 0) -> None:
-    """Write a trajectory, whose times count from ``t0_ns``, in TUM format, or in KITTI format with a file of times if the name
-    ends with .kitti."""
+def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> None:
+    """Write a trajectory in TUM format, or in KITTI format with a file of times if the name ends with .kitti. ``t0_ns``: time zero
+    of a planar one."""
     if Path(path).suffix == KITTI:
         write_kitti(trajectory, Path(path))
     else:
         write_tum(trajectory, path, t0_ns)
 
 
-def write_kitti(trajectory: Trajectory | Trajectory3, path: Path) -> Path:
-    """Write poses in KITTI format, and their stamps [s from the log's start] to ``NAME.times.txt``; return the latter's path.
+def write_kitti(trajectory: Trajectory | PosePath, path: Path) -> Path:
+    """Write poses in KITTI format, and their times [s], of a planar trajectory from the log's start, to ``NAME.times.txt``; return
+    the latter's path.
 
     Poses are of the robot's frame (x forward, z up), not of a camera, and not relative to the first one.
     """
-    rows = matrices(trajectory).reshape(-1, 12)
+    poses = trajectory.path("trajectory") if isinstance(trajectory, Trajectory) else trajectory
+    rows = np.concatenate((poses.rotations, poses.positions[:, :, None]), axis=2).reshape(-1, 12)
+    t = trajectory.t if isinstance(trajectory, Trajectory) else trajectory.seconds()
     times = path.with_name(path.stem + TIMES_SUFFIX)
     with writing(path):
         write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows.tolist()))
-        write_text(times, "".join(f"{t:.9f}\n" for t in trajectory.t.tolist()))
+        write_text(times, "".join(f"{seconds:.9f}\n" for seconds in t.tolist()))
     return times
 
 

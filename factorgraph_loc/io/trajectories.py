@@ -22,7 +22,6 @@ from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.results import FINAL
 from factorgraph_loc.model.pose_path import PosePath, require_poses
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
@@ -63,18 +62,18 @@ def _reference(log: str) -> PosePath:
     loaded = read_log(log)
     if loaded.reference is None:
         raise InputError(f"{log}: is a log without a reference, expected one with a reference, or a trajectory")
-    return path_of(loaded.reference, log, loaded.t0_ns)
+    return loaded.reference.path(log, loaded.t0_ns)
 
 
-def to_evo(trajectory: Trajectory | Trajectory3, t0_ns: int = 0) -> Any:
-    """A trajectory, whose times count from ``t0_ns``, as evo's ``PoseTrajectory3D``. InputError if evo is not installed, or
-    a pose is not finite."""
+def to_evo(trajectory: Trajectory | PosePath, t0_ns: int = 0) -> Any:
+    """A trajectory as evo's ``PoseTrajectory3D``. ``t0_ns``: time zero of a planar one. InputError if evo is not installed, or a
+    pose is not finite."""
     try:
         from evo.core.trajectory import PoseTrajectory3D  # type: ignore[import-untyped] # noqa: PLC0415
     except ImportError as error:
         raise InputError("trajectories of evo need evo: pip install evo") from error
-    path, turns = _posed(trajectory, t0_ns)
-    return PoseTrajectory3D(path.positions, np.roll(turns, 1, axis=1), path.seconds())  # evo has w first
+    path = _posed(trajectory, t0_ns)
+    return PoseTrajectory3D(path.positions, np.roll(path.quaternions(), 1, axis=1), path.seconds())  # evo has w first
 
 
 def from_evo(trajectory: Any) -> PosePath:
@@ -90,24 +89,24 @@ def from_evo(trajectory: Any) -> PosePath:
     return _path(name, table, None if times is None else checks.stamps(name, np.arange(1, len(times) + 1), times))
 
 
-def to_ros(trajectory: Trajectory | Trajectory3, frame_id: str = "map", t0_ns: int = 0) -> Any:
-    """A trajectory, whose times count from ``t0_ns``, as a ``nav_msgs/Path``: of ROS 2 where its environment is sourced, else of
-    rosbags. InputError if there is neither, or a pose is not finite."""
+def to_ros(trajectory: Trajectory | PosePath, frame_id: str = "map", t0_ns: int = 0) -> Any:
+    """A trajectory as a ``nav_msgs/Path``: of ROS 2 where its environment is sourced, else of rosbags. ``t0_ns``: time zero of a
+    planar one. InputError if there is neither, or a pose is not finite."""
     make = _messages()
-    path, turns = _posed(trajectory, t0_ns)
+    path = _posed(trajectory, t0_ns)
+    stamps, turns = path.stamps().tolist(), path.quaternions().tolist()
 
     def header(t_ns: int) -> Any:
         stamp = make("builtin_interfaces", "Time", sec=t_ns // 10**9, nanosec=t_ns % 10**9)
         return make("std_msgs", "Header", stamp=stamp, frame_id=frame_id)
 
     poses = []
-    assert path.t_ns is not None
-    for t_ns, place, turn in zip(path.t_ns.tolist(), path.positions.tolist(), turns.tolist(), strict=True):
+    for t_ns, place, turn in zip(stamps, path.positions.tolist(), turns, strict=True):
         position = make("geometry_msgs", "Point", **dict(zip("xyz", place, strict=True)))
         orientation = make("geometry_msgs", "Quaternion", **dict(zip("xyzw", turn, strict=True)))
         pose = make("geometry_msgs", "Pose", position=position, orientation=orientation)
         poses.append(make("geometry_msgs", "PoseStamped", header=header(t_ns), pose=pose))
-    return make("nav_msgs", "Path", header=header(int(path.t_ns[0])), poses=poses)
+    return make("nav_msgs", "Path", header=header(stamps[0]), poses=poses)
 
 
 def from_ros(messages: Any) -> PosePath:
@@ -131,11 +130,11 @@ def from_ros(messages: Any) -> PosePath:
     return path if points != {True} else PosePath(path.name, path.positions, path.rotations, path.t_ns, False)
 
 
-def _posed(trajectory: Trajectory | Trajectory3, t0_ns: int) -> tuple[PosePath, Array]:
-    """The poses of a trajectory, and their quaternions (N, 4). InputError if there are none, or one is not finite."""
-    path = path_of(trajectory, "the trajectory", t0_ns)
+def _posed(trajectory: Trajectory | PosePath, t0_ns: int) -> PosePath:
+    """The poses of a trajectory. InputError if there are none, or one is not finite."""
+    path = trajectory.path("the trajectory", t0_ns) if isinstance(trajectory, Trajectory) else trajectory
     require_poses(path)
-    return path, Trajectory3.of(path).quaternions()
+    return path
 
 
 def _seven(message: Any) -> tuple[float, ...]:

@@ -15,6 +15,5 @@ __all__ = [
     "settings",
     "setup",
     "trajectory",
-    "trajectory3",
     "world",
 ]

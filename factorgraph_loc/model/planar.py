@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import scipy
 from pydantic import AfterValidator, Field
 
 from factorgraph_loc.errors import InputError, require
@@ -53,8 +52,14 @@ class Mounting(FileModel):
 
     def rotation(self) -> Array:
         """The rotation matrix (3, 3) from the sensor frame to the robot frame."""
-        turn = scipy.spatial.transform.Rotation.from_euler("xyz", (self.roll, self.pitch, self.yaw))
-        return np.asarray(turn.as_matrix())
+        (cr, cp, cy), (sr, sp, sy) = (f((self.roll, self.pitch, self.yaw)) for f in (np.cos, np.sin))
+        return np.array(
+            [
+                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+                [-sp, cp * sr, cp * cr],
+            ]
+        )
 
 
 class Turned(FileModel):
@@ -87,9 +92,13 @@ def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Arra
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     valid = np.abs(length - 1.0) <= UNIT
     require(valid, source, rows, "length of the quaternion", length, "1, a unit quaternion")
-    if not len(quaternions):  # older versions of scipy refuse none
-        return np.empty((0, 3, 3))
-    return np.asarray(scipy.spatial.transform.Rotation.from_quat(quaternions).as_matrix())
+    x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    matrix = [  # without scipy, which most logs do not need
+        [w * w + x * x - y * y - z * z, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), w * w - x * x + y * y - z * z, 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), w * w - x * x - y * y + z * z],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(matrix), 2, 0))
 
 
 def on_floor(

@@ -1,9 +1,8 @@
-"""Planar trajectories with covariances, interpolation, the TUM text format, and the base class of trajectories."""
+"""Planar trajectories with covariances, interpolation, and the TUM text format."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -12,105 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import COVARIANCES, symmetric
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.model.pose_path import PosePath
+from factorgraph_loc.model.pose_path import Exchange, PosePath, numbers, upright
 from factors import se2
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
     import polars as pl
-
-
-class Exchange:
-    """The common base of trajectories: made from poses with absolute times, from arrays and from tables.
-
-    Times are seconds after ``t0_ns``, nanoseconds since 1970.
-    """
-
-    t: Array
-
-    @classmethod
-    def of(cls, path: PosePath, t0_ns: int = 0) -> Self:
-        """The poses of a path.
-
-        InputError if it has no times, as in KITTI files, or they do not increase. For a trajectory on the floor also if heights
-        vary.
-        """
-        if path.t_ns is None:
-            raise InputError(f"{path.name}: has poses without times, expected poses with times")
-        require_times(path.name, path.t_ns)
-        return cls._of_path((path.t_ns - t0_ns) / 1e9, path)
-
-    @classmethod
-    def from_numpy(cls, table: Array) -> Self:
-        """A trajectory from an array with a row for each pose, as :meth:`to_numpy` returns it. InputError if it is none."""
-        rows = np.asarray(table, dtype=float)
-        columns = cls._columns()
-        if rows.ndim != 2 or rows.shape[1] != len(columns):
-            expected = f"a row for each pose with {', '.join(columns)}"
-            raise InputError(f"the array has the shape {rows.shape}, expected (N, {len(columns)}): {expected}")
-        require_times("the array", rows[:, 0])
-        return cls._of_rows(rows)
-
-    @abstractmethod
-    def to_numpy(self) -> Array:
-        """The poses as an array (N, 4) or (N, 8), one row per pose: the time t [s] first, then the pose. The columns are those of
-        the subclass."""
-
-    @classmethod
-    def from_polars(cls, table: pl.DataFrame) -> Self:
-        """A trajectory from the columns that :meth:`to_polars` gives; others are ignored. InputError if one is missing, or has
-        values that are no numbers."""
-        if missing := [name for name in cls._columns() if name not in table.columns]:
-            raise InputError(f"the table has no column {missing[0]}, expected {', '.join(cls._columns())}")
-        return cls.from_numpy(numbers(table, cls._columns()))
-
-    def to_polars(self) -> pl.DataFrame:
-        """The poses as a table with the columns of :meth:`to_numpy`, one row per pose."""
-        import polars as pl  # noqa: PLC0415 - most users of trajectories need none
-
-        return pl.DataFrame(self.to_numpy(), schema=list(self._columns()))
-
-    @classmethod
-    @abstractmethod
-    def _columns(cls) -> tuple[str, ...]:
-        """The names of the columns of :meth:`to_numpy`."""
-
-    @classmethod
-    @abstractmethod
-    def _of_rows(cls, rows: Array) -> Self:
-        """The trajectory with these rows, as of :meth:`to_numpy`."""
-
-    @classmethod
-    @abstractmethod
-    def _of_path(cls, t: Array, path: PosePath) -> Self:
-        """The trajectory with the poses of a path at the times ``t``."""
-
-    @abstractmethod
-    def _tum(self) -> Iterator[str]:
-        """The poses as rows of a TUM file without times."""
-
-
-def numbers(table: pl.DataFrame, names: Iterable[str]) -> Array:
-    """Columns of a table as an array (N, K). InputError for one with values that are no numbers."""
-    import polars as pl  # noqa: PLC0415
-
-    columns = []
-    for name in names:
-        column = table[name]
-        if not column.dtype.is_numeric() or column.null_count():
-            raise InputError(f"column {name} has values that are no numbers, expected numbers alone")
-        columns.append(column.cast(pl.Float64).to_numpy())
-    return np.column_stack(columns)
-
-
-def require_times(name: str, t: Array | Integers) -> None:
-    """InputError for the first pose whose time, in seconds or nanoseconds, is not after that of the pose before."""
-    if len(stuck := np.flatnonzero(~(np.diff(t) > 0))):
-        i = int(stuck[0]) + 1
-        unit = "ns" if np.issubdtype(t.dtype, np.integer) else "s"
-        raise InputError(f"{name}: pose {i + 1} has the time {t[i]} {unit}, expected one after that of the pose before")
 
 
 @dataclass(frozen=True)
@@ -131,6 +40,18 @@ class Trajectory(Exchange):
 
     def __len__(self) -> int:
         return len(self.t)
+
+    @classmethod
+    def of(cls, path: PosePath, t0_ns: int = 0) -> Self:
+        """The poses of a path, at times in seconds after ``t0_ns``, nanoseconds since 1970. InputError if it has no times, they do
+        not increase, or heights vary."""
+        return cls(checks.seconds(path.stamps(), t0_ns), path.on_floor([]), has_heading=path.has_rotations)
+
+    def path(self, name: str, t0_ns: int = 0) -> PosePath:
+        """The poses at height 0, with times that count from ``t0_ns``."""
+        headings = self.poses[:, 2] if self.has_heading else np.zeros(len(self))
+        positions = np.column_stack((self.poses[:, :2], np.zeros(len(self))))
+        return PosePath(name, positions, upright(headings), checks.absolute(self.t, t0_ns), self.has_heading)
 
     def rows(self, which: Integers | NDArray[np.bool_]) -> Self:
         """The poses at indices ``which``, or where ``which`` (N,) is true."""
@@ -193,10 +114,6 @@ class Trajectory(Exchange):
     def _of_rows(cls, rows: Array) -> Self:
         return cls(rows[:, 0], rows[:, 1:])
 
-    @classmethod
-    def _of_path(cls, t: Array, path: PosePath) -> Self:
-        return cls(t, path.on_floor([]), has_heading=path.has_rotations)
-
     def _tum(self) -> Iterator[str]:
         for x, y, heading in self.poses:
             yield f"{x:.9f} {y:.9f} 0 0 0 {np.sin(heading / 2.0):.12f} {np.cos(heading / 2.0):.12f}"
@@ -223,14 +140,11 @@ def averaged(covariances: Array, first: Integers, last: Integers, fraction: Arra
     return np.asarray((1.0 - weight) * covariances[first] + weight * covariances[last])
 
 
-def write_tum(trajectory: Exchange, path: str | Path, t0_ns: int = 0) -> None:
-    """Write a TUM file with absolute timestamps in decimal seconds."""
-    rows = [f"{decimal_seconds(t, t0_ns)} {row}\n" for t, row in zip(trajectory.t, trajectory._tum(), strict=True)]
+def write_tum(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> None:
+    """Write a TUM file with absolute timestamps in decimal seconds, to the nanosecond. ``t0_ns``: time zero of a trajectory."""
+    stamps = checks.absolute(trajectory.t, t0_ns) if isinstance(trajectory, Trajectory) else trajectory.stamps()
+    rows = []
+    for t_ns, row in zip(stamps.tolist(), trajectory._tum(), strict=True):
+        sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
+        rows.append(f"{sign}{whole}.{fraction:09d} {row}\n")
     write_text(Path(path), "".join(rows))
-
-
-def decimal_seconds(t: float, t0_ns: int) -> str:
-    """A time ``t`` [s] after ``t0_ns`` as absolute decimal seconds, to the nanosecond."""
-    t_ns = t0_ns + round(t * 1e9)
-    sign, (whole, fraction) = "-" if t_ns < 0 else "", divmod(abs(t_ns), 10**9)
-    return f"{sign}{whole}.{fraction:09d}"

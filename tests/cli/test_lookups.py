@@ -59,7 +59,7 @@ def test_a_sensor_has_columns_with_units_and_the_keys_of_the_rig(fgloc):
 @pytest.mark.parametrize("name", READERS)
 def test_every_option_of_a_reader_is_told(fgloc, name):
     found = json.loads(fgloc("readers", name, "--json").stdout)
-    assert {one["key"].partition(".")[0] for one in found["settings"]} == set(reader(name).options.model_fields)
+    assert {one["key"].partition(".")[0] for one in found["settings"]} == set(reader(name).Options.model_fields)
     assert all(one["meaning"] for one in found["settings"])
     assert fgloc("readers", name).exit_code == 0
 

@@ -2,6 +2,7 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from pose_files import T0, wander, write
 from scipy.spatial.transform import Rotation
 from tum_files import read_tum
 
-from factorgraph_loc import InputError, Trajectory, Trajectory3, score
+from factorgraph_loc import InputError, PosePath, Trajectory, score
 from factorgraph_loc.evaluation import metrics
+from factorgraph_loc.files.checks import absolute
 from factorgraph_loc.model.scoring import ALIGNMENTS
 
 OPTIONS = {
@@ -126,14 +128,18 @@ def test_no_piece_of_a_second_spans_a_gap():
 
 
 def test_the_alignment_is_that_of_the_frames():
-    space = Trajectory3(*curve())
+    space = in_space(*curve())
     turn = Rotation.from_rotvec((0.3, -0.2, 1.0)).as_matrix()
-    moved = Trajectory3(space.t, 2.0 * space.positions @ turn.T + (1.0, 2.0, 3.0), turn @ space.rotations)
+    moved = replace(space, positions=2.0 * space.positions @ turn.T + (1.0, 2.0, 3.0), rotations=turn @ space.rotations)
     found = score(space, moved, align="sim3")
     assert found.transform.scale == pytest.approx(2.0)
     assert found.transform.rotation == pytest.approx(turn)
     assert found.transform.translation == pytest.approx((1.0, 2.0, 3.0))
     assert found.figures["ape.position_max"] == pytest.approx(0.0, abs=1e-12)
+
+
+def in_space(t, positions, rotations):
+    return PosePath("path", positions, rotations, absolute(t, 0))
 
 
 def curve(count=40):
@@ -146,10 +152,10 @@ def test_a_plane_is_seen_from_above():
     t, positions, rotations = curve()
     heading = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
     planar = Trajectory(t, np.column_stack((positions[:, :2], heading)))
-    figures = score(planar, Trajectory3(t, positions + np.array((5.0, 1.0, 0.7)), rotations), align="se2").figures
+    figures = score(planar, in_space(t, positions + np.array((5.0, 1.0, 0.7)), rotations), align="se2").figures
     assert figures["ape.position_max"] == pytest.approx(0.0, abs=1e-9)
     assert figures["ape.rotation_max"] == pytest.approx(0.0, abs=1e-7)
-    found = score(planar, Trajectory3(t, positions + np.array((0.0, 0.0, 5.0)), rotations))
+    found = score(planar, in_space(t, positions + np.array((0.0, 0.0, 5.0)), rotations))
     assert found.warnings == (
         "estimate is planar, and reference is up to 5.5 m above or below it: heights count, but not with align se2 or associate "
         "interpolate",

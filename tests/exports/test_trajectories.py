@@ -4,8 +4,9 @@ import numpy as np
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc.exports.trajectories import matrices, write_kitti
-from factorgraph_loc.model.trajectory3 import Trajectory3
+from factorgraph_loc.exports.trajectories import write_kitti
+from factorgraph_loc.io.readers.pose_file import read_matrices
+from factorgraph_loc.model.pose_path import PosePath
 
 
 def test_evo_reads_poses_of_kitti(log, tmp_path):
@@ -19,9 +20,11 @@ def test_evo_reads_poses_of_kitti(log, tmp_path):
     assert np.allclose(np.loadtxt(times), log.reference.t, atol=1e-9)
 
 
-def test_poses_in_space():
+def test_poses_in_space(tmp_path):
     turns = Rotation.from_rotvec([(0.1, 0.2, 0.3), (0.0, -0.5, 1.0)]).as_matrix()
     positions = np.array(((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)))
-    poses = matrices(Trajectory3(np.array((0.0, 1.0)), positions, turns))
-    assert np.array_equal(poses[:, :, :3], turns)
+    times = write_kitti(PosePath("path", positions, turns, np.array((0, 10**9))), tmp_path / "space.kitti")
+    poses = read_matrices(tmp_path / "space.kitti")
+    assert np.allclose(poses[:, :, :3], turns, atol=1e-11)
     assert np.array_equal(poses[:, :, 3], positions)
+    assert np.loadtxt(times).tolist() == [0.0, 1.0]

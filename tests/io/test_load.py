@@ -32,7 +32,7 @@ def manifest(mrclam):
 def test_shipped_manifests_are_right(name):
     """Reader, options and rig are known, whether the data is there or not; without a rig the reader has its own."""
     manifest = read_manifest(manifests()[name])
-    parse_model(reader(manifest.reader).options, manifest.options, name)
+    parse_model(reader(manifest.reader).Options, manifest.options, name)
     rig = read_rig(manifests()[name].parent / manifest.rig)
     assert all(getattr(rig, sensor) is not None for sensor in rig.sensors if sensor not in {"rssi", "phase"})
     assert all(file.startswith(manifest.path) for file in manifest.checksums)

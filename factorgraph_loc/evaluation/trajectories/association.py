@@ -13,10 +13,10 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.pairing import Pairs, align_points, pairs, pairs_in_space, pauses
+from factorgraph_loc.files import checks
 from factorgraph_loc.model.pose_path import PosePath, upright
 from factorgraph_loc.model.scoring import Alignment, Association
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factors.se2 import Array, Integers
 
 FEWEST = 3  # pairs that define an alignment by least squares
@@ -79,16 +79,12 @@ def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Intege
 
 
 def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> Associated:
-    assert estimate.t_ns is not None
-    t0_ns = int(estimate.t_ns[0])
-    ours, theirs = Trajectory3.of(estimate, t0_ns), Trajectory3.of(reference, t0_ns)
+    t0_ns = int(estimate.stamps()[0])
     if estimate.is_planar or reference.is_planar:
-        above = replace(ours.planar(), has_heading=estimate.has_rotations)
-        true = replace(theirs.planar(), has_heading=reference.has_rotations)
+        above, true = (Trajectory.of(path.seen_from_above(), t0_ns) for path in (estimate, reference))
         return in_plane(pairs(above, true, max_gap), above, true, (estimate.name, reference.name), t0_ns)
-    space, true3 = pairs_in_space(ours, theirs, max_gap)
-    paths = path_of(space, estimate.name, t0_ns), path_of(true3, reference.name, t0_ns)
-    return Associated(*paths, pauses(true3.t), from_reference=True)
+    paths = pairs_in_space(estimate, reference, max_gap)
+    return Associated(*paths, pauses(checks.seconds(paths[1].stamps(), t0_ns)), from_reference=True)
 
 
 def in_plane(
@@ -103,7 +99,7 @@ def in_plane(
     gaps = np.searchsorted(kept, np.concatenate((pauses(pair.t), np.flatnonzero(~known))))
     estimated = Trajectory(pair.t[kept], pair.poses[kept], has_heading=estimate.has_heading)
     truth = Trajectory(pair.t[kept], pair.truth[kept], has_heading=reference.has_heading)
-    paths = path_of(estimated, names[0], t0_ns), path_of(truth, names[1], t0_ns)
+    paths = estimated.path(names[0], t0_ns), truth.path(names[1], t0_ns)
     return Associated(*paths, np.asarray(gaps, dtype=np.int64), from_reference=True)
 
 

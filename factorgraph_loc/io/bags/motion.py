@@ -173,9 +173,9 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
 
     def motion(warnings: list[str]) -> tuple[Integers, Array]:
         path = poses.path(warnings)
-        assert path.t_ns is not None
-        moves = motions.between_poses(path.name, path.t_ns, path.on_floor(warnings, options), warnings)
-        return path.t_ns, motions.after_rest(moves)
+        t_ns = path.stamps()
+        moves = motions.between_poses(path.name, t_ns, path.on_floor(warnings, options), warnings)
+        return t_ns, motions.after_rest(moves)
 
     return motion
 

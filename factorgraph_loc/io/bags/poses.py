@@ -20,7 +20,6 @@ from factorgraph_loc.io.bags.topics import TF, Listeners, Stamper, TopicRows, To
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import Turned, rotations_of
 from factorgraph_loc.model.pose_path import PosePath
-from factorgraph_loc.model.trajectory3 import Trajectory3, path_of
 from factorgraph_loc.text import error_text, listed, quoted
 from factors.se2 import Array, Integers
 
@@ -75,7 +74,7 @@ class Poses:
         self._rows = TopicRows(f"{bag.path} {name}", len(paths), paths)
         self.add = self._rows.add
 
-    def path(self, warnings: list[str], t0_ns: int = 0) -> PosePath:
+    def path(self, warnings: list[str]) -> PosePath:
         """The poses, the last one of equal timestamps; InputError names the invalid message."""
         source, rows, t_ns, values = self._rows.source, self._rows.rows, self._rows.t_ns, self._rows.values
         if self._are_points:
@@ -184,32 +183,29 @@ class FrameReference:
             stamp = self._stamper.choose(as_nanoseconds(transform.header.stamp, 1), t_ns)
             edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
 
-    def path(self, warnings: list[str], t0_ns: int | None = None) -> PosePath:
-        """The poses at the timestamps of the most frequent transform where all are known; the others are interpolated, at times
-        after ``t0_ns``, by default that of the first transform."""
-        if t0_ns is None:
-            t0_ns = min((int(edge.t_ns[0]) for edge in self._edges.values()), default=0)
+    def path(self, warnings: list[str]) -> PosePath:
+        """The poses at the timestamps of the most frequent transform where all are known; the others are interpolated."""
         edges = [
-            self._edge(name, t0_ns, warnings) if name in self._edges else self._static.parents[name][1]
+            self._edge(name, warnings) if name in self._edges else self._static.parents[name][1]
             for name in self._chain()
         ]
-        moving = [edge for edge in edges if isinstance(edge, Trajectory3)]
+        moving = [edge for edge in edges if isinstance(edge, PosePath)]
         if not moving:
             raise InputError(f"{self._source}: {self._child} does not move in {self._parent}, expected frames that do")
-        t = max(moving, key=len).t
-        t = t[(t >= max(m.t[0] for m in moving)) & (t <= min(m.t[-1] for m in moving))]
-        if not len(t):
+        t_ns = max(moving, key=len).stamps()
+        t_ns = t_ns[(t_ns >= max(m.stamps()[0] for m in moving)) & (t_ns <= min(m.stamps()[-1] for m in moving))]
+        if not len(t_ns):
             raise InputError(
                 f"{self._source}: the transforms from {self._child} to {self._parent} have no time in common"
             )
-        poses = np.broadcast_to(np.eye(4), (len(t), 4, 4))
+        poses = np.broadcast_to(np.eye(4), (len(t_ns), 4, 4))
         for edge in edges:
-            if isinstance(edge, Trajectory3):
-                at = edge.at(t)
+            if isinstance(edge, PosePath):
+                at = edge.at(t_ns)
                 poses = matrices(at.positions, at.rotations) @ poses
             else:
                 poses = edge @ poses
-        return path_of(Trajectory3(t, poses[:, :3, 3], poses[:, :3, :3]), self._source, t0_ns)
+        return PosePath(self._source, poses[:, :3, 3], poses[:, :3, :3], t_ns)
 
     def _chain(self) -> list[str]:
         """The frames from the child up to the parent, without the parent."""
@@ -231,12 +227,12 @@ class FrameReference:
             frame = parents[frame]
         return chain
 
-    def _edge(self, name: str, t0_ns: int, warnings: list[str]) -> Trajectory3:
+    def _edge(self, name: str, warnings: list[str]) -> PosePath:
         edge = self._edges[name]
         source = f"{self._source} {self._parents[name]} to {name}"
         rotations = checked_rotations(source, edge.rows, edge.values)
         keep = checks.in_order(source, edge.rows, edge.t_ns, warnings)
-        return Trajectory3(checks.seconds(edge.t_ns[keep], t0_ns), edge.values[keep, :3], rotations[keep])
+        return PosePath(source, edge.values[keep, :3], rotations[keep], edge.t_ns[keep])
 
 
 def static_frames(listeners: Listeners, base: str) -> StaticFrames:

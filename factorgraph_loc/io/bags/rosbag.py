@@ -140,10 +140,9 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     streams |= {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
     reference = None
     if poses and of_reference:
-        path = poses.path(warnings, t0_ns)
-        assert path.t_ns is not None
+        path = poses.path(warnings)
         has_heading = of_reference.has_heading and path.has_rotations
-        t = checks.seconds(path.t_ns, t0_ns)
+        t = checks.seconds(path.stamps(), t0_ns)
         reference = Trajectory(t, path.on_floor(warnings, of_reference), has_heading=has_heading)
     notes: list[str] = []  # on the bag's own rig
     rig = _rig(streams, info, options, frames, notes)

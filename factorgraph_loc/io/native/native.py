@@ -134,8 +134,7 @@ def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str
         return None
     poses = read_pose_file(inside(path.parent, path.name, path.parent), "tum")
     warnings += poses.warnings
-    assert poses.t_ns is not None
-    return Trajectory(checks.seconds(poses.t_ns, t0_ns), poses.on_floor(warnings), has_heading=has_heading)
+    return Trajectory(checks.seconds(poses.stamps(), t0_ns), poses.on_floor(warnings), has_heading=has_heading)
 
 
 def write_native(

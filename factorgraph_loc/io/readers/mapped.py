@@ -342,8 +342,7 @@ def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array
     else:
         poses = read_pose_file(path, "euroc" if options.format == "euroc" else "tum")
     folder.warnings += poses.warnings
-    assert poses.t_ns is not None
-    return poses.t_ns + round(options.clock_offset * 1e9), poses.on_floor(folder.warnings, turned)
+    return poses.stamps() + round(options.clock_offset * 1e9), poses.on_floor(folder.warnings, turned)
 
 
 def _columns(mapped: Cells, offset: float) -> tuple[Integers, dict[str, Array]]:
