@@ -16,7 +16,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry import simulation as simulated_odometry
 from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
-from factorgraph_loc.sensors.rfid.map import TagsFile, read_mapped_tags
+from factorgraph_loc.sensors.rfid.map import TagsFile, read_tags
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ends_of, make_rfid_stream, rounds_from_gaps
 from factors import se2
@@ -45,7 +45,7 @@ def read_rfid_aisle(folder: Path, run: int, odometry_seed: int = 0) -> Log:
     return Log(
         name=f"rfid-aisle-run{run}",
         rig=read_rig(rigs()["rfid-aisle"]),
-        world=World(name=folder.resolve().name, tags=read_mapped_tags(folder / TAGS.file, TAGS)),
+        world=World(name=folder.resolve().name, tags=read_tags(folder / TAGS.file, TAGS)),
         streams={"odometry": odometry, "rfid": reads},
         reference=Trajectory(reference.t[::THINNING], reference.poses[::THINNING]),
         t0_ns=t0_ns,

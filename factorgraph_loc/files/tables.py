@@ -218,27 +218,22 @@ def _unread(header: Sequence[str], columns: Sequence[Column]) -> tuple[str, ...]
     return tuple(name for name in header if name not in known)
 
 
-def rows_by_name(
-    kind: type[Model],
-    path: Path,
-    rows: Integers,
-    column: Column,
-    names: Sequence[str],
-    numbers: Mapping[str, Array],
-) -> dict[str, Model]:
-    """The N rows of a table as models of ``kind`` by their ``names`` in ``column``.
+def rows_by_name(kind: type[Model], cells: Cells, table: Table, names: Sequence[str]) -> dict[str, Model]:
+    """The N rows of a ``table`` as models of ``kind`` by their ``names``, the first column. An empty cell is the default of its
+    field.
 
-    ``rows`` (N,): line numbers in ``path``; ``numbers``: values (N,) by field, NaN for the default of the field. InputError names
-    file and row of an empty or repeated name, and of an invalid value.
+    InputError names file and row of an empty or repeated name, and of an invalid value.
     """
+    column, *others = table.columns
+    numbers = {other.name: cells.numbers(other.name, other) for other in others if other.name in cells.columns}
     models: dict[str, Model] = {}
     first_rows: dict[str, int] = {}
-    for i, (row, name) in enumerate(zip(rows.tolist(), names, strict=True)):
+    for i, (row, name) in enumerate(zip(cells.rows.tolist(), names, strict=True)):
         if not name or name in first_rows:
             expected = f"another name than in row {first_rows[name]}" if name else column.doc
-            raise bad_field(path, column.name, name, expected, row=row)
-        values = {field: float(cells[i]) for field, cells in numbers.items() if not math.isnan(cells[i])}
-        models[name] = parse_model(kind, values, f"{path}:{row}")
+            raise bad_field(cells.path, column.name, name, expected, row=row)
+        values = {field: float(rows[i]) for field, rows in numbers.items() if not math.isnan(rows[i])}
+        models[name] = parse_model(kind, values, f"{cells.path}:{row}")
         first_rows[name] = row
     return models
 

@@ -56,10 +56,7 @@ def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[s
     jumps = (speeds > FASTER * fastest) | (turns > FASTER * _largest_before(turns, TURN))
     zeros = np.all(np.abs(poses[1:]) < ZERO, axis=1) & (speeds * durations > RESET_DISTANCE) & (durations > HOLD_TIME)
     anew = np.flatnonzero((home & jumps) | zeros)
-    for i in anew.tolist():
-        previous = se2.log(moves[i - 1]) / durations[i - 1] if i else np.zeros(3)
-        moves[i] = se2.exp(previous * min(float(durations[i]), HOLD_TIME))
-    _tell(source, t_ns, anew, warnings)
+    moves[anew] = se2.exp(_continued(source, t_ns, se2.log(moves), anew, warnings)[anew])
     return moves
 
 
@@ -77,11 +74,7 @@ def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array
     fastest = _largest_before(speeds, SPEED)
     home = np.abs(distances[1:]).max(axis=1, initial=0.0) <= RESET_DISTANCE + fastest * durations
     anew = np.flatnonzero(home & (speeds > FASTER * fastest))
-    for i in anew.tolist():
-        previous = steps[i - 1] / durations[i - 1] if i else np.zeros(2)
-        steps[i] = previous * min(float(durations[i]), HOLD_TIME)
-    _tell(source, t_ns, anew, warnings)
-    return steps
+    return _continued(source, t_ns, steps, anew, warnings)
 
 
 def between_wheels(
@@ -135,13 +128,19 @@ def _largest_before(rates: Array, least: float) -> Array:
     return out
 
 
-def _tell(source: object, t_ns: Integers, anew: Integers, warnings: list[str]) -> None:
+def _continued(source: object, t_ns: Integers, steps: Array, anew: Integers, warnings: list[str]) -> Array:
+    """Steps (N - 1, D) with that before each reset ``anew`` continued, and a warning if there are any."""
+    durations = _durations(t_ns)
+    for i in anew.tolist():
+        previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])
+        steps[i] = previous * min(float(durations[i]), HOLD_TIME)
     if len(anew):
         at = (int(t_ns[anew[0] + 1]) - int(t_ns[0])) / 1e9
         times = "" if len(anew) == 1 else f" {len(anew)} times, first"
         warnings.append(
             f"{source}: the odometry is reset{times} {at:.1f} s after its start: the previous motion is continued there"
         )
+    return steps
 
 
 def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, Any]:

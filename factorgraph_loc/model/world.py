@@ -39,15 +39,14 @@ class World(FileModel):
         layer: dict[str, L] = getattr(self, next(name for name, of_layer in _KINDS.items() if of_layer is kind))
         return layer
 
-    def position(self, name: str, layer: str | None = None) -> Array | None:
-        """Position (2,) of an element of ``layer``, by default the first layer; None if it is not in the map."""
-        element = getattr(self, layer or next(iter(_KINDS))).get(name)
-        return None if element is None else np.array((element.x, element.y))
+    def position(self, name: str) -> Array | None:
+        """Position (2,) of a landmark; None if it is not in the map."""
+        landmark = self.landmarks.get(name)
+        return None if landmark is None else np.array((landmark.x, landmark.y))
 
-    def positions(self, layer: str | None = None) -> Array:
-        """Positions (K, 2) of all elements of ``layer``, by default the first layer, in the order of the map."""
-        elements = getattr(self, layer or next(iter(_KINDS))).values()
-        return np.array([(element.x, element.y) for element in elements]).reshape(-1, 2)
+    def positions(self) -> Array:
+        """Positions (K, 2) of all landmarks, in the order of the map."""
+        return np.array([(landmark.x, landmark.y) for landmark in self.landmarks.values()]).reshape(-1, 2)
 
 
 _KINDS: dict[str, type[FileModel]] = {name: load(layer.kind) for name, layer in layers().items()}

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from factorgraph_loc.drawing.pages import Part
-from factorgraph_loc.files.models import FileModel, bounds
+from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fitting.posterior import (
     FittedConstant,
     Likelihood,
@@ -25,11 +25,6 @@ from factorgraph_loc.sensors.smoothed import Traced, pooled_constants
 from factors.se2 import Array
 
 BLOCK = 20.0  # s; errors within a block may be correlated
-
-
-def upper_bounds(kind: type[FileModel]) -> dict[str, float]:
-    """The upper bound of each number of a model."""
-    return {name: bounds(field.metadata)[1] for name, field in kind.model_fields.items()}
 
 
 @dataclass(frozen=True)
@@ -69,15 +64,14 @@ class SensorKnowledge:
 class Calibrator:
     """The calibration of one sensor.
 
-    ``section``: of the rig; ``channel``: the stream that a log must have; ``senses``: whether the robot can be localized by it.
-    ``uncertain``: the constants that an estimator can learn on each run, with the rig's upper bounds; ``first``: settings of an
-    unknown sensor.
+    ``section``: of the rig; ``channel``: the stream that a log must have; ``senses``: whether the robot can be localized by it;
+    ``first``: settings of an unknown sensor. The ``uncertainty`` of a section has the constants that an estimator can learn on
+    each run.
     """
 
     section: ClassVar[str]
     channel: ClassVar[str]
     senses: ClassVar[bool] = True
-    uncertain: ClassVar[Mapping[str, float]] = {}
     first: ClassVar[FileModel | None] = None
 
     def learn(
@@ -94,7 +88,7 @@ class Calibrator:
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
         """The rig with the uncertainties of the ``first`` one. Learnt ones are for later runs: in the next turn they would hold
         constants near the values of the last."""
-        if getattr(rig, self.section) is None or not self.uncertain:
+        if not hasattr(getattr(rig, self.section), "uncertainty"):
             return rig
         uncertainty = getattr(first, self.section).uncertainty
         settings = getattr(rig, self.section).model_copy(update={"uncertainty": uncertainty})
@@ -146,10 +140,7 @@ class ConstantsCalibrator(Calibrator):
         data = [self.part(replace(trace.log, rig=rig)) for trace in traced]
         parts, settings, posterior = self.estimated(data, self.settings(rig))
         constants = [] if posterior is None else self._constants(parts, settings, self.settings(rig), posterior)
-        if self.uncertain and len(parts) > 1:
-            uncertainties = {
-                c.name: min(c.uncertainty, self.uncertain[c.name]) for c in constants if c.uncertainty is not None
-            }
+        if uncertainties := {c.name: c.uncertainty for c in constants if c.uncertainty is not None}:
             settings = settings.model_copy(
                 update={"uncertainty": settings.uncertainty.model_copy(update=uncertainties)}
             )
@@ -195,7 +186,7 @@ class ConstantsCalibrator(Calibrator):
             if len(alone) > 1:
                 between = float(np.sqrt(np.sum((np.array(each) - values[p.name]) ** 2) / (len(each) - 1)))
                 error = max(error, between / np.sqrt(len(each)))
-                if p.name in self.uncertain:
+                if hasattr(getattr(settings, "uncertainty", None), p.name):
                     uncertainty = max(between, error) / (abs(values[p.name]) if "scale" in p.name else 1.0)
             start, fitted = float(getattr(initial, p.name)), values[p.name]
             out.append(FittedConstant(self.section, p.name, start, fitted, error, p.sigma, tuple(each), uncertainty))
@@ -203,9 +194,9 @@ class ConstantsCalibrator(Calibrator):
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
         """The means of what the smoother estimated in each log."""
-        if getattr(rig, self.section) is None or not self.uncertain:
+        if not hasattr(getattr(rig, self.section), "uncertainty"):
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""
         settings, initial = getattr(rig, self.section), getattr(first, self.section)
-        settings, constants = pooled_constants(self.section, prefix, settings, initial, self.uncertain, traced)
+        settings, constants = pooled_constants(self.section, prefix, settings, initial, traced)
         return SensorKnowledge({self.section: settings}, constants)

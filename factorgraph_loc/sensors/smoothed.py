@@ -81,17 +81,17 @@ def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, flo
 
 
 def pooled_constants(
-    section: str, prefix: str, settings: Any, first: Any, names: Mapping[str, float], traced: Sequence[Traced]
+    section: str, prefix: str, settings: Any, first: Any, traced: Sequence[Traced]
 ) -> tuple[Any, list[FittedConstant]]:
-    """The ``settings`` of a section with those of its constants ``names`` (with upper bounds of their uncertainties) that were
-    estimated in all logs, and these constants. ``first``: the settings before anything was learnt.
+    """The ``settings`` of a section with those of its uncertain constants that were estimated in all logs, and these constants.
+    ``first``: the settings before anything was learnt.
 
     Scales are corrected by factors, others by sums. The uncertainty is written if there are several logs.
     """
     values: dict[str, float] = {}
     uncertainties: dict[str, float] = {}
     out = []
-    for name, most in names.items():
+    for name in type(first.uncertainty).model_fields:
         if not (corrections := corrections_of(prefix + name, traced)):
             continue
         initial, current = float(getattr(first, name)), float(getattr(settings, name))
@@ -100,7 +100,7 @@ def pooled_constants(
         result = pooled(changes, float(getattr(first.uncertainty, name)))
         values[name] = initial + unit * result.mean
         if len(changes) > 1:
-            uncertainties[name] = min(result.scatter, most)
+            uncertainties[name] = result.scatter
         each = tuple((initial + unit * result.each).tolist())
         error, uncertainty = abs(unit) * result.error, uncertainties.get(name)
         out.append(FittedConstant(section, name, initial, values[name], error, None, each, uncertainty))

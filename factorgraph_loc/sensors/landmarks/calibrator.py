@@ -19,11 +19,10 @@ from factorgraph_loc.fitting.posterior import (
 )
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, Residuals, SensorKnowledge, upper_bounds
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, Residuals, SensorKnowledge
 from factorgraph_loc.sensors.landmarks.measurement import (
     BearingRangeSettings,
     BearingRangeStream,
-    BearingRangeUncertainty,
 )
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factors import se2
@@ -114,8 +113,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
     """The calibrator of a landmark sensor."""
 
     section, channel = "bearing_range", "bearing_range"
-    uncertain, rounds = upper_bounds(BearingRangeUncertainty), 4
-    first = FIRST
+    first, rounds = FIRST, 4
 
     def part(self, log: Log) -> Sightings:
         """The sightings of mapped landmarks, with a margin for clock offsets; InputError if there are too few."""

@@ -1,7 +1,7 @@
 """Measurements of identified landmarks, their stream, and its table."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -195,8 +195,8 @@ def read_landmarks(path: Path, mapping: ColumnMapping) -> dict[str, Landmark]:
     """Read a foreign table with the fields landmark, x, y and optionally sigma, or sigma_x and sigma_y; the larger one is
     used. InputError names file, row and field of an invalid value, or of a duplicate name."""
     position = ("landmark", "x", "y")
-    mapped = read_mapped(path, mapping, (position, (*position, "sigma"), (*position, "sigma_x", "sigma_y")))
-    numbers = {name: mapped.numbers(name, LANDMARKS[name]) for name in mapped.columns if name != "landmark"}
-    if "sigma_x" in numbers:
-        numbers["sigma"] = np.fmax(numbers.pop("sigma_x"), numbers.pop("sigma_y"))
-    return rows_by_name(Landmark, path, mapped.rows, LANDMARKS["landmark"], mapped.texts("landmark"), numbers)
+    cells = read_mapped(path, mapping, (position, (*position, "sigma"), (*position, "sigma_x", "sigma_y")))
+    if "sigma_x" in cells.columns:
+        larger = np.fmax(*(cells.numbers(name, LANDMARKS[name]) for name in ("sigma_x", "sigma_y")))
+        cells = replace(cells, columns={name: cells.columns[name] for name in position} | {"sigma": larger})
+    return rows_by_name(Landmark, cells, LANDMARKS, cells.texts("landmark"))

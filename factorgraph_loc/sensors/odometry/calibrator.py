@@ -18,14 +18,13 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.posterior import Parameter, robust_sigma
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, Residuals, SensorKnowledge, upper_bounds
+from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, Residuals, SensorKnowledge
 from factorgraph_loc.sensors.motion import integrated, odometry_model, odometry_of, overlap
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import (
     GrowthSettings,
     OdometryNoise,
     OdometrySettings,
-    OdometryUncertainty,
 )
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Traced
 from factors import chi_squared, se2
@@ -210,7 +209,6 @@ class OdometryCalibrator(ConstantsCalibrator):
     """The calibrator of wheel odometry."""
 
     section, channel, senses = "odometry", "odometry", False
-    uncertain = upper_bounds(OdometryUncertainty)
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None

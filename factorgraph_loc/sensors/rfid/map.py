@@ -60,7 +60,7 @@ def read_layer(content: Any, source: object, folder: Path) -> Any:
         return read_tags(inside(folder, content, source))
     if isinstance(content, dict) and isinstance(content.get("file"), str):
         mapping = parse_model(TagsFile, content, f"{source} [tags]")
-        return read_mapped_tags(inside(folder, mapping.file, source), mapping)
+        return read_tags(inside(folder, mapping.file, source), mapping)
     return content
 
 
@@ -72,22 +72,17 @@ def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
     return base.name + TAGS_SUFFIX
 
 
-def read_tags(path: Path) -> dict[str, Tag]:
-    """Read ``NAME.tags.csv`` with the columns epc, x, y, z, facing and optionally sigma; facing may be empty.
+def read_tags(path: Path, mapping: TagsFile | None = None) -> dict[str, Tag]:
+    """Read ``NAME.tags.csv`` with the columns epc, x, y, z, facing and optionally sigma; facing may be empty; or a foreign table
+    with a ``mapping``.
 
     InputError names file, row and field of an invalid value, or of a duplicate EPC.
     """
-    cells, columns = read_cells(path, (TAGS,))
-    numbers = {column.name: cells.numbers(column.name, column) for column in columns[1:]}
-    return rows_by_name(Tag, path, cells.rows, TAGS["epc"], cells.texts("epc"), numbers)
-
-
-def read_mapped_tags(path: Path, mapping: TagsFile) -> dict[str, Tag]:
-    """Read a foreign table; InputError as in :func:`read_tags`."""
-    mapped = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
-    numbers = {name: mapped.numbers(name, TAGS[name]) for name in mapped.columns if name != "epc"}
-    epcs = in_case(mapped.texts("epc"), mapping.epc_case)
-    return rows_by_name(Tag, path, mapped.rows, TAGS["epc"], epcs, numbers)
+    if mapping is None:
+        cells, _ = read_cells(path, (TAGS,))
+        return rows_by_name(Tag, cells, TAGS, cells.texts("epc"))
+    cells = read_mapped(path, mapping, (("epc", "x", "y"),), ("z", "facing", "sigma"))
+    return rows_by_name(Tag, cells, TAGS, in_case(cells.texts("epc"), mapping.epc_case))
 
 
 def write_tags(tags: Mapping[str, Tag], path: Path) -> None:

@@ -30,7 +30,7 @@ class CompassCalibrator(ConstantsCalibrator):
     """The calibrator of the bias."""
 
     section, channel, senses = "compass", "compass", False
-    uncertain, first = {"bias": 1.0}, CompassSettings()
+    first = CompassSettings()
 
     def part(self, log: Log) -> Headings:
         """The headings within the reference."""
