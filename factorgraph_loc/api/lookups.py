@@ -19,7 +19,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import ESTIMATORS, POLICIES, PRESETS, READERS, SENSORS
 from factorgraph_loc.sensors.registry import about, sections_of, sensor
-from factorgraph_loc.sensors.tables import tables_of_sensor
+from factorgraph_loc.sensors.tables import all_tables
 from factorgraph_loc.simulation.settings import SimulationSettings, preset
 
 ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
@@ -77,7 +77,7 @@ def describe_sensor(name: str) -> SensorDescription:
         described.name,
         about(described.name),
         tuple(channel.name for channel in described.channels),
-        {table.name: table.columns for table in tables_of_sensor(described)},
+        {table.name: table.columns for table in all_tables(described)},
         {section: tuple(settings) for section, settings in sections_of(described).items()},
     )
 

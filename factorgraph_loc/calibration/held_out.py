@@ -107,7 +107,7 @@ def _is_known(trial: Trial, key: str) -> bool:
 def growth(trials: Sequence[Trial]) -> float:
     """Position error with the learnt rig divided by that with the input rig: geometric mean over estimators, causal and final
     poses; NaN if unknown."""
-    return _ratio(trials, _error)
+    return _ratio(trials, lambda mine, rig, kind: pooled(mine, rig, f"{kind}.position_rmse"))
 
 
 def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
@@ -119,10 +119,6 @@ def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], 
         if (mine := [t for t in trials if t.estimator == estimator and _is_known(t, f"{kind}.position_rmse")])
     ]
     return math.exp(np.mean(np.log(ratios))) if ratios else math.nan
-
-
-def _error(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    return pooled(trials, rig, f"{kind}.position_rmse")
 
 
 def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:

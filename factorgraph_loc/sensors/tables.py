@@ -65,17 +65,12 @@ def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
     }
 
 
-def all_tables() -> Iterator[Table]:
-    """The descriptions of all tables of all sensors."""
-    for sensor in sensors().values():
-        yield from tables_of_sensor(sensor)
-
-
-def tables_of_sensor(sensor: SensorType) -> Iterator[Table]:
-    """The descriptions of the tables of a sensor: of its channels, then of its layers of the map."""
-    for channel in sensor.channels:
-        yield from (load(place) for place in (*channel.tables, *channel.described))
-    yield from (load(layer.table) for layer in sensor.layers.values() if layer.table)
+def all_tables(*chosen: SensorType) -> Iterator[Table]:
+    """The descriptions of the tables of sensors, by default of all: of the channels of each, then of its layers of the map."""
+    for sensor in chosen or sensors().values():
+        for channel in sensor.channels:
+            yield from (load(place) for place in (*channel.tables, *channel.described))
+        yield from (load(layer.table) for layer in sensor.layers.values() if layer.table)
 
 
 def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) -> Stream:

@@ -9,7 +9,6 @@ from changed_logs import with_stream
 from factorgraph_loc.calibration import learn as learning
 from factorgraph_loc.calibration.calibrate import check
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.sensors.landmarks.calibrator import SIGMAS
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.smoothed import Traced
 from factors import se2
@@ -45,27 +44,21 @@ def test_the_constants_are_found(knowledge, name, truth):
     assert result.error < 0.1 * abs(truth - result.initial)
 
 
-def share_of(knowledge):
-    """The share of independent sightings."""
-    return knowledge.sensors["landmarks"].figures["noise_factor"] ** -2
-
-
-def scatter_of(knowledge):
-    """The settings of the landmarks with the scatter of their errors as noise, which is not widened for correlations."""
-    settings, share = knowledge.rig.bearing_range, share_of(knowledge)
-    return settings.model_copy(update={name: share**0.5 * getattr(settings, name) for name in SIGMAS})
+def widened(knowledge):
+    """How much the noise of the landmarks is widened for correlated errors."""
+    return knowledge.sensors["landmarks"].figures["noise_factor"]
 
 
 def test_the_scatter_is_found_without_the_outliers(knowledge):
-    sensor = scatter_of(knowledge)
+    sensor = knowledge.rig.bearing_range
     at_4_m = np.hypot(sensor.range_sigma, 4.0 * sensor.range_sigma_relative)
-    assert at_4_m == pytest.approx(0.03, rel=0.1)
-    assert sensor.bearing_sigma == pytest.approx(0.01, rel=0.1)
+    assert at_4_m / widened(knowledge) == pytest.approx(0.03, rel=0.1)
+    assert sensor.bearing_sigma / widened(knowledge) == pytest.approx(0.01, rel=0.1)
 
 
 def test_white_errors_are_worth_independent_ones(knowledge, simulate):
     """Errors of a landmark that last for 3 s, as of a Gauss-Markov process, are not."""
-    assert share_of(knowledge) > 0.6
+    assert widened(knowledge) ** -2 > 0.6
     log = simulate(seconds=240.0, range_sigma=1e-6)
     sightings, rng = log.streams["bearing_range"], np.random.default_rng(3)
     errors = np.zeros(len(sightings.t))
@@ -83,7 +76,7 @@ def test_white_errors_are_worth_independent_ones(knowledge, simulate):
             "bearing_range": replace(sightings, range=sightings.range + errors),
         },
     )
-    assert share_of(learn(with_errors)) < 0.3
+    assert widened(learn(with_errors)) ** -2 < 0.3
 
 
 def test_constants_that_the_robot_does_not_have_are_within_chance(simulate):
@@ -115,7 +108,7 @@ def test_gross_ranges_do_not_widen_the_noise(simulate):
     result = learn(with_stream(log, "bearing_range", range=sightings.range + long))
     (scale,) = (c for c in result.constants if c.name == "range_scale")
     assert scale.fitted == pytest.approx(1.0, abs=4.0 * scale.error + 1e-3)
-    assert scatter_of(result).range_sigma < 0.06
+    assert result.rig.bearing_range.range_sigma / widened(result) < 0.06
 
 
 @pytest.mark.parametrize(("depth", "kind"), [(True, "depth"), (False, "distance")])
@@ -123,9 +116,9 @@ def test_depths_are_told_from_distances(simulate, depth, kind):
     log = simulate(seconds=100.0, depth=depth)
     knowledge = learn(log)
     assert knowledge.rig.bearing_range.range_kind == kind
-    fit = scatter_of(knowledge)
+    fit = knowledge.rig.bearing_range
     scatter = np.hypot(fit.range_sigma, 4.0 * fit.range_sigma_relative)
-    assert scatter == pytest.approx(0.03, rel=0.15)
+    assert scatter / widened(knowledge) == pytest.approx(0.03, rel=0.15)
 
 
 def test_what_differs_between_logs_becomes_an_uncertainty(simulate):

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from factorgraph_loc.io.bags.poses import (
     static_frames,
 )
 from factorgraph_loc.io.bags.tables import Landmarks, LandmarkTopic, Reads, RfidTopic, TableTopic, rows_of_table
-from factorgraph_loc.io.bags.topics import TF, Clock, Gatherer, Listeners, report
+from factorgraph_loc.io.bags.topics import TF, Clock, Listeners, report
 from factorgraph_loc.io.motions import odometry_stream
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.model.log import NOT_READ, RIG_NOTES, Log
@@ -105,12 +105,6 @@ OTHERS = [
 add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS}, after="camera")
 
 
-class Streamed(Gatherer, Protocol):
-    """Collects the rows of a stream."""
-
-    def stream(self, t0_ns: int, warnings: list[str]) -> Stream: ...
-
-
 def read(path: Path | None, options: Options) -> Log:
     """The log in a bag; t = 0 at the first odometry. InputError names bag, topic, message and field of an invalid value."""
     if path is None:
@@ -168,10 +162,10 @@ def _left_out(bag: Bag, listeners: Listeners) -> str:
     return ", ".join(f"{topic.name} ({topic.type})" for topic in unread)
 
 
-def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Streamed]:
+def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Any]:
     """Register collectors for the sensors in the manifest except odometry, and return them by name of stream."""
     bag = listeners.bag
-    out: dict[str, Streamed] = {}
+    out: dict[str, Any] = {}
     if options.imu:
         out["imu"] = listeners.listen(options.imu, YawRates(bag, options.imu, frames))
     if options.rfid:

@@ -17,7 +17,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ReadNames, in_case
 from factorgraph_loc.files.columns import LATEST, POSES, STAMP, Column, Table
 from factorgraph_loc.files.models import InUnit
-from factorgraph_loc.files.tables import NAMES, NUMBERS, TableRows
+from factorgraph_loc.files.tables import NAMES, NUMBERS, Cells, TableRows
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import StaticFrames
 from factorgraph_loc.io.bags.topics import LIST, Fields, TopicRows, TopicSettings, as_nanoseconds, as_text, leaves
@@ -78,15 +78,11 @@ class RowsOfTopic:
         units: Mapping[Any, str | float] | None = None,
     ) -> None:
         self._fields = Fields(bag, bag.topic(topic), fields)
-        self._table = table
-        columns, units = columns or table.columns[1:], units or {}
-        self._named = [column for column in columns if column.kind in NAMES]
-        numbered = [column for column in columns if column.kind in NUMBERS]
-        self._numbered = [column.name for column in numbered]
-        source = f"{bag.path} {topic}"
-        self._units = [column.in_unit(units.get(column.name, 1.0), source)[1] for column in numbered]
+        self._table, self._columns, self._units = table, columns or table.columns[1:], units or {}
+        self._named = [column for column in self._columns if column.kind in NAMES]
+        self._numbered = [column.name for column in self._columns if column.kind in NUMBERS]
         self._names: dict[str, list[str]] = {column.name: [] for column in self._named}
-        self._rows = TopicRows(source, len(numbered))
+        self._rows = TopicRows(f"{bag.path} {topic}", len(self._numbered))
 
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the rows of a message."""
@@ -108,9 +104,10 @@ class RowsOfTopic:
         raise bad_field(self._rows.source, column.name, text, column.doc, row=row)
 
     def rows_of(self) -> TableRows:
-        """The collected rows."""
-        numbers = dict(zip(self._numbered, (self._rows.values * self._units).T, strict=True))
-        return TableRows(Path(self._rows.source), self._rows.rows, self._rows.t_ns, numbers, self._names)
+        """The collected rows; InputError for a number that is missing or out of bounds."""
+        cells = {**self._names, **dict(zip(self._numbered, self._rows.values.T, strict=True))}
+        read = Cells(Path(self._rows.source), self._rows.rows, cells, units=self._units)
+        return TableRows.of(read, self._columns, self._rows.t_ns)
 
     def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
         """The rows as a stream; problems are an InputError or a warning."""
@@ -177,7 +174,6 @@ class Reads(RowsOfTopic):
         """All reads in their rounds. InputError names the invalid message."""
         table = self.rows_of()
         table = replace(table, names=table.names | {"epc": in_case(table.names["epc"], self._options.epc_case)})
-        native_rfid.check_reads(table)
         if self._options.rounds == "gaps":
             return native_rfid.read_rounds(table, None, self._options.round_gap, warnings).stream(t0_ns)
         ends = [max([t_ns, *table.t_ns[reads].tolist()]) for t_ns, reads, _ in self._rounds]

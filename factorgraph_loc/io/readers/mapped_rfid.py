@@ -27,7 +27,7 @@ from factorgraph_loc.files.columns import PURE, Column
 from factorgraph_loc.files.models import FileModel, InUnit, read_toml
 from factorgraph_loc.files.tables import Cells, TableRows
 from factorgraph_loc.sensors.rfid.stream import RFID
-from factorgraph_loc.sensors.rfid.tables import SIGNALS, check_reads
+from factorgraph_loc.sensors.rfid.tables import SIGNALS
 from factorgraph_loc.text import listed, quoted
 from factors.se2 import Array
 
@@ -178,7 +178,6 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
         numbers,
         {"epc": _epcs(mapped, options.epc_case), "antenna": [options.antennas.get(str(a), str(a)) for a in antennas]},
     )
-    check_reads(table)
     return joined(path, [_with_last(table, mapped, options, folder.warnings)])
 
 

@@ -14,7 +14,7 @@ from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
-from factorgraph_loc.sensors.rfid.stream import RFID, RfidStream
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 from factors.se2 import Array, Integers
 
@@ -137,8 +137,6 @@ def read_rounds(
 
     InputError names file, row and field of an invalid value; reads outside of every inventory are skipped with a warning.
     """
-    if reads is not None:
-        check_reads(reads)
     if inventories is not None:
         return _from_inventories(reads, inventories, warnings)
     assert reads is not None
@@ -194,13 +192,6 @@ def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in ("rssi", "phase", "frequency"))
     return ReadsByRound(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
-
-
-def check_reads(reads: TableRows) -> None:
-    """InputError for physically impossible values, for example in a wrong unit."""
-    for name in SIGNALS:
-        if name in reads.numbers:
-            RFID[name].require(reads.path, reads.rows, reads.numbers[name])
 
 
 def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
