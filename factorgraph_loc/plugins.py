@@ -36,10 +36,6 @@ class Group(Mapping[str, Any]):
         self.own: dict[str, Place] = {}
         self._others: dict[str, tuple[Place, str]] | None = None  # place and name of the package
 
-    def forget(self) -> None:
-        """Search for entry points again at the next access."""
-        self._others = None
-
     def place(self, name: str) -> Place:
         """The place of a name; KeyError if it is unknown."""
         return self.own[name] if name in self.own else self._installed()[name][0]

@@ -11,12 +11,20 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.fusion import registry as estimators
 from factorgraph_loc.io.readers import reader
-from factorgraph_loc.model.sections import Section
+from factorgraph_loc.model.sections import Section, registered
 from factorgraph_loc.plugins import ESTIMATORS, READERS, SENSORS, load
 from factorgraph_loc.sensors import registry
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
 SONAR = SensorType("sonar", (Channel("sonar", section="sonar"),), {"sonar": Section("sonar:Settings")})
+
+
+def search_again():
+    """The next access searches for entry points again."""
+    for kind in (ESTIMATORS, READERS, SENSORS):
+        kind._others = None
+    for function in (registered, registry.channels, registry.sensor_of):
+        function.cache_clear()
 
 
 @pytest.fixture
@@ -34,15 +42,11 @@ def install(monkeypatch):
             "entry_points",
             lambda *, group: [*(e for e in found if e.group == group), *installed(group=group)],
         )
-        for kind in (ESTIMATORS, READERS):
-            kind.forget()
-        registry.forget()
+        search_again()
 
     yield put
     monkeypatch.undo()
-    for kind in (ESTIMATORS, READERS):
-        kind.forget()
-    registry.forget()
+    search_again()
 
 
 @pytest.fixture

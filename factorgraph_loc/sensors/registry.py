@@ -165,10 +165,3 @@ def functions(kind: str) -> Iterator[tuple[str, Any]]:
     for name, sensor in sensors().items():
         if place := getattr(sensor, kind):
             yield name, load(place)
-
-
-def forget() -> None:
-    """Search for installed sensors again at the next access."""
-    SENSORS.forget()
-    for function in (registered, channels, sensor_of):
-        function.cache_clear()

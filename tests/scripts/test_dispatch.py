@@ -12,12 +12,11 @@ from functools import cache
 
 from package_tables import ROOT
 
-from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import channels, sensors
 
 PACKAGE = ROOT / "factorgraph_loc"
 APART = ("sensors", "io", "builtin.py")  # the last lists what there is
-STREAMS = [load(place) for channel in channels().values() for place in channel.streams]
+STREAMS = [stream for channel in channels().values() for stream in channel.streams]
 CLASSES = [*STREAMS, *(stream.kind for stream in STREAMS)]
 TYPES = {kind.__name__ for kind in CLASSES}
 HELD = {field.name for kind in CLASSES for field in fields(kind)} - {"t", "source"}
