@@ -224,8 +224,8 @@ def rows_by_name(kind: type[Model], cells: Cells, table: Table, names: Sequence[
 
     InputError names file and row of an empty or repeated name, and of an invalid value.
     """
-    column, *others = table.columns
-    numbers = {other.name: cells.numbers(other.name, other) for other in others if other.name in cells.columns}
+    column, *fields = table.columns
+    numbers = {known.name: cells.numbers(known.name, known) for known in fields if known.name in cells.columns}
     models: dict[str, Model] = {}
     first_rows: dict[str, int] = {}
     for i, (row, name) in enumerate(zip(cells.rows.tolist(), names, strict=True)):

@@ -128,15 +128,15 @@ def _largest_before(rates: Array, least: float) -> Array:
     return out
 
 
-def _continued(source: object, t_ns: Integers, steps: Array, anew: Integers, warnings: list[str]) -> Array:
-    """Steps (N - 1, D) with that before each reset ``anew`` continued, and a warning if there are any."""
+def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[str]) -> Array:
+    """Steps (N - 1, D), with the previous one continued at each reset; ``resets``: their indices."""
     durations = _durations(t_ns)
-    for i in anew.tolist():
+    for i in resets.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])
         steps[i] = previous * min(float(durations[i]), HOLD_TIME)
-    if len(anew):
-        at = (int(t_ns[anew[0] + 1]) - int(t_ns[0])) / 1e9
-        times = "" if len(anew) == 1 else f" {len(anew)} times, first"
+    if len(resets):
+        at = (int(t_ns[resets[0] + 1]) - int(t_ns[0])) / 1e9
+        times = "" if len(resets) == 1 else f" {len(resets)} times, first"
         warnings.append(
             f"{source}: the odometry is reset{times} {at:.1f} s after its start: the previous motion is continued there"
         )
