@@ -36,7 +36,7 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
     chosen: list[int] = []
     for i in range(len(cameras)):
         near = np.linalg.norm(cameras.positions[chosen] - cameras.positions[i], axis=1) < distance
-        if not np.any(near & (_angles(cameras.rotations[chosen], cameras.rotations[i]) < angle)):
+        if not np.any(near & (angles_between(cameras.rotations[chosen], cameras.rotations[i]) < angle)):
             chosen.append(i)
     return np.array(chosen, dtype=np.int64)
 
@@ -46,7 +46,7 @@ def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
     pairs = set()
     for i in range(len(cameras)):
         distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
-        turn = _angles(cameras.rotations, cameras.rotations[i])
+        turn = angles_between(cameras.rotations, cameras.rotations[i])
         cost = distance / APART + turn / ASKEW
         cost[i] = np.inf
         order = np.argsort(cost, kind="stable")
@@ -135,7 +135,7 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
     return Tracks(track, frame, feature, pixels)
 
 
-def _angles(rotations: Array, rotation: Array) -> Array:
-    """Angles (F,) [rad] between ``rotations`` (F, 3, 3) and one (3, 3)."""
-    trace = np.einsum("nij,ij->n", rotations, rotation)
+def angles_between(first: Array, second: Array) -> Array:
+    """Angles (F,) [rad] between rotations ``first`` (F, 3, 3) and ``second`` (F, 3, 3), or one (3, 3)."""
+    trace = np.einsum("nij,nij->n", *np.broadcast_arrays(first, second))
     return np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))

@@ -18,7 +18,7 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.mapping import bundle
 from factorgraph_loc.mapping.bundle import Bundle
-from factorgraph_loc.mapping.feature_tracks import chained, keyframes, matched_pairs, overlapping_pairs
+from factorgraph_loc.mapping.feature_tracks import angles_between, chained, keyframes, matched_pairs, overlapping_pairs
 from factorgraph_loc.mapping.triangulation import PARALLAX, Cameras, Tracks, parallax, reproject, triangulate
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log
@@ -191,7 +191,8 @@ def _made(
     """The map of the points that fulfil the settings, and the report."""
     kept, points, covariances, angles = _kept(adjusted, settings)
     errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
-    shift, turn = _moved(posed.cameras, adjusted.cameras)
+    shift = np.linalg.norm(adjusted.cameras.positions - posed.cameras.positions, axis=1)
+    turn = angles_between(posed.cameras.rotations, adjusted.cameras.rotations)
     report = PointReport(
         keyframes=len(posed.frames),
         pairs=pairs,
@@ -249,13 +250,6 @@ def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int
             apart = np.minimum(apart, np.linalg.norm(places - places[taken[-1]], axis=1))
         chosen += rows[taken].tolist()
     return np.array(chosen, dtype=np.int64)
-
-
-def _moved(old: Cameras, new: Cameras) -> tuple[Array, Array]:
-    """Change of each camera's position (F,) [m] and orientation (F,) [rad]."""
-    trace = np.einsum("nij,nij->n", old.rotations, new.rotations)
-    shift = np.linalg.norm(new.positions - old.positions, axis=1)
-    return shift, np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
 def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) -> PosedFrames:

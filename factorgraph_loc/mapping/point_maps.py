@@ -66,24 +66,7 @@ def thinned(points: PointMap, most: int) -> PointMap:
     rank = np.empty(len(viewed), dtype=np.int64)
     rank[order] = np.arange(len(viewed)) - np.repeat(starts, np.diff(np.append(starts, len(viewed))))
     kept = viewed[np.lexsort((sigma[viewed], rank))[:most]]
-    return chosen(points, np.sort(np.concatenate((kept, np.setdiff1d(np.arange(len(points)), viewed)))))
-
-
-def chosen(points: PointMap, which: Integers) -> PointMap:
-    """The points with indices ``which``, with their views."""
-    place = np.full(len(points), -1, dtype=np.int64)
-    place[which] = np.arange(len(which))
-    views = np.flatnonzero(place[points.owners] >= 0)
-    return PointMap(
-        tuple(points.names[i] for i in which.tolist()),
-        points.positions[which],
-        points.covariances[which],
-        points.feature if len(views) else "",
-        place[points.owners[views]],
-        points.descriptors[views],
-        points.seen_from[views],
-        None if points.common is None else points.common[views],
-    )
+    return points.chosen(np.sort(np.concatenate((kept, np.setdiff1d(np.arange(len(points)), viewed)))))
 
 
 def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers) -> PointMap:

@@ -19,7 +19,7 @@ from factorgraph_loc.files.tables import read_parquet, text_column, write_parque
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.text import listed
 from factors.positive import worst_sigma
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 POINTS_SUFFIX = ".points.parquet"
 COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
@@ -89,6 +89,22 @@ class PointMap:
             np.empty(0, dtype=np.int64),
             np.empty((0, 0)),
             np.empty((0, 3)),
+        )
+
+    def chosen(self, which: Integers) -> PointMap:
+        """The points with indices ``which``, with their views."""
+        place = np.full(len(self), -1, dtype=np.int64)
+        place[which] = np.arange(len(which))
+        views = np.flatnonzero(place[self.owners] >= 0)
+        return PointMap(
+            tuple(self.names[i] for i in which.tolist()),
+            self.positions[which],
+            self.covariances[which],
+            self.feature if len(views) else "",
+            place[self.owners[views]],
+            self.descriptors[views],
+            self.seen_from[views],
+            None if self.common is None else self.common[views],
         )
 
     def with_points(self, added: PointMap, source: object) -> PointMap:

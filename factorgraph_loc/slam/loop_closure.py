@@ -10,7 +10,7 @@ Geometric verification and consistency over consecutive images: Cadena, Galvez-L
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -121,12 +121,12 @@ def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tup
     somewhere = associator.relocalized(frame)
     if somewhere is None:
         return None
-    *camera, associations = somewhere
-    floor = _on_floor(model, CameraPose(*camera), points, frame, associations)
+    camera, associations = somewhere
+    floor = _on_floor(model, camera, points, frame, associations)
     if floor is None:
         return None
     placed = lifted(model, floor.pose, floor.covariance)
-    associations = associator.guided(frame, placed.position, placed.rotation, placed.covariance, model)
+    associations = associator.guided(frame, placed, model)
     enough = max(FEWEST, LEAST_SHARE * associations.expected)
     floor = _on_floor(model, placed, points, frame, associations) if len(associations) >= enough else None
     if floor is None or np.count_nonzero(floor.inliers) < enough:
@@ -171,17 +171,9 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
 
 def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> PointMap:
     """Some of the points at their newest estimates, with the viewpoints moved along."""
-    points = old.points
+    points = old.points.chosen(rows)
     positions = np.array([current(old.keys[i]) for i in rows.tolist()])
-    return PointMap(
-        tuple(points.names[i] for i in rows.tolist()),
-        positions,
-        points.covariances[rows],
-        points.feature,
-        np.arange(len(rows)),
-        points.descriptors[rows],
-        points.seen_from[rows] + positions - points.positions[rows],
-    )
+    return replace(points, positions=positions, seen_from=points.seen_from + positions - points.positions)
 
 
 def _is_spread_out(model: CameraModel, pixels: Array) -> bool:

@@ -28,7 +28,6 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point
 from factorgraph_loc.slam.monoslam_motion import (
-    PLANAR,
     ROBOT,
     UPRIGHT,
     Origin,
@@ -37,7 +36,6 @@ from factorgraph_loc.slam.monoslam_motion import (
     about_z,
     measured,
     on_the_floor,
-    planar,
     seen_from_above,
     standstill,
 )
@@ -58,7 +56,7 @@ from factorgraph_loc.slam.monoslam_state import (
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import LARGEST_HEIGHT, LARGEST_TILT
 from factors import se2
-from factors.camera.model import TiltScale, carrier
+from factors.camera.model import PLANAR, TiltScale, carrier
 from factors.robust import huber_weight
 from factors.se2 import Array
 
@@ -175,7 +173,7 @@ class Monoslam(Filter):
         increment = self._travelled(t)
         s, robot, dt = self._settings, self._state.robot, increment.duration
         delta, by_constants = self._motion.changed(increment, self._state.constants)
-        step = measured(robot, planar(delta, increment.covariance, by_constants), dt)
+        step = measured(robot, delta, increment.covariance, by_constants, dt)
         self._step = on_the_floor(step, dt, s.height_sigma, *self._state.sway(s.tilt_sigma))
         self._state = self._state.moved(self._step)
 

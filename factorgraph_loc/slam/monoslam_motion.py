@@ -8,16 +8,16 @@ robot's frame, as in ``gtsam.Pose3``. The velocity (3,) in the world frame and t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
+from factors.camera.model import PLANAR
 from factors.se2 import Array
 
 ROBOT = 12  # values of the error state
 TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
-PLANAR = [3, 4, 2]  # indices in the pose's error: x, y and heading of a level robot
 UPRIGHT = [0, 1, 5]  # the components bounded by the floor: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # their velocities
 SETTLING, UNEVEN = 1.0, 3.0  # s, time constant of the return to the floor; where its unevenness is learnt
@@ -79,19 +79,6 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Displacement:
-    """A motion: ``rotation`` (3, 3) and ``shift`` (3,) of the end in the frame of the start.
-
-    ``covariance`` (6, 6): of a perturbation at the end, rotation first. ``by_constants`` (6, P): its derivative by constants.
-    """
-
-    rotation: Array
-    shift: Array
-    covariance: Array
-    by_constants: Array = field(default_factory=lambda: np.zeros((6, 0)))
-
-
-@dataclass(frozen=True)
 class Origin:
     """The start of a run without a map: ``robot`` then, and the covariance (6, 6) of its pose, common to all later poses."""
 
@@ -119,33 +106,26 @@ def standstill(robot: RobotState) -> Step:
     return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
 
 
-def measured(robot: RobotState, motion: Displacement, dt: float) -> Step:
-    """Motion that was measured over ``dt``. It replaces velocity and turn rate, and their noise (reading 4 of the paper)."""
+def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: Array, dt: float) -> Step:
+    """Motion that odometry measured over ``dt``. It replaces velocity and turn rate, and their noise (reading 4 of the paper).
+
+    ``delta`` (3,): x, y and heading of the end in the frame of the start, with ``covariance`` (3, 3) of a perturbation there;
+    ``by_constants`` (3, P): its derivative by constants.
+    """
     dt = max(dt, SHORTEST)
-    rotation = orthonormal(robot.rotation @ motion.rotation)
+    turn, ahead = about_z(float(delta[2])), np.array((delta[0], delta[1], 0.0))
+    rotation = orthonormal(robot.rotation @ turn)
     transition, by_noise = np.zeros((ROBOT, ROBOT)), np.zeros((ROBOT, 6))
-    transition[TURN, TURN] = transition[SHIFT, SHIFT] = motion.rotation.T
-    transition[SHIFT, TURN] = -motion.rotation.T @ cross(motion.shift)
-    transition[VELOCITY, TURN] = -robot.rotation @ cross(motion.shift) / dt
+    transition[TURN, TURN] = transition[SHIFT, SHIFT] = turn.T
+    transition[SHIFT, TURN] = -turn.T @ cross(ahead)
+    transition[VELOCITY, TURN] = -robot.rotation @ cross(ahead) / dt
     by_noise[:6] = np.eye(6)
     by_noise[VELOCITY, SHIFT] = rotation / dt
     by_noise[RATE, TURN] = np.eye(3) / dt
-    shift = robot.rotation @ motion.shift
-    moved = RobotState(robot.position + shift, rotation, shift / dt, log(motion.rotation) / dt)
-    return Step(
-        moved, np.hstack((transition, by_noise @ motion.by_constants)), by_noise @ motion.covariance @ by_noise.T
-    )
-
-
-def planar(delta: Array, covariance: Array, by_constants: Array) -> Displacement:
-    """Odometry of a robot on the floor as a three-dimensional motion: ``delta`` (3,) with ``covariance`` (3, 3) and the derivative
-    ``by_constants`` (3, P).
-    """
-    x, y, heading = delta.tolist()
-    spatial, derivative = np.zeros((6, 6)), np.zeros((6, by_constants.shape[1]))
-    spatial[np.ix_(PLANAR, PLANAR)] = covariance
-    derivative[PLANAR] = by_constants
-    return Displacement(about_z(heading), np.array((x, y, 0.0)), spatial, derivative)
+    by_noise = by_noise[:, PLANAR]
+    shift = robot.rotation @ ahead
+    moved = RobotState(robot.position + shift, rotation, shift / dt, log(turn) / dt)
+    return Step(moved, np.hstack((transition, by_noise @ by_constants)), by_noise @ covariance @ by_noise.T)
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
@@ -205,8 +185,7 @@ def log(rotation: Array) -> Array:
 
 def about_z(angle: float) -> Array:
     """The rotation (3, 3) by ``angle`` [rad] about z."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+    return np.asarray(gtsam.Rot3.Yaw(angle).matrix())
 
 
 def cross(v: Array) -> Array:

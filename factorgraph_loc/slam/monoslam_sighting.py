@@ -12,7 +12,6 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.sensors.camera.known_points import DISAGREES, EXACT, MOST
 from factorgraph_loc.sensors.camera.measurement import Pixels
-from factorgraph_loc.slam.monoslam_motion import PLANAR
 from factorgraph_loc.slam.monoslam_search import agreeing
 from factorgraph_loc.slam.monoslam_state import Eye, Innovation, Sights, SlamState
 from factorgraph_loc.slam.slipping import ENOUGH, more_probable
@@ -24,6 +23,7 @@ from factorgraph_loc.vision.keypoints import spread_out
 from factorgraph_loc.vision.matching import gates, match
 from factorgraph_loc.vision.relocalization import located
 from factors.camera import inverse_depth
+from factors.camera.model import PLANAR
 from factors.se2 import Array, Integers
 
 CLEARANCE = 15.0  # px between a new point and all others
@@ -146,7 +146,7 @@ class FeatureMatcher:
         """The camera pose from this image and the map alone; None if they do not determine it."""
         if m.frame is not None:
             relocated = None if self._associator is None else self._associator.relocalized(m.frame)
-            return None if relocated is None else CameraPose(*relocated[:3])
+            return None if relocated is None else relocated[0]
         known = [(i, self._map.index[name]) for i, name in enumerate(m.names) if name in self._map.index]
         if len(known) < FEWEST_FOUND:
             return None
@@ -165,7 +165,7 @@ class FeatureMatcher:
         if m.feature != self._associator.feature:
             self._diagnostics.ignore("camera: features of another kind than the map's", len(m.pixels))
             return [], 0
-        associations = self._associator.guided(m, *eye.pose(state.robot), eye.camera_covariance(state.covariance))
+        associations = self._associator.guided(m, eye.predicted(state))
         if associations.rejected:
             self._diagnostics.reject(DISAGREES, associations.rejected)
         # one that is left out must not become a new point
@@ -192,9 +192,8 @@ class FeatureMatcher:
             return known
         points = self._map.positions[[p for _, p in known]]
         noise = eye.known(state.robot, points, self._covariances([p for _, p in known])).noise
-        camera = CameraPose(*eye.pose(state.robot), eye.camera_covariance(state.covariance))
         try:
-            right = consensus.agreeing(eye.model, camera, points, pixels[[i for i, _ in known]], noise)
+            right = consensus.agreeing(eye.model, eye.predicted(state), points, pixels[[i for i, _ in known]], noise)
         except np.linalg.LinAlgError:  # of a meaningless prediction
             right = np.zeros(len(known), dtype=bool)
         return self._kept(known, right)

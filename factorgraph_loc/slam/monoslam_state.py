@@ -17,7 +17,6 @@ from scipy.linalg import solve_triangular
 
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.slam.monoslam_motion import (
-    PLANAR,
     ROBOT,
     SETTLING,
     SHIFT,
@@ -28,9 +27,10 @@ from factorgraph_loc.slam.monoslam_motion import (
     cross,
     tilt_of,
 )
+from factorgraph_loc.vision.consensus import CameraPose
 from factors import positive
 from factors.camera import inverse_depth
-from factors.camera.model import CameraModel, TiltScale, linearize_in_space, mounted
+from factors.camera.model import PLANAR, CameraModel, TiltScale, lift, linearize_in_space, mounted
 from factors.motion import ChainState
 from factors.se2 import Array, Integers
 from factors.update import GATE
@@ -179,18 +179,15 @@ class Eye:
 
     @staticmethod
     def of(model: CameraModel) -> Eye:
-        lift = np.zeros((POSE, POSE))
-        lift[:3, :3] = lift[3:, 3:] = model.rotation.T
-        lift[3:, :3] = -model.rotation.T @ cross(model.position)
-        return Eye(model, lift)
+        return Eye(model, lift(model))
 
     def pose(self, robot: RobotState) -> tuple[Array, Array]:
         """Position and rotation of the camera in the world."""
         return mounted(self.model, robot.position, robot.rotation)
 
-    def camera_covariance(self, covariance: Array) -> Array:
-        """The covariance (6, 6) of the camera's perturbation, from that of the error state."""
-        return self.lift @ covariance[:POSE, :POSE] @ self.lift.T
+    def predicted(self, state: SlamState) -> CameraPose:
+        """The pose of the camera with its covariance."""
+        return CameraPose(*self.pose(state.robot), self.lift @ state.covariance[:POSE, :POSE] @ self.lift.T)
 
     def known(self, robot: RobotState, points: Array, covariances: Array | None) -> Sights:
         """Predicted pixels of map ``points`` (K, 3) with covariances ``covariances`` (K, 3, 3); None: exact."""

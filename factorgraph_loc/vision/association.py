@@ -88,19 +88,13 @@ class Associator:
         self._slopes = 1.3 * np.abs(reprojection.undistorted(model, corners)).max(axis=0)
 
     def guided(
-        self,
-        frame: CameraFrame,
-        position: Array,
-        rotation: Array,
-        covariance: Array,
-        model: CameraModel | None = None,
-        focal: float = 0.0,
+        self, frame: CameraFrame, camera: CameraPose, model: CameraModel | None = None, focal: float = 0.0
     ) -> Associations:
-        """Match with a predicted camera pose ``position`` (3,), ``rotation`` (3, 3) in the world.
+        """Match with a predicted pose of the ``camera``.
 
-        ``covariance`` (6, 6): of a perturbation in the camera's frame, rotation first. ``model``: the current estimate of the
-        camera, ``focal``: standard deviation of the logarithm of its focal length."""
+        ``model``: the current estimate of the camera, ``focal``: standard deviation of the logarithm of its focal length."""
         model = self._model if model is None else model
+        position, rotation = camera.position, camera.rotation
         if len(frame.pixels) == 0 or frame.feature != self.feature:
             return NONE
         x, y, depth = ((self._positions - position) @ rotation).T
@@ -117,7 +111,7 @@ class Associator:
         if focal > 0.0:
             away = focal * (predicted - (model.cx, model.cy))
             covariances += away[:, :, None] * away[:, None, :]
-        inverses, reaches = _gates(by_camera @ covariance @ by_camera.transpose(0, 2, 1) + covariances)
+        inverses, reaches = _gates(by_camera @ camera.covariance @ by_camera.transpose(0, 2, 1) + covariances)
         features = np.ascontiguousarray(frame.pixels, dtype=float)
         pairs = gated_pairs(predicted[kept], inverses[kept], reaches[kept], features, CELL)
         pairs[:, 0] = np.flatnonzero(kept)[pairs[:, 0]]
@@ -129,7 +123,6 @@ class Associator:
         rows, matched_features = pairs[:, 0], pairs[:, 1]
         if len(rows) < FEWEST:
             return Associations(rows[:0], matched_features[:0], int(kept.sum()))
-        camera = CameraPose(position, rotation, covariance)
         right = agreeing(model, camera, points[rows], features[matched_features], covariances[rows])
         expected, agreed = int(kept.sum()), int(np.count_nonzero(right))
         if agreed < LEAST_SHARE * min(expected, len(features)):
@@ -152,9 +145,8 @@ class Associator:
         ]
         return views, np.append(np.searchsorted(self._owners[views], points), len(views))
 
-    def relocalized(self, frame: CameraFrame) -> tuple[Array, Array, Array, Associations] | None:
-        """Relocalize: camera position (3,), rotation (3, 3), covariance (6, 6) as in :meth:`guided`, and the matches; None if the
-        map does not determine the pose."""
+    def relocalized(self, frame: CameraFrame) -> tuple[CameraPose, Associations] | None:
+        """Relocalize: the pose of the camera, and the matches; None if the map does not determine the pose."""
         if len(frame.pixels) == 0 or frame.feature != self.feature or len(self._owners) == 0:
             return None
         points, features = self._alike(frame)
@@ -168,7 +160,7 @@ class Associator:
         associations = Associations(
             points[resection.inliers], features[resection.inliers], len(points), len(points) - count
         )
-        return resection.camera.position, resection.camera.rotation, resection.camera.covariance, associations
+        return resection.camera, associations
 
     def _alike(self, frame: CameraFrame) -> tuple[Integers, Integers]:
         """Points and features that are similar, and pass the ratio test against all other points."""

@@ -67,25 +67,24 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
         return np.ones(count, dtype=bool)
     if count < FEWEST:
         return np.zeros(count, dtype=bool)
-    whiteners, root = positive.whitener(covariances), root_of(camera)
+    whiteners, root = positive.whitener(covariances), _root(camera)
     position, rotation, squared = _best_of_samples(model, camera, points, pixels, whiteners, REACH * root)
     inside = squared < SAMPLE_GATE
     for _ in range(2):
         if np.count_nonzero(inside) < FEWEST:
             return np.zeros(count, dtype=bool)
-        residual, jacobian = whitened(model, position, rotation, points[inside], pixels[inside], whiteners[inside])
-        step = np.linalg.lstsq((jacobian @ root).reshape(-1, 6), -residual.ravel(), rcond=1e-9)[0]
-        position, rotation = moved(position[None], rotation[None], (root @ step)[None])
-        position, rotation = position[0], rotation[0]
-        squared = _squared(model, position[None], rotation[None], points, pixels, whiteners)[0]
-        inside = squared < GATE
+        inliers = points[None, inside], pixels[None, inside], whiteners[None, inside]
+        residual, jacobian = _whitened(model, position, rotation, *inliers)
+        step = np.linalg.lstsq(jacobian[0] @ root, -residual[0], rcond=1e-9)[0]
+        position, rotation = _moved(position, rotation, (root @ step)[None])
+        inside = _squared(model, position, rotation, points, pixels, whiteners)[0] < GATE
     return np.asarray(inside) if np.count_nonzero(inside) >= FEWEST else np.zeros(count, dtype=bool)
 
 
 def _best_of_samples(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, whiteners: Array, root: Array
 ) -> tuple[Array, Array, Array]:
-    """The pose with most inliers among the corrections by random samples, and the squared residuals (K,) there."""
+    """The pose (1, 3), (1, 3, 3) with most inliers among corrections by random samples, and the squared residuals (K,) there."""
     rng, count = np.random.default_rng(0), len(points)
     best: tuple[float, Array, Array, Array] | None = None
     tried = 0
@@ -96,7 +95,7 @@ def _best_of_samples(
         total = np.zeros((ROUND, 6))
         for _ in range(3):
             # Gauss-Newton in the whitened perturbation, whose prior is the unit Gaussian
-            residual, jacobian = _whitened_each(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
+            residual, jacobian = _whitened(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
             flat = jacobian @ root
             normal = flat.transpose(0, 2, 1) @ flat
             normal[:, range(6), range(6)] = 1.0 + (1.0 + RIDGE) * normal[:, range(6), range(6)]
@@ -105,12 +104,12 @@ def _best_of_samples(
             # three outliers may give any correction
             step *= np.minimum(1.0, FARTHEST / np.linalg.norm(step, axis=1))[:, None]
             total = total + step
-            position, rotation = moved(position, rotation, step @ root.T)
+            position, rotation = _moved(position, rotation, step @ root.T)
         squared = _squared(model, position, rotation, points, pixels, whiteners)
         costs = np.minimum(squared, SAMPLE_GATE).sum(axis=1)
         i = int(np.argmin(costs))
         if best is None or costs[i] < best[0]:
-            best = float(costs[i]), position[i], rotation[i], squared[i]
+            best = float(costs[i]), position[[i]], rotation[[i]], squared[i]
         tried += ROUND
         share = np.count_nonzero(best[3] < SAMPLE_GATE) / count
         if (1.0 - share**SAMPLE) ** tried < FAILURE:
@@ -154,31 +153,24 @@ def _joint(
     return total
 
 
-def root_of(camera: CameraPose) -> Array:
+def _root(camera: CameraPose) -> Array:
     """A square root (6, 6) of the covariance, which may be singular."""
     values, vectors = np.linalg.eigh(camera.covariance)
     # rounding errors must not change the directions of a sample
     return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 
-def moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
+def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
     """H camera poses after perturbations (H, 6)."""
     shifted = position + (rotation @ step[:, 3:, None])[..., 0]
     return shifted, rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:, :3]).as_matrix()
 
 
-def whitened(
+def _whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """Whitened residuals (K, 2), predicted minus measured, and Jacobians (K, 2, 6) with respect to the camera's perturbation."""
-    predicted, jacobian, _ = reprojection.linearize_in_space(model, position, rotation, points)
-    return np.einsum("kij,kj->ki", whiteners, predicted - pixels), whiteners @ jacobian
-
-
-def _whitened_each(
-    model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
-) -> tuple[Array, Array]:
-    """The same for H cameras with ``points`` (H, S, 3) each, stacked: (H, 2S) and (H, 2S, 6)."""
+    """Whitened residuals (H, 2S), predicted minus measured, of H cameras with ``points`` (H, S, 3) each, and their Jacobians
+    (H, 2S, 6) by the perturbation of the camera."""
     count = len(position)
     local = (points - position[:, None]) @ rotation
     # a point in the camera frame is like a world point seen by a camera at the origin

@@ -115,7 +115,7 @@ class ReprojectionFactor:
         blocks = [jacobian[..., :TILT]]
         if self.estimated:
             by_parameters = jacobian[..., CONSTANTS:]
-            by_parameters[..., 3:6] = by_parameters[..., 3:6] @ _turns(self.estimated, values[1])
+            by_parameters[..., 3:6] = by_parameters[..., 3:6] @ turns(self.estimated, values[1])
             if self.twist is not None:
                 twist = self.twist if on_pose.offset is None else se2.adjoint(on_pose.offset) @ self.twist
                 by_parameters[..., TIME_OFFSET] = blocks[0] @ twist
@@ -181,11 +181,9 @@ def image_update(
     return replace(correction, covariance=reset @ correction.covariance @ reset.T)
 
 
-def _turns(estimated: tuple[int, ...], changes: Array) -> Array:
+def turns(estimated: tuple[int, ...], changes: Array) -> Array:
     """Jacobian (3, 3) of a small rotation by the corrections of the camera's rotation: the left Jacobian of SO(3), which is the
     right one of the opposite rotation."""
-    turn = np.zeros(3)
-    for place, value in zip(estimated, changes.tolist(), strict=True):
-        if place in (3, 4, 5):
-            turn[place - 3] = value
-    return np.asarray(gtsam.Rot3.ExpmapDerivative(-turn))
+    full = np.zeros(len(PARAMETERS))
+    full[list(estimated)] = changes
+    return np.asarray(gtsam.Rot3.ExpmapDerivative(-full[3:6]))

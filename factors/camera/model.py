@@ -32,6 +32,7 @@ PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw", "focal", "time_offset")
 FOCAL, TIME_OFFSET = PARAMETERS.index("focal"), PARAMETERS.index("time_offset")
 WIDEST = 4.0  # of x^2 + y^2 (63 degrees off the axis): maximum for the distortion polynomial
 GRID = 33  # rows and columns of pixels at which a lens is checked
+PLANAR = [3, 4, 2]  # indices in the perturbation of a pose in space: x, y and heading of a level robot
 NONE = 1e-9  # tolerance of distorted directions
 
 # columns: axes of a forward-facing camera in the robot frame (z up)
@@ -85,20 +86,14 @@ class CameraModel:
 def mounting(roll: float, pitch: float, yaw: float) -> Array:
     """The rotation (3, 3) of a camera in the robot frame. The forward-facing camera is rotated by ``roll`` about x, ``pitch`` about
     y (down is positive), ``yaw`` about z (left is positive)."""
-    (a, b), (c, d), (e, f) = ((math.cos(w), math.sin(w)) for w in (roll, pitch, yaw))
-    about_x = np.array(((1.0, 0.0, 0.0), (0.0, a, -b), (0.0, b, a)))
-    about_y = np.array(((c, 0.0, d), (0.0, 1.0, 0.0), (-d, 0.0, c)))
-    about_z = np.array(((e, -f, 0.0), (f, e, 0.0), (0.0, 0.0, 1.0)))
-    return np.asarray(about_z @ about_y @ about_x @ FORWARD)
+    return np.asarray(gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ FORWARD)
 
 
 def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
     """Roll, pitch and yaw of a camera whose optical axes are ``rotation`` (3, 3) in the robot frame: the inverse of
     :func:`mounting`."""
-    turned = rotation @ FORWARD.T
-    yaw = math.atan2(turned[1, 0], turned[0, 0])
-    pitch = math.atan2(-turned[2, 0], math.hypot(turned[0, 0], turned[1, 0]))
-    return math.atan2(turned[2, 1], turned[2, 2]), pitch, yaw
+    roll, pitch, yaw = gtsam.Rot3(rotation @ FORWARD.T).xyz().tolist()
+    return roll, pitch, yaw
 
 
 def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
@@ -130,6 +125,15 @@ def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
 def mounted(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
     """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``position`` (3,) with ``rotation`` (3, 3)."""
     return position + rotation @ model.position, rotation @ model.rotation
+
+
+def lift(model: CameraModel) -> Array:
+    """Jacobian (6, 6) of the camera's perturbation in its own frame by that of the robot, rotation before translation in both."""
+    x, y, z = model.position
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = jacobian[3:, 3:] = model.rotation.T
+    jacobian[3:, :3] = -model.rotation.T @ np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    return jacobian
 
 
 def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:

@@ -6,11 +6,11 @@ import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from factors import se2
 from factors.camera import kernels
+from factors.camera.factor import turns
 from factors.camera.kernels import BEHIND, CONSTANTS, POINT, TILT, Lens
 from factors.camera.model import PARAMETERS, TIME_OFFSET, CameraModel, lens_of, recalibrated
 from factors.robust import huber_loss
@@ -54,12 +54,8 @@ class PointFactor:
             jacobian[..., :TILT] = jacobian[..., :TILT] @ se2.adjoint(se2.inverse(later))
         blocks = [jacobian[..., :TILT], jacobian[..., TILT:POINT], jacobian[..., POINT:CONSTANTS]]
         if estimated:
-            turn = np.zeros(3)
-            for place, value in zip(estimated, constants.tolist(), strict=True):
-                if place in (3, 4, 5):
-                    turn[place - 3] = value
             by_constants = jacobian[..., CONSTANTS:]
-            by_constants[..., 3:6] = by_constants[..., 3:6] @ gtsam.Rot3.ExpmapDerivative(-turn)
+            by_constants[..., 3:6] = by_constants[..., 3:6] @ turns(estimated, constants)
             blocks.insert(1, by_constants[..., list(estimated)])
         return residual, blocks
 

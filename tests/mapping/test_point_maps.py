@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc import InputError, PointMap
-from factorgraph_loc.mapping.point_maps import chosen, merged, thinned
+from factorgraph_loc.mapping.point_maps import merged, thinned
 
 SIGMA = 0.02
 
@@ -92,6 +92,6 @@ def test_thinned_maps_keep_the_best_points_in_all_places():
 
 def test_chosen_points_keep_their_views():
     points, _ = drive(2, np.arange(10))
-    some = chosen(points, np.array([7, 2]))
+    some = points.chosen(np.array([7, 2]))
     assert some.names == ("p7", "p2")
     np.testing.assert_array_equal(some.descriptors[some.owners == 0], points.descriptors[points.owners == 7])

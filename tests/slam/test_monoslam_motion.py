@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.slam import monoslam_motion
-from factorgraph_loc.slam.monoslam_motion import Displacement, Origin, RobotState, exp
+from factorgraph_loc.slam.monoslam_motion import Origin, RobotState, exp
 
 ROBOT = RobotState(
     np.array((1.0, -2.0, 0.3)), exp(np.array((0.2, -0.1, 0.7))), np.array((0.3, 0.1, -0.2)), np.array((0.5, -0.4, 0.6))
@@ -12,7 +12,7 @@ ROBOT = RobotState(
 LEVEL = RobotState(
     np.array((1.0, -2.0, 0.0)), exp(np.array((0.0, 0.0, 0.7))), np.array((0.3, 0.1, 0.0)), np.array((0.0, 0.0, 0.6))
 )
-MOTION = Displacement(exp(np.array((0.1, -0.2, 0.3))), np.array((0.2, 0.1, -0.1)), 1e-4 * np.eye(6))
+MOTION = np.array((0.1, 0.02, 0.05)), np.diag((1e-4, 2e-4, 3e-4)), np.zeros((3, 0))
 DT = 0.1
 NOTHING = np.zeros(3)
 
@@ -29,45 +29,42 @@ def numerical(f, at):
 
 def test_the_error_is_carried_as_the_state_moves():
     def step(robot):
-        return monoslam_motion.measured(robot, MOTION, DT)
+        return monoslam_motion.measured(robot, *MOTION, DT)
 
     np.testing.assert_allclose(step(ROBOT).transition, numerical(lambda r: step(r).robot, ROBOT), atol=1e-6)
 
 
 def test_the_floor_carries_the_error_of_a_level_robot_as_stated():
     def step(robot):
-        return monoslam_motion.on_the_floor(monoslam_motion.measured(robot, MOTION_ON_FLOOR, DT), DT, 0.01, 0.01, 1.0)
+        return monoslam_motion.on_the_floor(monoslam_motion.measured(robot, *MOTION, DT), DT, 0.01, 0.01, 1.0)
 
     np.testing.assert_allclose(step(LEVEL).transition, numerical(lambda r: step(r).robot, LEVEL), atol=2e-6)
 
 
-MOTION_ON_FLOOR = monoslam_motion.planar(np.array((0.1, 0.02, 0.05)), np.diag((1e-4, 2e-4, 3e-4)), np.zeros((3, 0)))
-
-
 def test_constants_move_a_robot_as_stated():
     def moved(change):
-        delta = MOTION_ON_FLOOR.shift[:2].tolist()
+        delta = MOTION[0][:2].tolist()
         by = np.array(((0.1, 0.0), (0.02, 0.0), (0.0, 0.05)))
-        return monoslam_motion.planar(np.array((*delta, 0.05)) + rotated(by @ change), np.eye(3), by)
+        return np.array((*delta, 0.05)) + rotated(by @ change), np.eye(3), by
 
     def rotated(local):  # a perturbation at the end, in the frame of the start
         return np.array((*(exp(np.array((0.0, 0.0, 0.05))) @ np.array((*local[:2], 0.0)))[:2], local[2]))
 
-    transition = monoslam_motion.measured(LEVEL, moved(np.zeros(2)), DT).transition
+    transition = monoslam_motion.measured(LEVEL, *moved(np.zeros(2)), DT).transition
     for i, unit in enumerate(1e-6 * np.eye(2)):
-        ahead, back = (monoslam_motion.measured(LEVEL, moved(s * unit), DT).robot for s in (1, -1))
+        ahead, back = (monoslam_motion.measured(LEVEL, *moved(s * unit), DT).robot for s in (1, -1))
         np.testing.assert_allclose(transition[:, 12 + i], ahead.minus(back) / 2e-6, atol=1e-6)
 
 
 def test_odometry_replaces_the_noise_of_what_it_measures_and_the_floor_holds_the_rest():
     """After long at rest with perfect odometry, height and tilt have the floor's deviations, and nothing else is uncertain."""
-    still = monoslam_motion.planar(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 0)))
+    still = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 0))
     robot, covariance = LEVEL, np.zeros((12, 12))
     for _ in range(100):
-        step = monoslam_motion.on_the_floor(monoslam_motion.measured(robot, still, DT), DT, 0.02, 0.03, 1.0)
+        step = monoslam_motion.on_the_floor(monoslam_motion.measured(robot, *still, DT), DT, 0.02, 0.03, 1.0)
         robot, covariance = step.robot, step.transition @ covariance @ step.transition.T + step.noise
     np.testing.assert_allclose(np.diag(covariance)[:6], (0.03**2, 0.03**2, 0, 0, 0, 0.02**2), atol=1e-9)
-    moved = monoslam_motion.measured(LEVEL, MOTION_ON_FLOOR, DT)
+    moved = monoslam_motion.measured(LEVEL, *MOTION, DT)
     np.testing.assert_allclose(np.diag(moved.noise)[:6], (0, 0, 3e-4, 1e-4, 2e-4, 0), atol=1e-12)
 
 

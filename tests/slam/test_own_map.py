@@ -11,7 +11,6 @@ from factorgraph_loc import World
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.output import map_of
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.mapping.point_maps import chosen
 from factorgraph_loc.model.log import cut
 
 SECONDS = 24.0
@@ -67,7 +66,7 @@ def test_points_are_known_from_several_sides(days):
 def test_points_that_a_map_lacks_are_added_to_it(days):
     log = cut(days[SEEDS[0]], 0.0, 12.0)
     half = np.flatnonzero(log.world.points.positions[:, 0] < 0.0)
-    known = replace(log, world=World(points=chosen(log.world.points, half)))
+    known = replace(log, world=World(points=log.world.points.chosen(half)))
     found = map_of(run(known, RunConfig("smoother", {"landmarks": "extended"})), known)
     assert set(known.world.points.names) <= set(found.points.names)
     assert len(found.points) > len(half) + 10

@@ -38,7 +38,7 @@ def test_what_is_seen_is_found_near_its_prediction_and_what_looks_like_others_is
     associator, covariance = Associator(points, MODEL), spread(turn, shift)
     for _ in range(5):
         image, shown = frame(points, POSE, 0.0, rng, wrong=wrong)
-        found = associator.guided(image, *predicted(rng, covariance), covariance)
+        found = associator.guided(image, CameraPose(*predicted(rng, covariance), covariance))
         assert np.mean(shown[found.features] == found.points) >= (0.98 if wrong else 1.0)
         assert len(found) > (0.5 if wrong else 0.85) * np.count_nonzero(shown >= 0)
         assert wrong or found.expected >= len(found)
@@ -55,10 +55,10 @@ def test_points_that_were_seen_from_elsewhere_are_not_looked_for():
     points = replace(points, seen_from=seen_from)
     image, shown = frame(points, POSE, 0.0, rng)
     image = replace(image, pixels=image.pixels[shown < len(here)], descriptors=image.descriptors[shown < len(here)])
-    found = Associator(points, MODEL).guided(image, *HERE, spread(0.01, 0.03))
+    found = Associator(points, MODEL).guided(image, CameraPose(*HERE, spread(0.01, 0.03)))
     assert len(found) > 20
     assert np.all(found.points < len(here))
-    near = Associator(with_views(pointed(here)), MODEL).guided(image, *HERE, spread(0.01, 0.03))
+    near = Associator(with_views(pointed(here)), MODEL).guided(image, CameraPose(*HERE, spread(0.01, 0.03)))
     assert found.expected < 1.3 * near.expected
 
 
@@ -68,11 +68,12 @@ def test_nothing_in_an_image_or_of_another_kind_is_nothing():
     associator = Associator(points, MODEL)
     image, _ = frame(points, POSE, 0.0, rng)
     empty = replace(image, pixels=np.empty((0, 2)), descriptors=np.empty((0, 64), np.float32))
-    assert len(associator.guided(empty, *HERE, spread(0.01, 0.03))) == 0
+    assert len(associator.guided(empty, CameraPose(*HERE, spread(0.01, 0.03)))) == 0
     assert associator.relocalized(empty) is None
-    assert len(associator.guided(replace(image, feature="sift"), *HERE, spread(0.01, 0.03))) == 0
+    assert len(associator.guided(replace(image, feature="sift"), CameraPose(*HERE, spread(0.01, 0.03)))) == 0
     # far from the room, and looking away
-    assert len(associator.guided(image, np.array((100.0, 0.0, 1.0)), HERE[1], spread(0.01, 0.03))) == 0
+    away = CameraPose(np.array((100.0, 0.0, 1.0)), HERE[1], spread(0.01, 0.03))
+    assert len(associator.guided(image, away)) == 0
 
 
 def test_clutter_alone_matches_nothing():
@@ -82,7 +83,7 @@ def test_clutter_alone_matches_nothing():
     image, shown = frame(points, POSE, 0.0, rng, clutter=300)
     only = shown < 0
     image = replace(image, pixels=image.pixels[only], descriptors=image.descriptors[only])
-    assert len(associator.guided(image, *HERE, spread(0.02, 0.05))) <= 3
+    assert len(associator.guided(image, CameraPose(*HERE, spread(0.02, 0.05)))) <= 3
     assert associator.relocalized(image) is None
 
 
@@ -92,12 +93,12 @@ def test_a_camera_is_found_in_the_map_without_a_prediction(binary, wrong):
     rng = np.random.default_rng(6)
     points = with_views(room(400), binary=binary)
     image, shown = frame(points, POSE, 0.0, rng, wrong=wrong)
-    position, rotation, covariance, seen = Associator(points, MODEL).relocalized(image)
+    camera, seen = Associator(points, MODEL).relocalized(image)
     assert np.mean(shown[seen.features] == seen.points) > 0.98
-    turn = gtsam.Rot3.Logmap(gtsam.Rot3(HERE[1].T @ rotation))
-    error = np.concatenate((turn, HERE[1].T @ (position - HERE[0])))
+    turn = gtsam.Rot3.Logmap(gtsam.Rot3(HERE[1].T @ camera.rotation))
+    error = np.concatenate((turn, HERE[1].T @ (camera.position - HERE[0])))
     # six degrees of freedom, a bound with 1e-5 of false alarms
-    assert error @ np.linalg.solve(covariance, error) < 34.0
+    assert error @ np.linalg.solve(camera.covariance, error) < 34.0
 
 
 def named(rng, count, wrong):
@@ -183,7 +184,7 @@ def test_few_that_agree_of_many_expected_are_not_believed(kept, believed):
     strange = np.arange(len(shown)) >= max(4, int(kept * len(shown)))
     descriptors = np.where(strange[:, None], rng.standard_normal(image.descriptors.shape), image.descriptors)
     image = replace(image, descriptors=descriptors.astype(np.float32))
-    found = Associator(points, MODEL).guided(image, *predicted(rng, covariance), covariance)
+    found = Associator(points, MODEL).guided(image, CameraPose(*predicted(rng, covariance), covariance))
     assert found.expected > 400
     assert (len(found) > 0) == believed
     assert found.rejected >= 4 or believed

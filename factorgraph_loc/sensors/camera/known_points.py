@@ -192,10 +192,9 @@ class KnownPoints:
         relocated = None if self.associator is None else self.associator.relocalized(m)
         if relocated is None:
             return None, 0
-        position, rotation, covariance, matches = relocated
+        camera, matches = relocated
         covariances = self.map.covariances[matches.points] if self._map_matters else None
         pixels = np.asarray(m.pixels[matches.features], dtype=float)
-        camera = CameraPose(position, rotation, covariance)
         return on_floor(model, camera, self.map.positions[matches.points], pixels, covariances), matches.expected
 
     def _factor(self, model: CameraModel, points: list[int], pixels: Array) -> ReprojectionFactor:
@@ -219,7 +218,7 @@ class KnownPoints:
     ) -> ReprojectionFactor | None:
         """The factor of the points matched in a frame."""
         assert self.associator is not None
-        matches = self.associator.guided(m, camera.position, camera.rotation, camera.covariance, model, focal)
+        matches = self.associator.guided(m, camera, model, focal)
         self.used = matches.features
         unsure = float(np.trace(camera.covariance[3:, 3:])) > UNSURE**2
         self.missed = len(matches) < FEW and (unsure or min(matches.expected, len(m.pixels)) >= MANY)
@@ -267,7 +266,7 @@ class KnownPoints:
             elif place < FOCAL:
                 full[:3, column] = model.rotation[place - 3]
             elif place == TIME_OFFSET and expected.twist is not None:
-                full[:, column] = _lift(model) @ expected.twist
+                full[:, column] = reprojection.lift(model)[:, reprojection.PLANAR] @ expected.twist
         return replace(camera, covariance=camera.covariance + full @ predicted.spread @ full.T)
 
 
@@ -275,16 +274,6 @@ def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
     """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3), which may tilt."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
     return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
-
-
-def _lift(model: CameraModel) -> Array:
-    """Jacobian (6, 3) of the camera's perturbation in its own frame (rotation first) by that of the robot's planar pose."""
-    x, y, _ = model.position
-    lift = np.zeros((6, 3))
-    lift[:3, 2] = model.rotation[2]
-    lift[3:, 0], lift[3:, 1] = model.rotation[0], model.rotation[1]
-    lift[3:, 2] = -y * model.rotation[0] + x * model.rotation[1]
-    return lift
 
 
 def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:

@@ -19,11 +19,11 @@ from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.measurement import ImageStream, PixelSightings, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.sensors.interfaces import Marks, Paragraph, Summary
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.images import decoded, read_image
 from factorgraph_loc.vision.matching import match
-from factorgraph_loc.vision.settings import FrontendSettings
 from factors import se2
 from factors.se2 import Array
 
@@ -85,8 +85,8 @@ def summarize_images(log: Log) -> ImageSummary | None:
     chosen = np.unique(places.round().astype(int)).tolist()
     sizes: Counter[str] = Counter()
     counts, fault = [], None
-    wanted = _wanted(log)
-    finder = extractor(*wanted)
+    wanted = frontend_of(log.rig, log.world)
+    finder = extractor(wanted.feature, wanted.count)
     for i in chosen:
         try:
             image = read_image(stream.file[i])
@@ -96,7 +96,7 @@ def summarize_images(log: Log) -> ImageSummary | None:
         sizes[f"{image.shape[1]}x{image.shape[0]}"] += 1
         counts.append(len(finder.detect(image)))
     median = float(np.median(counts)) if counts else 0.0
-    return ImageSummary(len(stream.file), len(chosen), len(counts), dict(sizes), wanted[0], median, fault)
+    return ImageSummary(len(stream.file), len(chosen), len(counts), dict(sizes), wanted.feature, median, fault)
 
 
 def summarize_pixels(log: Log) -> PixelSummary | None:
@@ -144,12 +144,6 @@ def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary 
         if pixels.outside:
             out.append(f"{pixels.outside} of {pixels.rows} sightings lie outside of the camera's image")
     return out
-
-
-def _wanted(log: Log) -> tuple[str, int]:
-    camera = log.rig.find(CameraSettings)
-    settings = FrontendSettings() if camera is None else camera.frontend
-    return settings.feature, settings.count
 
 
 def _calibration(log: Log, images: ImageSummary) -> list[str]:
