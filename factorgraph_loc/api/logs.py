@@ -12,8 +12,11 @@ from factorgraph_loc.evaluation.plots import overview
 from factorgraph_loc.experiments.run import run
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import temporary_folder, writing
-from factorgraph_loc.io.bags.manifest import BagManifest, manifest_of_bag
+from factorgraph_loc.io.bags.file import is_bag
+from factorgraph_loc.io.bags.manifest import manifest_of_bag
+from factorgraph_loc.io.folder_manifest import manifest_of_folder
 from factorgraph_loc.io.native.native import require_new, write_native
+from factorgraph_loc.io.proposals import Proposal
 from factorgraph_loc.io.readers import Dataset, LogLike, RigLike, WorldLike, describe, load_all, read_log
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import RunConfig
@@ -66,20 +69,21 @@ def convert(
     write_native(read_log(log, rig=rig, world=world), out, format, overwrite=overwrite)
 
 
-def manifest(bag: str | Path, out: str | Path | None = None, *, overwrite: bool = False) -> BagManifest:
-    """Propose a manifest for a ROS bag: which topic is which sensor. ``out``: a file to write it to, in the folder of the bag or
-    one above, which can be read as a log once it is checked.
+def manifest(log: str | Path, out: str | Path | None = None, *, overwrite: bool = False) -> Proposal:
+    """Propose a manifest for a folder of tables or a ROS bag: which file or topic is which sensor. ``out``: a file to write it to,
+    beside the log or in a folder above, which can be read as a log once it is checked.
 
-    InputError if the bag cannot be read, or the file is elsewhere or exists.
+    InputError if the log cannot be read, or the file is elsewhere or exists.
     """
-    if out is None:
-        return manifest_of_bag(Path(bag), Path.cwd())
-    file = Path(out)
+    path, file = Path(log), None if out is None else Path(out)
+    propose = manifest_of_folder if path.is_dir() and not is_bag(path) else manifest_of_bag
+    if file is None:
+        return propose(path, Path.cwd())
     if file.exists() and not overwrite:
         raise InputError(f"{file}: exists already, expected a new file")
-    proposal = manifest_of_bag(Path(bag), file.parent)
+    proposal = propose(path, file.parent)
     if proposal.folder != file.parent.resolve():
-        raise InputError(f"{file}: the bag is in {proposal.folder}, expected a file there or in a folder above")
+        raise InputError(f"{file}: the log is in {proposal.folder}, expected a file there or in a folder above")
     write_text(file, proposal.text)
     return proposal
 

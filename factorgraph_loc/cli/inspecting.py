@@ -149,13 +149,19 @@ def _document(log: Log, inspection: Inspection) -> dict[str, Any]:
 
 
 def manifest(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", help="A .bag, .mcap or .db3, or the folder of a ROS 2 bag.")],
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="A folder of tables, a .bag, .mcap or .db3, or the folder of a ROS 2 bag."),
+    ],
     json: Json = False,
 ) -> None:
-    """Propose a manifest for a ROS bag: which topic is which sensor. Write it to a file and check it."""
-    from factorgraph_loc.io.bags.manifest import manifest_of_bag
+    """Propose a manifest: which file of a folder, or topic of a ROS bag, is which sensor. Write it to a file and check it.
 
-    proposal = manifest_of_bag(bag, Path.cwd())
+    Example: fgloc manifest monday > monday.toml; fgloc info monday.toml
+    """
+    from factorgraph_loc.api.logs import manifest
+
+    proposal = manifest(log)
     if proposal.folder != Path.cwd().resolve():
         name = proposal.content["path"]
         show.note(

@@ -182,14 +182,14 @@ def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
     """The mapped cells of the chosen rows of a table."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
-    comments, content = _split_comments(numbered)
+    comments, content = split_comments(numbered)
     if not content:
         raise InputError(f"{path}: contains no rows")
-    body = list(_parsed(path, content, mapping.separator))
+    body = list(parsed(path, content, mapping.separator))
     where = mapping.chosen()
     if mapping.header:
         first_row, first = body[0]
-        named = next(_parsed(path, comments[-1:], mapping.separator), (0, []))[1]
+        named = next(parsed(path, comments[-1:], mapping.separator), (0, []))[1]
         # a comment with as many names as there are columns is the header, unless the first row contains the names
         in_comment = _has(named, needed) or (len(named) == len(first) and not _has(first, needed))
         header = named if in_comment else first
@@ -216,7 +216,7 @@ def _is_chosen(parts: Sequence[str], header: Sequence[str], where: Mapping[str, 
     return all(cells.get(name) in values for name, values in where.items())
 
 
-def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
+def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
     """Split off the comments before the first row, without their marks; the last one may be the header."""
     content = [(row, line) for row, line in lines if not line.lstrip().startswith(COMMENT)]
     until = content[0][0] if content else 0
@@ -224,7 +224,7 @@ def _split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, s
     return comments, content
 
 
-def _parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
+def parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
     if separator == " ":  # any number of blanks
         return ((row, line.split()) for row, line in lines)
     rows = csv_rows(path, lines, delimiter=separator, skipinitialspace=True)

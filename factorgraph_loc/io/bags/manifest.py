@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
 from factorgraph_loc.io.bags.file import Bag, Topic, open_bag
@@ -17,11 +15,10 @@ from factorgraph_loc.io.bags.poses import ODOMETRY as ORIGINS
 from factorgraph_loc.io.bags.poses import POINT, POSES, ROBOT, STATIC, WORLD, Tree, tree_of
 from factorgraph_loc.io.bags.tables import CORNERS, DETECTIONS
 from factorgraph_loc.io.bags.topics import LIST, TF, has_header, leaves
+from factorgraph_loc.io.field_names import LANDMARK, RANGE, READ, TRUTH, plain, rank
+from factorgraph_loc.io.proposals import Proposal, proposal_of
 from factorgraph_loc.text import listed
 
-TRUTH = re.compile(
-    r"truth|(^|[/_])gt($|[/_])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
-)
 LEFT, RIGHT = re.compile("left", re.IGNORECASE), re.compile("right", re.IGNORECASE)
 WHEEL = re.compile("wheel", re.IGNORECASE)
 WHEELS = {"radius": 0.1, "track": 0.5}  # m
@@ -29,30 +26,11 @@ NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORE
 
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
-# common names of the last part of a field's path, without underscores and without a unit at the end
-NAMES: dict[str, tuple[str, ...]] = {
-    "epc": ("epc", "epchex", "tagepc", "tagid", "epcid", "uid", "tag"),
-    "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
-    "rssi": ("rssi", "peakrssi", "signalstrength"),
-    "phase": ("phase", "phaseangle", "rfphase", "rfphaseangle"),
-    "frequency": ("frequency", "freq", "carrier", "channelfrequency", "channelmhz", "channelkhz"),
-    "stamp": ("firstseen", "firstseentimestamp", "firstseentimestamputc", "readtime", "timestamp"),
-}
-UNIT = re.compile(r"(deg(rees)?|rad(ians)?|[mk]?hz|[mun]s|dbm)$")
-# the same of a range to a radio or another landmark, the likeliest first
-LANDMARK = ("anchorid", "anchor", "anchorname", "responderid", "beaconid", "beacon", "landmarkid", "nodeid", "id")
-RANGE = ("range", "distance", "dist", "dis", "rangem", "distancem")
 # suffixes of field names that imply a unit; the first match is used
 UNITS = {
     "phase": {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"},
     "frequency": {"mhz": "MHz", "khz": "kHz", "hz": "Hz"},
     "stamp": {"us": "us", "ms": "ms", "ns": "ns"},
-}
-
-
-COMPANIONS = {
-    "rig": 'no rig is given: set rig = "NAME.rig.toml" to a file next to this one; `fgloc rigs new` writes one',
-    "world": 'no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks',
 }
 
 
@@ -68,20 +46,15 @@ class TopicUse:
 
 
 @dataclass(frozen=True)
-class BagManifest:
-    """A proposed manifest: its ``content``, and its ``text`` as TOML with ``remarks`` as comments. Its paths are relative to
-    ``folder``. ``duration``: of the bag [s]; ``topics``: all that are in it."""
+class BagManifest(Proposal):
+    """The proposed manifest of a bag. ``duration``: of the bag [s]; ``topics``: all that are in it."""
 
-    content: Mapping[str, Any]
-    remarks: tuple[str, ...]
-    text: str
-    folder: Path
     duration: float
     topics: tuple[TopicUse, ...]
 
 
 @dataclass
-class Proposal:
+class Uses:
     """``options`` of the reader; ``uses``: use of each topic, by name; ``notes``: remarks for the user."""
 
     options: dict[str, Any] = field(default_factory=dict)
@@ -103,9 +76,8 @@ def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
     InputError if the bag cannot be read.
     """
     path, folder = Path(os.path.realpath(bag)), folder.resolve()
-    root = folder if path.is_relative_to(folder) else path.parent
     with open_bag(path) as opened:
-        proposal = propose(opened)
+        uses = propose(opened)
         span = opened.duration
         topics = tuple(
             TopicUse(
@@ -113,32 +85,18 @@ def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
                 topic.type,
                 topic.count,
                 (topic.count - 1) / span if span > 0.0 and topic.count > 1 else None,
-                proposal.uses.get(topic.name),
+                uses.uses.get(topic.name),
             )
             for topic in opened.topics.values()
         )
-    remarks = list(proposal.notes)
-    content: dict[str, Any] = {"title": f"The bag {path.name}", "reader": "rosbag"}
-    content["path"] = path.relative_to(root).as_posix()
-    stem = path.with_suffix("") if path.is_file() else path
-    for kind, advice in COMPANIONS.items():
-        if (file := stem.with_name(f"{stem.name}.{kind}.toml")).is_file():
-            content[kind] = file.relative_to(root).as_posix()
-        else:
-            remarks.append(advice)
-    for topic in topics:
-        if topic.use is None:
-            remarks.append(f"not used: {topic.topic} ({topic.type}, {topic.messages} messages)")
-    content |= {"licence": "none stated", "origin": "your own recording"}
-    options = dict(sorted(proposal.options.items(), key=lambda item: isinstance(item[1], dict)))  # tables last
-    comments = "".join(f"# {line}\n" for line in remarks)
-    text = f"{tomli_w.dumps(content)}{comments}\n{tomli_w.dumps({'options': options})}"
-    return BagManifest(content | {"options": options}, tuple(remarks), text, root, span, topics)
+    unused = [f"not used: {t.topic} ({t.type}, {t.messages} messages)" for t in topics if t.use is None]
+    proposal = proposal_of("rosbag", path, folder, uses.options, [*uses.notes, *unused])
+    return BagManifest(**vars(proposal), duration=span, topics=topics)
 
 
-def propose(bag: Bag) -> Proposal:
+def propose(bag: Bag) -> Uses:
     """Propose uses of the topics. Of several topics for one sensor the most likely one is used, and a note lists the others."""
-    out = Proposal()
+    out = Uses()
     topics = [topic for topic in bag.topics.values() if topic.count]
     tree = tree_of(bag, out.notes)
     _motion(out, bag, topics, tree)
@@ -164,7 +122,7 @@ def propose(bag: Bag) -> Proposal:
     return out
 
 
-def _motion(out: Proposal, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
+def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
     """Prefer odometry, then transforms of its frame, then velocities, then wheels; commands are no measurements."""
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
@@ -213,7 +171,7 @@ def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
     return {"wheels": {"left": left, "right": right} | WHEELS}
 
 
-def _reference(out: Proposal, topics: Sequence[Topic], tree: Tree) -> None:
+def _reference(out: Uses, topics: Sequence[Topic], tree: Tree) -> None:
     poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]
     if named:
@@ -235,7 +193,7 @@ def _reference(out: Proposal, topics: Sequence[Topic], tree: Tree) -> None:
         )
 
 
-def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
+def _camera(out: Uses, topics: Sequence[Topic]) -> None:
     candidates = [topic for topic in topics if topic.type in {COMPRESSED, RAW}]
     images = [topic for topic in candidates if "depth" not in topic.name.lower()]
     if not images:
@@ -252,7 +210,7 @@ def _camera(out: Proposal, topics: Sequence[Topic]) -> None:
         out.notes.append("no CameraInfo belongs to the images: the rig has to describe the camera")
 
 
-def _custom(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
+def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
     """The topics without a use whose messages are not of ROS itself, with the paths of their fields."""
     custom = []
     for topic in topics:
@@ -267,7 +225,7 @@ def _custom(out: Proposal, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topi
     return custom
 
 
-def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
+def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     """The topic with a field for the EPC, and most other fields of a read."""
     candidates = [(topic, fields) for topic, paths in custom if "epc" in (fields := read_fields(paths))]
     if not candidates:
@@ -290,7 +248,7 @@ def _rfid(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
         out.notes.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
 
 
-def _ranges(out: Proposal, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
+def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     """Use the topic with a field of a distance and, next to it, one of the name of a landmark."""
     candidates = [(t, fields) for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))]
     if candidates and "bearing_range" not in out.options:
@@ -313,20 +271,15 @@ def range_fields(paths: Sequence[str]) -> dict[str, str]:
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
     """The fields of a read among the paths of a message type, by common names."""
-    out = {}
     usable = [path for path in paths if path.count(LIST) <= 1 and not path.startswith("header.")]
-    for name, known in NAMES.items():
-        fitting = [(rank, len(path), path) for path in usable if (rank := _rank(_plain(path), known)) is not None]
+    out = {}
+    for name, known in READ.items():
+        fitting = [(at, len(path), path) for path in usable if (at := rank(_plain(path), known)) is not None]
         if fitting:
             out[name] = min(fitting)[-1]
     if "stamp" not in out:  # the timestamp of a read in the message of its EPC
         out.update([("stamp", path) for path in paths if path.endswith("stamp") and LIST in path][:1])
     return out
-
-
-def _rank(name: str, known: Sequence[str]) -> int | None:
-    """The index of a name in ``known``, with its unit or without; None if it is unknown."""
-    return next((known.index(text) for text in (name, UNIT.sub("", name)) if text in known), None)
 
 
 def _units(fields: Mapping[str, str]) -> dict[str, str]:
@@ -341,4 +294,4 @@ def _units(fields: Mapping[str, str]) -> dict[str, str]:
 
 
 def _plain(path: str) -> str:
-    return path.rsplit(".", 1)[-1].removesuffix(LIST).replace("_", "").lower()
+    return plain(path.rsplit(".", 1)[-1].removesuffix(LIST))

@@ -41,8 +41,8 @@ class Manifest(FileModel):
 
     title: str
     reader: str
-    licence: str
-    origin: str
+    licence: str = "none stated"
+    origin: str = ""
     path: str | None = None
     rig: str | None = None
     world: str | None = None

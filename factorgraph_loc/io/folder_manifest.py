@@ -1,0 +1,276 @@
+"""A proposed manifest for a folder of tables: which file is which sensor, with columns, units and clock offsets."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.bounded import YAML
+from factorgraph_loc.files.models import read_text
+from factorgraph_loc.io.field_names import TRUTH
+from factorgraph_loc.io.guesses import Guess, guess, sample_of
+from factorgraph_loc.io.proposals import Proposal, proposal_of, toml_of
+from factorgraph_loc.text import listed, quoted
+from factors.se2 import Array
+
+SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".tum")
+QUATERNION = ("qx", "qy", "qz", "qw")
+FIELDS = {
+    "odometry": ("t", "v", "w", "x", "y", "z", "heading", *QUATERNION),
+    "reference": ("t", "x", "y", "z", "heading", *QUATERNION),
+    "imu": ("t", "w"),
+    "rfid": ("t", "epc", "antenna", "rssi", "phase", "frequency"),
+    "inventories": ("t", "antenna", "duration"),
+    "bearing_range": ("t", "landmark", "range", "bearing"),
+    "tags": ("epc", "x", "y", "z", "facing"),
+    "landmarks": ("landmark", "x", "y"),
+}
+MAPS = ("tags", "landmarks")
+WIDTHS = (8, 16, 32)  # bits of counters
+WINDOW = 1.0  # s over which turns are compared
+TICK, TRACK = 0.001, 0.5  # m: examples of what no file says
+APART = 5.0  # s that clocks may begin apart
+
+
+@dataclass
+class _Roles:
+    """The table of each role, the tables without one, and ``remarks``."""
+
+    tables: dict[str, Guess] = field(default_factory=dict)
+    unused: list[Guess] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+
+
+def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
+    """Propose a manifest for the tables in a folder, to be saved in ``folder`` if ``tables`` is below it, else beside ``tables``.
+
+    InputError if no file of the folder is a table with times.
+    """
+    path, folder = Path(os.path.realpath(tables)), folder.resolve()
+    guesses = [guess(sample) for file in _tables(path) if (sample := sample_of(file)) is not None]
+    if not any(found.has("t") for found in guesses):
+        raise InputError(
+            f"{tables}: has no table with times, expected files such as odometry.csv: {', '.join(SUFFIXES)}"
+        )
+    roles = _roles(guesses)
+    options: dict[str, Any] = {}
+    for role, found in list(roles.tables.items()):
+        if role in MAPS:
+            options.setdefault("world", {})[role] = _in_map(role, roles)
+        else:
+            options[role] = _described(role, found, roles)
+    if "odometry" not in options:
+        roles.remarks.append(
+            "no file looks like odometry, which every estimator needs: describe one in [options.odometry]"
+        )
+    if "rfid" in options and not roles.tables["rfid"].has("antenna"):
+        options["rfid"]["antenna"] = "antenna"
+        roles.remarks.append("the reads name no antenna: all are assigned to one, set in antenna")
+    _add_clocks(options, roles)
+    for found in roles.tables.values():
+        roles.remarks += [f"{found.name}: {reason}" for reason in found.reasons]
+    read = {found.name for found in roles.tables.values()}
+    others = [
+        entry.name for entry in sorted(path.iterdir()) if entry.name not in read and not entry.name.startswith(".")
+    ]
+    if others:
+        roles.remarks.append(f"not used: {listed(others)}")
+    if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
+        antennas = dict.fromkeys(roles.tables["rfid"].sample.columns[roles.tables["rfid"].fields["antenna"]])
+        roles.remarks.append(f"the rig needs the antennas {listed(antennas)}, by these names in [rfid.antennas]")
+    beside = [] if "world" in options or any(path.parent.glob("*.world.toml")) else _map_beside(path, roles)
+    roles.remarks += beside
+    return proposal_of("mapped", path, folder, options, roles.remarks, with_map=not beside and "world" not in options)
+
+
+def _map_beside(path: Path, roles: _Roles) -> list[str]:
+    """The lines of a world file for a map that is a table beside the folder."""
+    for file in _tables(path.parent):
+        found = None if (sample := sample_of(file)) is None else guess(sample)
+        role = None if found is None else _role(found)
+        if found is not None and role in MAPS:
+            roles.tables[role] = found
+            name = path.parent.name
+            walls = next(
+                (y.name for y in sorted(path.parent.glob("*.yaml")) if "resolution:" in read_text(y, YAML)), None
+            )
+            world = {"name": name, **({} if walls is None else {"walls": walls}), role: _in_map(role, roles)}
+            lines = toml_of(world).splitlines()
+            return [f"{file.name} looks like a map: save these lines as {name}.world.toml beside it", *lines]
+    return []
+
+
+def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
+    """The keys of a table of a map; EPCs in the letter case of the reads."""
+    found, reads = roles.tables[role], roles.tables.get("rfid")
+    settings = found.mapping(FIELDS[role])
+    if role == "tags" and reads is not None:
+        tags, read = (set(g.sample.columns[g.fields["epc"]]) for g in (found, reads))
+        case = next((case for case in ("upper", "lower") if all(epc == getattr(epc, case)() for epc in read)), None)
+        if case is not None and not tags & read and {getattr(epc, case)() for epc in tags} & read:
+            settings["epc_case"] = case
+    return settings
+
+
+def _tables(folder: Path) -> list[Path]:
+    return sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES and entry.is_file())
+
+
+def _roles(guesses: Sequence[Guess]) -> _Roles:
+    """The role of each table. Poses are the reference if the name of the file says so, or if there is other odometry."""
+    out = _Roles()
+    poses = [g for g in guesses if g.has("t", "x", "y") and not g.has("epc") and not g.has("landmark")]
+    truths = [g for g in poses if TRUTH.search(g.name)]
+    for found in guesses:
+        role = _role(found)
+        if role is not None and role not in out.tables:
+            out.tables[role] = found
+        elif role is not None:
+            out.remarks.append(f"{role} could also be {found.name}")
+    rest = [g for g in poses if g not in out.tables.values() and g not in truths]
+    if "odometry" not in out.tables and rest:
+        out.tables["odometry"] = rest.pop(0)
+    reference = truths[0] if truths else rest[0] if rest else None
+    if reference is not None:
+        out.tables["reference"] = reference
+        if reference not in truths:
+            out.remarks.append(
+                f"{reference.name} is used as the reference: remove it if it is an estimate, not the truth"
+            )
+    return out
+
+
+def _role(found: Guess) -> str | None:
+    """The role that the fields of a table show; None for poses and for unknown tables."""
+    if not found.has("t"):
+        return "tags" if found.has("epc", "x", "y") else "landmarks" if found.has("landmark", "x", "y") else None
+    if found.has("epc"):
+        return "rfid"
+    if found.has("landmark") and (found.has("range") or found.has("bearing")):
+        return "bearing_range"
+    if _sides(found) or found.has("v", "w"):
+        return "odometry"
+    if found.has("antenna"):
+        return "inventories"
+    return "imu" if found.has("w") else None
+
+
+def _sides(found: Guess) -> tuple[str, ...]:
+    """The fields of a left and a right wheel, if the table has them."""
+    return tuple(name for name in found.fields if name.startswith(("left", "right")))
+
+
+def _described(role: str, found: Guess, roles: _Roles) -> dict[str, Any]:
+    """The keys of a table of the manifest."""
+    sides = _sides(found) if role == "odometry" else ()
+    names = ("t", *sides) if sides else FIELDS[role]
+    if role == "odometry" and found.has("v", "w"):
+        names = ("t", "v", "w")
+    if role in ("odometry", "reference") and not sides and not found.has("heading") and not found.has(*QUATERNION):
+        found.reasons.append("has no headings")
+    settings = found.mapping(names)
+    if sides:
+        _add_sizes(settings, found, sides, roles)
+    if role == "reference" and not found.has("heading") and not found.has(*QUATERNION):
+        settings["has_heading"] = False
+    return settings
+
+
+def _add_sizes(settings: dict[str, Any], found: Guess, sides: Sequence[str], roles: _Roles) -> None:
+    """The distance between the wheels, and the distance per unit of counters: from the reference, or examples."""
+    settings["track"] = TRACK
+    if sides[0] != "left":
+        if sides[0] in ("left_angle", "left_rate"):
+            settings["radius"] = 0.1
+        roles.remarks.append(
+            f"{found.name}: measure the distance between the wheels, and their radius: track, radius [m]"
+        )
+        return
+    left, right = (_unwrapped(found.values(name)) for name in sides)
+    tick, track = TICK, None
+    if (reference := roles.tables.get("reference")) is not None:
+        travelled = float(np.nansum(np.abs(np.diff((left + right) / 2.0))))
+        way = _way(reference)
+        if travelled > 0.0 and way > 0.0:
+            tick = float(f"{way / travelled:.3g}")
+            roles.remarks.append(
+                f"{found.name}: {tick:g} m per unit of {quoted(found.fields['left'])}, as the reference travels {way:.1f} m over "
+                f"{travelled:.0f} of them; replace it by the size of your wheels"
+            )
+        track = _track(found.times(), tick * (right - left), reference)
+    else:
+        roles.remarks.append(f"{found.name}: replace {tick:g} by the metres per unit of {quoted(found.fields['left'])}")
+    if track is None:
+        roles.remarks.append(f"{found.name}: measure the distance between the wheels: track [m]")
+    else:
+        settings["track"] = track
+        roles.remarks.append(
+            f"{found.name}: track = {track:g} m, as the reference turns; replace it by what you measure"
+        )
+    settings.setdefault("units", {}).update(left=tick, right=tick)
+
+
+def _unwrapped(counts: Array) -> Array:
+    """The values of a counter without its wraps, for the fewest bits that it fits in."""
+    for bits in WIDTHS:
+        if np.nanmax(np.abs(counts)) < 2.0**bits and np.nanmax(np.abs(np.diff(counts)), initial=0.0) > 2.0 ** (
+            bits - 1
+        ):
+            return np.asarray(np.unwrap(counts, period=2.0**bits))
+    return counts
+
+
+def _way(reference: Guess) -> float:
+    """The length of the way of a reference [m], between poses that are a second apart."""
+    poses = _poses(reference)
+    steps = np.searchsorted(poses[:, 0], np.arange(poses[0, 0], poses[-1, 0], WINDOW))
+    return float(np.nansum(np.hypot(*np.diff(poses[steps, 1:3], axis=0).T)))
+
+
+def _poses(reference: Guess) -> Array:
+    """Times [s], positions [m] and headings [rad] of a table of poses (N, 4); headings are NaN without any."""
+    factor = {"mm": 1e-3, "cm": 1e-2}.get(str(reference.units.get("x", "m")), 1.0)
+    heading = np.full(len(reference.times()), np.nan)
+    if reference.has("heading"):
+        heading = reference.values("heading") * (np.pi / 180.0 if reference.units.get("heading") == "deg" else 1.0)
+    elif reference.has(*QUATERNION):
+        x, y, z, w = (reference.values(name) for name in QUATERNION)
+        heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
+    return np.column_stack((reference.times(), factor * reference.values("x"), factor * reference.values("y"), heading))
+
+
+def _track(t: Array, difference: Array, reference: Guess) -> float | None:
+    """The distance between the wheels [m] with which their difference (N,) [m] turns as much as the reference; None if unknown."""
+    poses = _poses(reference)
+    if np.isnan(poses[:, 3]).any():
+        return None
+    turns = []
+    for times, values in ((t, difference), (poses[:, 0], np.unwrap(poses[:, 3]))):
+        steps = np.searchsorted(times, np.arange(times[0], times[-1], WINDOW))
+        turns.append(float(np.sum(np.abs(np.diff(values[steps])))))
+    return float(f"{turns[0] / turns[1]:.3g}") if turns[1] > 1.0 else None
+
+
+def _add_clocks(options: dict[str, Any], roles: _Roles) -> None:
+    """Offsets of clocks that begin at another time than that of most tables: as if all logs began together."""
+    starts = {role: float(np.nanmin(found.times())) for role, found in roles.tables.items() if found.has("t")}
+    ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}
+    if not starts:
+        return
+
+    def agreeing(role: str) -> tuple[int, bool]:
+        others = sum(ends[role] > starts[other] and starts[role] < ends[other] for other in starts)
+        return others, role == "reference"
+
+    usual = max(starts, key=agreeing)
+    for role, start in starts.items():
+        if start > ends[usual] + APART or ends[role] < starts[usual] - APART:
+            options[role]["clock_offset"] = round(starts[usual] - start, 3)
+            roles.remarks.append(
+                f"{roles.tables[role].name}: its clock differs from that of {roles.tables[usual].name}: clock_offset is such that "
+                "both begin together; correct it if they did not"
+            )

@@ -1,0 +1,312 @@
+"""Guesses of what the table of another program has: separator, header, and the field and the unit of each column.
+
+A guess is by the name of a column first, and by its values second. Each one comes with its reason.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from factorgraph_loc.files.column_mapping import parsed, split_comments
+from factorgraph_loc.files.models import read_text
+from factorgraph_loc.files.tables import iso_nanoseconds
+from factorgraph_loc.io.field_names import LANDMARK, RANGE, READ, plain, rank
+from factorgraph_loc.text import quoted
+from factors.se2 import Array
+
+SEPARATORS = ("\t", ";", ",", " ")
+LOOKED_AT = 50  # lines that separator and header are guessed from
+TIME = re.compile(r"^(t|time.*|.*time|.*stamp|when|date.*|millis|uptime|clock|secs?|seconds|finished|end(ed)?|begin)$")
+BRACKETS = re.compile(r"\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
+WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+POSE = {
+    "x": ("x", "px", "posx", "positionx", "east", "easting"),
+    "y": ("y", "py", "posy", "positiony", "north", "northing"),
+    "z": ("z", "pz", "posz", "positionz", "height", "up"),
+    "heading": ("heading", "theta", "yaw", "th", "phi"),
+    **{f"q{axis}": (f"q{axis}", f"quat{axis}", f"orientation{axis}", f"o{axis}") for axis in "xyzw"},
+}
+MOTION = {
+    "v": ("v", "vx", "speed", "velocity", "vel", "linear", "linearx", "linearvelocity", "forward"),
+    "w": ("w", "wz", "omega", "yawrate", "turnrate", "angular", "angularz", "angularvelocity", "gyroz", "rotz"),
+}
+OTHERS = {
+    "landmark": ("landmark", "anchor", "beacon", "marker", *LANDMARK[:-1], "name", "id"),
+    "range": RANGE,
+    "bearing": ("bearing", "azimuth"),
+    "duration": ("duration", "len", "length"),
+    "facing": ("facing", "faces", "direction", "facingdirection"),
+}
+NAMES: dict[str, Sequence[str]] = {**{k: v for k, v in READ.items() if k != "stamp"}, **POSE, **MOTION, **OTHERS}
+# names of units at the end of a column's name, by kind of field
+SECONDS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "millis": "ms", "micros": "us", "nanos": "ns"}
+LENGTHS = {"m": "m", "cm": "cm", "mm": "mm", "ft": "ft", "in": "in"}
+ANGLES = {"deg": "deg", "degrees": "deg", "rad": "rad"}
+SPEEDS = {"m/s": "m/s", "cm/s": "cm/s", "mm/s": "mm/s", "km/h": "km/h", "mps": "m/s", "kmh": "km/h"}
+RATES = {"rad/s": "rad/s", "deg/s": "deg/s", "dps": "deg/s", "rpm": "rpm"}
+ENDS: dict[str, Mapping[str, str]] = {
+    **dict.fromkeys(("t", "duration"), SECONDS),
+    **dict.fromkeys(("x", "y", "z", "range"), LENGTHS),
+    **dict.fromkeys(("heading", "bearing", "facing", "phase"), ANGLES),
+    "v": SPEEDS,
+    "w": RATES,
+    "frequency": {"hz": "Hz", "khz": "kHz", "mhz": "MHz"},
+}
+DEGREES, FASTEST, TURNING = 6.4, 15.0, 12.0  # larger angles are in degrees; m/s and rad/s that no robot has
+# units of values of at most this size
+LARGER = {
+    "phase": (("rad", 6.4), ("deg", 360.0), ("turn/4096", 4096.0)),
+    "frequency": (("MHz", 1e4), ("kHz", 1e7)),
+    "rssi": (("dBm", 200.0), ("cdBm", 2e4)),
+}
+OURS = ("rad", "dBm")
+EPC = re.compile(r"(0x)?[0-9A-Fa-f]{8,}$")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The ``columns`` of a table as texts, by name or, without ``header``, by number from 1; ``separator`` and ``decimal`` mark."""
+
+    path: Path
+    separator: str
+    decimal: str
+    header: bool
+    columns: Mapping[str, Sequence[str]]
+
+    def numbers(self, name: str) -> Array | None:
+        """The numbers (N,) of a column, NaN where it is empty; None if it has other texts, or none."""
+        texts = self.columns[name]
+        with suppress(ValueError):
+            values = np.array([float(t.replace(self.decimal, ".")) if t else np.nan for t in texts])
+            return values if np.isfinite(values).any() else None
+        return None
+
+
+@dataclass
+class Guess:
+    """The ``fields`` of a table with the column of each, their ``units``, and the ``reasons`` of guesses by values."""
+
+    sample: Sample
+    fields: dict[str, str] = field(default_factory=dict)
+    units: dict[str, str | float] = field(default_factory=dict)
+    reasons: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.sample.path.name
+
+    def values(self, name: str) -> Array:
+        """The numbers (N,) of a field."""
+        values = self.sample.numbers(self.fields[name])
+        return np.empty(0) if values is None else values
+
+    def times(self) -> Array:
+        """The timestamps (N,) in seconds; empty without any."""
+        unit = self.units.get("t")
+        if unit == "iso":
+            return np.array([iso_nanoseconds(text) / 1e9 for text in self.sample.columns[self.fields["t"]]])
+        return self.values("t") * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[str(unit)] if unit else np.empty(0)
+
+    @property
+    def is_tum(self) -> bool:
+        """Whether the table is a TUM file."""
+        sample = self.sample
+        return not sample.header and sample.separator == " " and self.has("qw") and self.units.get("t") == "s"
+
+    def has(self, *names: str) -> bool:
+        """Whether the table has all these fields."""
+        return all(name in self.fields for name in names)
+
+    def mapping(self, names: Sequence[str]) -> dict[str, Any]:
+        """The keys of a manifest that map the fields ``names``, as far as the table has them."""
+        out: dict[str, Any] = {"file": self.name}
+        sample = self.sample
+        if self.is_tum:
+            return out | {"format": "tum"}
+        out |= {} if sample.separator == "," else {"separator": sample.separator}
+        out |= {} if sample.decimal == "." else {"decimal": sample.decimal}
+        out |= {} if sample.header else {"header": False}
+        out["columns"] = {name: self.fields[name] for name in names if name in self.fields}
+        if units := {name: self.units[name] for name in out["columns"] if name in self.units}:
+            out["units"] = units
+        return out
+
+
+def sample_of(path: Path) -> Sample | None:
+    """The columns of a table; None if the file is no table of at least two rows and columns."""
+    numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
+    comments, content = split_comments(numbered)
+    for separator in SEPARATORS:
+        first = list(parsed(path, content[:LOOKED_AT], separator))
+        widths = {len(parts) for _, parts in first}
+        if len(first) > 1 and len(widths) == 1 and widths != {1}:
+            break
+    else:
+        return None
+    width, body = widths.pop(), [parts for _, parts in parsed(path, content, separator)]
+    named = next(parsed(path, comments[-1:], separator), (0, []))[1]
+    names: Sequence[str] = [str(i) for i in range(1, width + 1)]
+    if len(named) == width or not any(_is_value(text) for text in body[0]):
+        names, body = (named, body) if len(named) == width else (body[0], body[1:])
+    rows = [parts for parts in body if len(parts) == width]
+    if not rows or len(set(names)) < width:
+        return None
+    columns = {name: [parts[i] for parts in rows] for i, name in enumerate(names)}
+    cells = " ".join(text for parts in rows[:LOOKED_AT] for text in parts)
+    decimal = "," if separator != "," and re.search(r"\d,\d", cells) and not re.search(r"\d\.\d", cells) else "."
+    return Sample(path, separator, decimal, not names[0].isdecimal(), columns)
+
+
+def _is_value(text: str) -> bool:
+    """Whether a text is a number or a time, and so no name of a column."""
+    return bool(re.match(r"[-+]?[\d.,]+(e[-+]?\d+)?$", text, re.IGNORECASE)) or _is_time(text)
+
+
+def _is_time(text: str) -> bool:
+    with suppress(ValueError):
+        return len(text) > len("2026-01-31") and iso_nanoseconds(text) > 0
+    return False
+
+
+def guess(sample: Sample) -> Guess:
+    """The fields and units of a table."""
+    out = Guess(sample)
+    _add_time(out)
+    if not sample.header:
+        _add_tum(out)
+        return out
+    taken = set(out.fields.values())
+    for name in sample.columns:
+        text, end = _split(name)
+        ranked = [(at, f) for f, known in NAMES.items() if (at := rank(plain(text), known)) is not None]
+        if name in taken or not ranked:
+            continue
+        best = min(ranked)[1]
+        if best not in out.fields:
+            out.fields[best] = name
+            if unit := ENDS.get(best, {}).get(end):
+                out.units[best] = unit
+    for name, texts in sample.columns.items():
+        if "epc" not in out.fields and name not in taken and all(EPC.match(text) for text in texts[:LOOKED_AT]):
+            out.fields["epc"] = name
+            out.reasons.append(f"{quoted(name)} has hexadecimal numbers as EPCs have")
+    _add_wheels(out)
+    _add_units(out)
+    return out
+
+
+def _split(name: str) -> tuple[str, str]:
+    """The name of a column without its unit, and the unit in lower case, or ""."""
+    if bracket := BRACKETS.search(name):
+        return name[: bracket.start()], bracket[1].lower()
+    words = WORDS.findall(name)
+    end = words[-1].lower() if len(words) > 1 else ""
+    known = any(end in ends for ends in ENDS.values())
+    return (name[: name.rfind(words[-1])], end) if known else (name, "")
+
+
+def _add_time(out: Guess) -> None:
+    """The column of the time: named so, with times or numbers that hardly ever fall; without header the first one."""
+    sample = out.sample
+    names = list(sample.columns)
+    named = [name for name in names if TIME.match(plain(_split(name)[0]))] if sample.header else names[:1]
+    for name in [*named, *names[:1]]:
+        texts = sample.columns[name]
+        if _is_time(texts[0]) and _is_time(texts[-1]):
+            out.fields["t"], out.units["t"] = name, "iso"
+            return
+        values = sample.numbers(name)
+        if values is None or len(values) < 2 or np.mean(np.diff(values) < 0.0) > 0.2 or np.ptp(values) == 0.0:
+            continue
+        end = _split(name)[1] or plain(name)
+        out.fields["t"] = name
+        out.units["t"] = SECONDS.get(end) or _unit_of_times(values)
+        if end not in SECONDS and sample.header:
+            out.reasons.append(f"{quoted(name)} is in {out.units['t']}: it begins with {texts[0]}")
+        return
+
+
+def _unit_of_times(values: Array) -> str:
+    """The unit of timestamps, by their size since 1970, or by the steps of a clock that begins with the log."""
+    first = float(np.abs(values[np.isfinite(values)][0]))
+    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
+        if first > least:
+            return unit
+    step = float(np.nanmedian(np.diff(np.unique(values))))
+    whole = bool(np.all(values == np.floor(values)))
+    return "s" if not whole or step <= 1.0 else "ms" if step < 1e4 else "us" if step < 1e7 else "ns"
+
+
+def _add_tum(out: Guess) -> None:
+    """The eight columns of a TUM file: time, position, and a quaternion of length 1."""
+    names = list(out.sample.columns)
+    values = [out.sample.numbers(name) for name in names]
+    if len(names) != 8 or any(v is None for v in values):
+        return
+    length = np.linalg.norm(np.column_stack([v for v in values[4:] if v is not None]), axis=1)
+    if np.nanmax(np.abs(length - 1.0)) < 1e-2:
+        out.fields |= dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), names[1:], strict=True))
+
+
+def _add_wheels(out: Guess) -> None:
+    """The columns of a left and a right wheel: their speeds, rates, angles or distances, or counters, which are whole numbers."""
+    words = {name: [word.lower() for word in WORDS.findall(name)] for name in out.sample.columns}
+    sides = {
+        side: [name for name, parts in words.items() if {side, side[0]} & set(parts)] for side in ("left", "right")
+    }
+    if not sides["left"] or len(sides["left"]) != len(sides["right"]):
+        return
+    if len(sides["left"]) > 1:
+        out.reasons.append(f"of several wheels on a side, those of {quoted(sides['left'][0])} are used")
+    left, right = (sides[side][0] for side in ("left", "right"))
+    parts = set(words[left])
+    kind = next(
+        (
+            end
+            for end, known in (
+                ("_rate", {"rate", "rpm", "omega"}),
+                ("_speed", {"speed", "velocity", "vel", "v", "mps"}),
+                ("_angle", {"angle", "rad", "position"}),
+            )
+            if known & parts
+        ),
+        "",
+    )
+    out.fields |= {f"left{kind}": left, f"right{kind}": right}
+    if "rpm" in parts:
+        out.units |= {"left_rate": "rpm", "right_rate": "rpm"}
+
+
+def _add_units(out: Guess) -> None:
+    """Units that values show: angles above a turn, and speeds and positions that no robot has in metres."""
+    for name in ("heading", "bearing", "facing"):
+        if out.has(name) and name not in out.units and np.nanmax(np.abs(out.values(name)), initial=0.0) > DEGREES:
+            _set_unit(out, name, "deg", f"has values up to {np.nanmax(np.abs(out.values(name))):.0f}")
+    if out.has("w") and "w" not in out.units and np.nanmax(np.abs(out.values("w")), initial=0.0) > TURNING:
+        _set_unit(out, "w", "deg/s", f"has values up to {np.nanmax(np.abs(out.values('w'))):.0f}")
+    if out.has("v") and "v" not in out.units and np.nanmax(np.abs(out.values("v")), initial=0.0) > FASTEST:
+        _set_unit(out, "v", "mm/s", f"has values up to {np.nanmax(np.abs(out.values('v'))):.0f}")
+    for name, sizes in LARGER.items():
+        size = np.nanmax(np.abs(out.values(name)), initial=0.0) if out.has(name) else 0.0
+        if size > 0.0 and name not in out.units:
+            unit = next((unit for unit, most in sizes if size <= most), None)
+            if unit is not None and unit not in OURS:
+                _set_unit(out, name, unit, f"has values up to {size:g}")
+    t = out.times()
+    if out.has("x", "y") and len(t) > 1 and not {"x", "y"} & set(out.units):
+        steps = np.hypot(np.diff(out.values("x")), np.diff(out.values("y")))
+        speed = float(np.nansum(steps) / max(t[-1] - t[0], 1e-9))
+        if speed > FASTEST:
+            for name in ("x", "y", *(("z",) if out.has("z") else ())):
+                _set_unit(out, name, "mm", f"would move at {speed:.0f} m/s in metres")
+
+
+def _set_unit(out: Guess, name: str, unit: str, why: str) -> None:
+    out.units[name] = unit
+    out.reasons.append(f"{quoted(out.fields[name])} is in {unit}: it {why}")

@@ -1,0 +1,67 @@
+"""Proposed manifests, with remarks on what they assume."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+COMPANIONS = {
+    "rig": 'no rig is given: set rig = "NAME.rig.toml" to a file next to this one; `fgloc rigs new` writes one',
+    "world": 'no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks',
+}
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A proposed manifest: its ``content``, and its ``text`` as TOML with ``remarks`` as comments. Its paths are relative to
+    ``folder``."""
+
+    content: Mapping[str, Any]
+    remarks: tuple[str, ...]
+    text: str
+    folder: Path
+
+
+def proposal_of(
+    reader: str, path: Path, folder: Path, options: Mapping[str, Any], remarks: Sequence[str], *, with_map: bool = True
+) -> Proposal:
+    """The manifest of a log at ``path`` with the ``options`` of a reader, in ``folder`` if the log is below it, else beside it.
+
+    Rig and map are files beside the log that begin with its name. Without ``with_map``, the options have the map.
+    """
+    root = folder if path.is_relative_to(folder) else path.parent
+    kind = "bag" if reader == "rosbag" else "folder"
+    content: dict[str, Any] = {"title": f"The {kind} {path.name}", "reader": reader}
+    content["path"] = path.relative_to(root).as_posix()
+    stem, notes = path.with_suffix("") if path.is_file() else path, list(remarks)
+    for companion, advice in COMPANIONS.items():
+        beside = sorted(path.parent.glob(f"*.{companion}.toml"))
+        own = stem.with_name(f"{stem.name}.{companion}.toml")
+        file = own if own in beside or len(beside) != 1 else beside[0]
+        if file in beside:
+            content[companion] = file.relative_to(root).as_posix()
+        elif companion != "world" or with_map:
+            notes.append(advice)
+    ordered = dict(sorted(options.items(), key=lambda item: isinstance(item[1], dict)))  # tables last
+    comments = "".join(f"# {line}\n" for line in notes)
+    text = f"{tomli_w.dumps(content)}{comments}\n{toml_of(ordered, 'options')}"
+    return Proposal(content | {"options": ordered}, tuple(notes), text, root)
+
+
+def toml_of(content: Mapping[str, Any], name: str = "") -> str:
+    """Settings as TOML, or as the table ``name``: values, then tables, whose own tables are in braces."""
+    tables = {key: value for key, value in content.items() if isinstance(value, dict)}
+    values = [_line(key, value) for key, value in content.items() if key not in tables]
+    parts = ["\n".join([f"[{name}]", *values] if name else values)] if values else []
+    for key, table in tables.items():
+        header = f"[{name}.{key}]" if name else f"[{key}]"
+        parts.append("\n".join([header, *(_line(*entry) for entry in table.items())]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _line(key: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{key} = {{ {', '.join(_line(*entry) for entry in value.items())} }}"
+    return tomli_w.dumps({key: value}).strip()
