@@ -74,10 +74,3 @@ def test_the_camera_of_a_robot_moves_as_the_robot_does(rng):
         lift[:3, i] = turn[2, 1], turn[0, 2], turn[1, 0]
         lift[3:, i] = rotation.T @ (there - position) / step
     np.testing.assert_allclose(covariance, lift @ root @ root.T @ lift.T, atol=1e-4)
-
-
-def test_pixels_of_uncertain_points_scatter_with_both(rng):
-    factor, pose = seen(rng, inexact=True)
-    _, _, by_point = reprojection.linearize_in_space(MODEL, *camera_pose(MODEL, pose), factor.points)
-    expected = MODEL.sigma**2 * np.eye(2) + by_point @ factor.point_covariances @ by_point.transpose(0, 2, 1)
-    np.testing.assert_allclose(pixel_kernels.pixel_noise(by_point, factor.point_covariances, MODEL.sigma), expected)

@@ -129,32 +129,3 @@ def test_noise_on_the_way_adds_up_as_small_motions_do():
     spread = se2.log(se2.between(se2.compose(particles, along[-1]), out[-1])).std(axis=0)
     assert spread[2] == pytest.approx(0.06, rel=0.06)
     assert spread[1] > 0.06
-
-
-def test_covariances_are_those_of_weighted_particles():
-    rng = np.random.default_rng(0)
-    poses = rng.normal((0.0, 5.0, 3.1), (1.0, 2.0, 0.3), (2, 300, 3))  # headings about the seam
-    wrapped = poses.copy()
-    wrapped[..., 2] = se2.wrap(poses[..., 2])
-    weights = rng.random((4, 300)).astype(np.float32)
-    index = np.array((0, 1, 1, 0))
-    out = np.empty((4, 3, 3))
-    particle_kernels.covariances(wrapped, index, weights, out)
-    for n, k in enumerate(index):
-        np.testing.assert_allclose(out[n], np.cov(poses[k].T, aweights=weights[n], ddof=0), rtol=1e-4, atol=1e-5)
-
-
-def test_histograms_count_particles_in_cells():
-    rng = np.random.default_rng(0)
-    poses = rng.uniform((-2.0, -2.0, -9.0), (2.0, 2.0, 9.0), (2, 500, 3))
-    weights = rng.random((3, 500)).astype(np.float32)
-    index, cell = np.array((1, 0, 1)), np.array((0.5, 0.8, 2.0 * math.pi / 6.0))
-    for dims in (1, 2, 3):
-        out = np.empty(3)
-        particle_kernels.cell_entropies(poses, index, weights, cell, dims, out)
-        for n, k in enumerate(index):
-            at = poses[k].copy()
-            at[:, 2] %= 2.0 * math.pi
-            _, which = np.unique(np.floor(at / cell)[:, :dims], axis=0, return_inverse=True)
-            p = np.bincount(which.ravel(), weights[n]) / weights[n].sum()
-            assert out[n] == pytest.approx(-np.sum(p * np.log(p)) + np.log(cell[:dims]).sum(), abs=1e-5)
