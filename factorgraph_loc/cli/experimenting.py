@@ -23,7 +23,6 @@ from factorgraph_loc.cli.options import (
     parse_list,
     takes_options,
 )
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.scoring import parse_seeds
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, POLICIES
 
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment import Done, Prepared
 
 
-MANY_RUNS = 2000  # runs above which confirmation is required
 SHOWN = 10  # failures and damaged runs that are printed
 
 app = typer.Typer(no_args_is_help=True, help="Experiments: run them, show their status, report their results.")
@@ -81,19 +79,12 @@ def run(
         bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
     ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help=f"Confirm more than {MANY_RUNS:,} runs.")] = False,
     json: Json = False,
 ) -> None:
     """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
     from factorgraph_loc.experiments.experiment import prepare, run_experiment
-    from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError
 
-    try:
-        prepared = prepare(file, **options.given(), verify=verify, most=MOST_RUNS if yes or dry_run else MANY_RUNS)
-    except TooManyRunsError as error:
-        if yes or dry_run:
-            raise
-        raise InputError(f"{error}: confirm with --yes, or list them with --dry-run") from error
+    prepared = prepare(file, **options.given(), verify=verify)
     if dry_run:
         _print_plan(prepared, jobs, retry_failed, json)
         return

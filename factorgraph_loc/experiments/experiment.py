@@ -15,11 +15,10 @@ from factorgraph_loc.evaluation.warned import lines
 from factorgraph_loc.experiments.cluster import Cluster
 from factorgraph_loc.experiments.execute import Executor, execute
 from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
-from factorgraph_loc.experiments.plan import MOST_RUNS, PlannedRun, TooManyRunsError, plan
+from factorgraph_loc.experiments.plan import PlannedRun, plan
 from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import State, Store
 from factorgraph_loc.files.bounded import kind
-from factorgraph_loc.text import plain
 
 if TYPE_CHECKING:
     import polars as pl
@@ -130,15 +129,13 @@ def prepare(
     data_root: str | Path | None = None,
     out: str | Path | None = None,
     verify: bool = False,
-    most: int = MOST_RUNS,
 ) -> Prepared:
     """Plan the experiment of a ``file`` with ``changes``, and look up stored results.
 
     ``changes``: values by dotted key, see :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``out``: folder of
     the results, by default the file's. ``verify``: check all checksums.
 
-    Raises InputError for errors in the file, TooManyRunsError for more than ``most`` runs, StoreError if the folder for results
-    cannot be written.
+    Raises InputError for errors in the file and for too many runs, StoreError if the folder for results cannot be written.
     """
     file = Path(file)
     experiment = read_experiment(file, changes)
@@ -147,10 +144,7 @@ def prepare(
         raise InputError(f"{folder}: is {kind_of_path}, expected a folder for the results")
     store = Store(folder)
     store.create()
-    try:
-        runs = plan(experiment, file.parent, store.folder, None if data_root is None else str(data_root), most=most)
-    except TooManyRunsError as error:
-        raise TooManyRunsError(f"{plain(file)}: {error}") from error
+    runs = plan(experiment, file.parent, store.folder, None if data_root is None else str(data_root))
     return Prepared.of(experiment, folder, runs, verify=verify)
 
 

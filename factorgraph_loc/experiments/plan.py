@@ -71,17 +71,12 @@ class _PlannedLog:
     sensors: tuple[str, ...]
 
 
-class TooManyRunsError(InputError):
-    """An experiment would have more runs than allowed."""
-
-
 def plan(
     experiment: Experiment,
     folder: Path,
     cache: Path,
     data_root: str | None = None,
     *,
-    most: int = MOST_RUNS,
     given: Sequence[LogSource] = (),
 ) -> list[PlannedRun]:
     """All runs of an experiment with paths relative to ``folder``; cached facts are stored below ``cache``. ``given``: logs in
@@ -89,7 +84,7 @@ def plan(
 
     Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only.
 
-    Before any log is read, raises TooManyRunsError for more than ``most`` runs. Before anything runs, raises InputError for an
+    Before any log is read, raises InputError for more than :data:`MOST_RUNS` runs. Before anything runs, raises it for an
     unreadable log, two logs of one name, invalid settings or prior, or a sensor that no log has.
     """
     facts = Facts(cache / "facts.json")
@@ -101,23 +96,18 @@ def plan(
         for place, entry in enumerate(experiment.logs)
         if entry.simulate is None
     }
-    _check_count(_count(experiment, sum(map(len, recorded.values())), facts), most)
+    _check_count(_count(experiment, sum(map(len, recorded.values())), facts), experiment)
     for entry in experiment.estimators:
         for swept in sweep.points(entry.shown, entry.name):
             facts.estimator(entry.name, _settings(entry, swept))  # report a wrong setting before logs are read
     try:
-        runs = _all_runs(experiment, recorded, facts, most)
+        runs = _all_runs(experiment, recorded, facts)
     finally:  # keep what was looked up, even if interrupted
         facts.save()
     return runs
 
 
-def _all_runs(
-    experiment: Experiment,
-    recorded: Mapping[int, Sequence[LogSource]],
-    facts: Facts,
-    most: int,
-) -> list[PlannedRun]:
+def _all_runs(experiment: Experiment, recorded: Mapping[int, Sequence[LogSource]], facts: Facts) -> list[PlannedRun]:
     sweep = experiment.sweep
     of_others = {entry.shown: sweep.points(entry.shown, entry.name) for entry in experiment.estimators}
     of_simulated = {entry.shown: _by_simulation(sweep, entry) for entry in experiment.estimators}
@@ -139,7 +129,7 @@ def _all_runs(
                 for swept in concerns:
                     for run in _runs(experiment, log, entry, swept, facts):
                         runs.setdefault(f"{run.label} {run.key}", run)
-                _check_count(len(runs), most)
+                _check_count(len(runs), experiment)
     return list(runs.values())
 
 
@@ -155,10 +145,10 @@ def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
     return total
 
 
-def _check_count(count: int, most: int) -> None:
-    if count > most:
+def _check_count(count: int, experiment: Experiment) -> None:
+    if count > MOST_RUNS:
         shown = f"{count:,}" if count < 10**12 else f"{count:.1g}"
-        raise TooManyRunsError(f"plans {shown} runs, more than {most:,}")
+        raise InputError(f"the experiment {experiment.name} plans {shown} runs, more than {MOST_RUNS:,}")
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:

@@ -10,7 +10,7 @@ from factorgraph_loc import InputError, write_native
 from factorgraph_loc.experiments import keys
 from factorgraph_loc.experiments import plan as plan_module
 from factorgraph_loc.experiments.experiment_file import Experiment
-from factorgraph_loc.experiments.plan import MOST_RUNS, TooManyRunsError, plan
+from factorgraph_loc.experiments.plan import plan
 
 
 @pytest.fixture
@@ -25,9 +25,9 @@ def logs(tmp_path, log):
 def planned(logs, tmp_path):
     """``planned(**content)``: the runs of an experiment with other keys than the usual ones."""
 
-    def make(most=MOST_RUNS, **content):
+    def make(**content):
         usual = {"name": "a", "logs": ["one", "two"], "estimators": ["dead_reckoning"]}
-        return plan(Experiment.model_validate(usual | content), logs, tmp_path, most=most)
+        return plan(Experiment.model_validate(usual | content), logs, tmp_path)
 
     return make
 
@@ -109,7 +109,7 @@ def test_an_experiment_may_name_logs_below_the_data_folder(planned, logs, outsid
 def test_runs_are_counted_before_any_is_planned(planned, content, monkeypatch):
     monkeypatch.setattr(plan_module, "_runs", lambda *_: pytest.fail("was planned"))
     monkeypatch.setattr(plan_module, "_logs", lambda *_: pytest.fail("a log was looked at"))
-    with pytest.raises(TooManyRunsError, match="more than 100,000"):
+    with pytest.raises(InputError, match="more than 100,000"):
         planned(**content)
 
 
