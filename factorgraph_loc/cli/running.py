@@ -221,8 +221,8 @@ def _print_events(result: RunResult) -> None:
     if events:
         more = f", the first {SHOWN_EVENTS}; all are in events.csv" if len(events) > SHOWN_EVENTS else ""
         show.line(f"events: {len(events)}{more}")
-    for t, text in events[:SHOWN_EVENTS]:
-        show.line(f"  at {t:.1f} s: {text}")
+    for event in events[:SHOWN_EVENTS]:
+        show.line(f"  at {event.t:.1f} s: {event}")
 
 
 def _print_effort(scores: Mapping[str, Any]) -> None:

@@ -62,7 +62,7 @@ class Track:
     def of(cls, result: RunResult) -> Track:
         """The plotted data of a run, from its result in memory."""
         nis = {s: np.array(rows, dtype=float).reshape(-1, 3) for s, rows in result.diagnostics.nis.items()}
-        events = tuple(result.diagnostics.events)
+        events = tuple((event.t, str(event)) for event in result.diagnostics.events)
         return cls(result.causal(), result.final, nis, events, result.max_gap, result.reliability)
 
     @classmethod

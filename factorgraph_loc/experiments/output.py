@@ -195,7 +195,7 @@ def learnt_tables(learnt: Learnt) -> dict[str, Any]:
 
 def events(result: RunResult, log: Log) -> pl.DataFrame:
     """The table of ``events.csv``; see :func:`write_run`."""
-    rows = [(log.t0_ns + round(t * 1e9), t, text) for t, text in result.diagnostics.events]
+    rows = [(log.t0_ns + round(e.t * 1e9), e.t, str(e)) for e in result.diagnostics.events]
     return pl.DataFrame(rows, schema={"t_ns": pl.Int64, "t": pl.Float64, "event": pl.String}, orient="row")
 
 

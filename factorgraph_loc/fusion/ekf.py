@@ -17,7 +17,7 @@ from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
-from factorgraph_loc.fusion.tracking import Refuted, Tracked, Tracking, is_doubted, laplace_evidence
+from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracked, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -258,8 +258,7 @@ class Ekf(Filter):
         refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
         best = self._search.best if refuted is not None else None
         if refuted is not None and best is not None:
-            what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
-            self.diagnostics.events.append((m.t, what))
+            self.diagnostics.event(m.t, "lost", JUMPED, why=refuted.why, since=refuted.since)
             self._jump(self._search.brought(best, self._odometry), refuted)
 
     def _pose_back(self, t: float, pose: Array) -> Array:
@@ -277,7 +276,7 @@ class Ekf(Filter):
         if pose is None:
             return None
         self._search.begin_track(by_search=True)
-        self.diagnostics.events.append((m.t, "localized"))
+        self.diagnostics.event(m.t, "localized", "localized")
         return self._start(self._search.brought(pose, self._odometry))
 
     def _jump(self, best: PosePrior, refuted: Refuted) -> None:

@@ -39,7 +39,7 @@ from factorgraph_loc.fusion.filter import Filter, FilterSettings, twin
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.timeline import Taken
-from factorgraph_loc.fusion.tracking import Change, Tracked, Tracking, is_known
+from factorgraph_loc.fusion.tracking import LOST, Change, Tracked, Tracking, is_known
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -191,7 +191,8 @@ class ParticleFilter(Filter):
             self._search.begin_track(by_search=True)
             for sensor in self._sensors.values():
                 sensor.restart(since)
-            self.diagnostics.event(self._t, "recovered" if self._lost else "localized")
+            kind = "recovered" if self._lost else "localized"
+            self.diagnostics.event(self._t, kind, kind)
         return cloud
 
     def _cloud(self, poses: Array, previous: Cloud | None = None) -> Cloud:
@@ -297,7 +298,7 @@ class ParticleFilter(Filter):
         if refuted is not None:
             # for the final trajectory: the track was wrong since then
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
-            self.diagnostics.event(self._t, f"lost: {refuted.why} since {refuted.since:.1f} s")
+            self.diagnostics.event(self._t, "lost", LOST, why=refuted.why, since=refuted.since)
             self._lost = True
             self._changes.append((self._t, refuted.change))
             self._state = self._sampled_cloud(refuted.since) or self._state
@@ -365,7 +366,7 @@ class ParticleFilter(Filter):
 
     def _is_due(self) -> bool:
         """Whether a cloud is to be kept for smoothing; also where the particles jump, as there is nothing to interpolate."""
-        if self.diagnostics.events and self.diagnostics.events[-1][0] == self._t:
+        if self.diagnostics.events and self.diagnostics.events[-1].t == self._t:
             return True
         last = next((r.t for r in reversed(self._records) if r.cloud is not None), -math.inf)
         return self._t >= last + self._settings.smoothing_interval - 1e-9

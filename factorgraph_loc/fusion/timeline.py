@@ -139,7 +139,7 @@ class Timeline(ABC):
         if best is None:
             return
         again = self._take_back(-math.inf)
-        self.diagnostics.event(m.t, "localized")
+        self.diagnostics.event(m.t, "localized", "localized")
         kept = start if start is not None and self._t <= start.t + START_KEPT else None
         t = again[0].t if kept is None else kept.t
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))

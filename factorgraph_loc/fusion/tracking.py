@@ -79,6 +79,12 @@ class WeighedObservation(NamedTuple):
     evidence: float
 
 
+# sentences of events
+LOST = "lost: {why} since {since:.1f} s"
+JUMPED = f"{LOST}; goes on at another place"
+SLIPS = "the odometry contradicts the observations since {since:.1f} s: the motion is not known"
+
+
 class Tracked(NamedTuple):
     """The newest pose of a track: the odometry there, and ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
 
@@ -279,8 +285,7 @@ class SlipMonitor:
         if surprise(correction) > 1.0 and self._are_surprising(t):
             odds, onset = max(self._log_odds(t - ago) for ago in ONSETS)
             if odds > RARE:
-                event = f"the odometry contradicts the observations since {onset:.1f} s: the motion is not known"
-                self._diagnostics.event(t, event)
+                self._diagnostics.event(t, "slip", SLIPS, since=onset)
                 self._motion.begin_slip(onset)
                 self._compared = t
 

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 # an addition: the list or count, its name, and the added rows or number
 Addition = tuple[dict[str, Any], str, Any]
+
+
+@dataclass(frozen=True)
+class Event:
+    """What happened at ``t`` [s], by its ``kind`` and ``fields``. Printed, it is the ``sentence`` with the fields in its braces."""
+
+    t: float
+    kind: str
+    sentence: str
+    fields: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return self.sentence.format(**self.fields)
 
 
 @dataclass
@@ -16,8 +29,8 @@ class Diagnostics:
 
     ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the update. ``nis``:
     by sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by
-    reason. ``events``: (t, description), for example a rebuilt graph. ``doubted``: by kind of doubt (``moved_tags``), elements of
-    the map that are probably not as the map has them, with that probability.
+    reason. ``events``: for example a rebuilt graph. ``doubted``: by kind of doubt (``moved_tags``), elements of the map that are
+    probably not as the map has them, with that probability.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -25,7 +38,7 @@ class Diagnostics:
     ignored: dict[str, int] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)
     late: dict[str, int] = field(default_factory=dict)
-    events: list[tuple[float, str]] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
     doubted: dict[str, dict[str, float]] = field(default_factory=dict)
     # all additions since :meth:`record` was called; None if it was not
     added: list[Addition] | None = field(default=None, init=False, repr=False, compare=False)
@@ -55,10 +68,11 @@ class Diagnostics:
         if self.added is not None:
             self.added.append((self.residuals, name, rows))
 
-    def event(self, t: float, what: str) -> None:
+    def event(self, t: float, kind: str, sentence: str, **fields: Any) -> None:
         """Record an event; an event that is repeated after going back in time is recorded once."""
-        if (t, what) not in self.events:
-            self.events.append((t, what))
+        event = Event(t, kind, sentence, fields)
+        if event not in self.events:
+            self.events.append(event)
 
     def keep_last(self, rows: int) -> None:
         """Keep the last ``rows`` rows of each list only."""

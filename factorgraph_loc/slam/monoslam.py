@@ -245,7 +245,7 @@ class Monoslam(Filter):
         relocated = None if camera is None else self._standing(camera, eye, state)
         if relocated is None:
             return replace(state, lost=lost), False
-        self.diagnostics.events.append((m.t, "camera: found its place in the map"))
+        self.diagnostics.event(m.t, "relocalized", "camera: found its place in the map")
         return relocated, True
 
     def _is_vague(self, state: SlamState) -> bool:

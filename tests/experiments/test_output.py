@@ -59,7 +59,7 @@ def test_table_of_estimates(result, log, tmp_path):
 def test_what_was_learnt_and_what_happened(result, log, tmp_path):
     point = LearntPoint(np.array((5.0, 1.0)), np.array(((0.04, 0.01), (0.01, np.nan))))
     result = replace(result, learnt=replace(result.learnt, landmarks={"a": point}))
-    result.diagnostics.events.append((0.75, "moved, or lost"))
+    result.diagnostics.event(0.75, "lost", "moved, or lost")
     write_run(result, log, tmp_path / "out")
     assert json.loads((tmp_path / "out/learnt.json").read_text()) == {
         "constants": {"scale": {"value": 1.0, "sigma": 0.1}},

@@ -1,7 +1,5 @@
 """A small log with all kinds of sensors, and two runs of it in folders, as `fgloc run` writes them."""
 
-import dataclasses
-
 import cv2
 import numpy as np
 import polars as pl
@@ -80,7 +78,7 @@ def results(log, tmp_path_factory):
     out = tmp_path_factory.mktemp("results")
     for estimator in ("ekf", "dead_reckoning"):
         result = run(log, RunConfig(estimator))
-        events = dataclasses.replace(result.diagnostics, events=[(1.25, "a jump")])
-        write_run(dataclasses.replace(result, diagnostics=events), log, out / "store" / estimator[:2] / estimator)
+        result.diagnostics.event(1.25, "jump", "a jump")
+        write_run(result, log, out / "store" / estimator[:2] / estimator)
     pl.DataFrame({"key": ["dead_reckoning", "ekf"], "status": ["ok", "ok"]}).write_parquet(out / "results.parquet")
     return out

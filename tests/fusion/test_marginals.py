@@ -155,7 +155,9 @@ def test_a_solver_that_fails_is_built_anew(lag, log, monkeypatch):
     expected = run(log, config)
     failing_marginals(1, monkeypatch)
     result = run(log, config)
-    assert [what for _, what in result.diagnostics.events] == ["solver rebuilt: made to fail"]
+    assert [(event.kind, event.fields) for event in result.diagnostics.events] == [
+        ("solver_rebuilt", {"why": "made to fail"})
+    ]
     assert set(result.status) == {"localized"}
     assert np.abs(result.poses - expected.poses)[:, :2].max() < 0.02
     assert np.abs(result.final.poses - expected.final.poses)[:, :2].max() < 0.02

@@ -23,7 +23,7 @@ def test_a_lost_track_is_ambiguous_until_its_place_is_found(log):
     carried = join(cut(log, 0.0, 10.0), alone)
     result = run(carried, RunConfig("smoother"))
     status = np.array(result.status)
-    ((t, _),) = result.diagnostics.events
+    (t,) = [event.t for event in result.diagnostics.events]
     assert 18.0 < t < 22.0
     assert np.all(status[(result.t > 13.0) & (result.t < t)] == "ambiguous")
     assert np.all(status[result.t > t + 0.1] == "localized")

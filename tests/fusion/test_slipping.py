@@ -47,7 +47,7 @@ def test_ranges_that_agree_overrule_wheels_that_slip(estimator):
     slipped, events = off(drive(slips=True), estimator)
     assert slipped.position.max() < 0.8  # the wheels report 3 m
     assert slipped.position[slipped.t > END + 5.0].max() < 0.2
-    assert any("odometry contradicts" in what for _, what in events)
+    assert any(event.kind == "slip" for event in events)
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "smoother", "particle_filter"])

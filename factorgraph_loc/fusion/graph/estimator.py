@@ -27,7 +27,7 @@ from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSetting
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.search import DURATION
 from factorgraph_loc.fusion.timeline import Taken, Timeline
-from factorgraph_loc.fusion.tracking import FOUND, Refuted, Tracked, Tracking, is_known
+from factorgraph_loc.fusion.tracking import FOUND, JUMPED, Refuted, Tracked, Tracking, is_known
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -182,8 +182,7 @@ class Smoother(Timeline):
         refuted = self._search.refuted(m, track, back)
         best = None if refuted is None else self._search.best
         if refuted is not None and best is not None:
-            what = f"lost: {refuted.why} since {refuted.since:.1f} s; goes on at another place"
-            self.diagnostics.events.append((self._t, what))
+            self.diagnostics.event(self._t, "lost", JUMPED, why=refuted.why, since=refuted.since)
             self._go_on(refuted, best)
 
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.fusion.graph.marginals import blamed, damped
+from factorgraph_loc.fusion.graph.marginals import DAMPED, blamed
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.tracking import Change
 from factorgraph_loc.maps.points import PointMap
@@ -371,7 +371,7 @@ class Graph:
         """Note as an event that covariances needed a larger damping than before."""
         if damping > self._damping:
             self._damping = damping
-            self.diagnostics.events.append((self.t, damped(damping)))
+            self.diagnostics.event(self.t, "damped", DAMPED, damping=damping)
 
     def unsolved(self, error: Exception) -> RunFailedError:
         """The error of a graph that cannot be solved, with the time and the variable that is to blame."""

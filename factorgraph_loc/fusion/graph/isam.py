@@ -161,7 +161,8 @@ class Incremental:
                 raise RuntimeError("the estimate jumped")
             self._read(newest, {key for node in nodes for key in node.keys})
         except GTSAM_ERRORS as error:
-            self._graph.diagnostics.events.append((newest.t, f"solver rebuilt: {self._graph.reason(error)}"))
+            why = self._graph.reason(error)
+            self._graph.diagnostics.event(newest.t, "solver_rebuilt", "solver rebuilt: {why}", why=why)
             newest.causal = guess
             self._start_again(newest, self._solver.summary(failed=True), "QR", failed=True)
         while self._failed:

@@ -14,6 +14,7 @@ import numpy as np
 from factors.se2 import Array
 
 DAMPINGS = (0.0, 1e-10, 1e-7)
+DAMPED = "covariances: the graph hardly determines them, relative damping of {damping:g}"  # sentence of the event
 _NEAR = re.compile(r"variable\s+(\d+)")  # in GTSAM's message about an indeterminate system
 
 
@@ -43,11 +44,6 @@ def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys
         if isinstance(result, dict):
             return Covariances(result, damping)
     raise result
-
-
-def damped(damping: float) -> str:
-    """The text of the event that reports a damping."""
-    return f"covariances: the graph hardly determines them, relative damping of {damping:g}"
 
 
 def blamed(error: Exception) -> int | None:

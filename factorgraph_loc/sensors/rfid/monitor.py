@@ -29,7 +29,6 @@ class SilenceMonitor:
     """Detects that no tag is read where tags should be: the reader or the tags have failed. The misses are then uninformative, and
     would drive the estimate to an area without tags."""
 
-    EVENT = "no tag is read where some should be"
     REJECTED = "rfid: no tag read where some should be"
 
     def __init__(self) -> None:
@@ -219,8 +218,6 @@ class ConsistencyMonitor:
     few predicted reads are merged, far bands with nearer ones: there are the reads if a range is too short. The model is
     doubted while one of them is beyond chance, and more than :data:`DIFFERENT` of the predicted reads are missing or too many.
     """
-
-    EVENT = "reads are not as the detection models predict"
 
     def __init__(self, antennas: Sequence[str]) -> None:
         self._groups = ReadGroups(antennas)

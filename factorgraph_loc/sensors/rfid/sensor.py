@@ -34,6 +34,10 @@ from factors.update import Correction
 
 PLACED = 5.0  # m: standard deviation of the position, above which a scan does not inform single tags
 SCAN = 50  # work of a scan, besides that of the tags in reach
+# sentences of events
+DEAD_ANTENNA = "antenna {antenna} reads no tag where it should: it is ignored until it does"
+DOUBTED_MODEL = "reads are not as the detection models predict: {shares}"
+SILENT = "no tag is read where some should be"
 
 
 @dataclass(frozen=True)
@@ -213,10 +217,10 @@ class TagSensor(Sensor):
             self._consistency.add(t, looks, reads, counts, overdispersion)
             for antenna in self._consistency.dead_antennas(overdispersion):
                 name = self.tags.exclude(antenna)
-                self._diagnostics.event(t, f"antenna {name} reads no tag where it should: it is ignored until it does")
+                self._diagnostics.event(t, "dead_antenna", DEAD_ANTENNA, antenna=name)
                 self._consistency.clear()
             if self._consistency.doubted and not doubted:
-                self._diagnostics.event(t, f"{ConsistencyMonitor.EVENT}: {self._consistency.shares}")
+                self._diagnostics.event(t, "doubted_model", DOUBTED_MODEL, shares=self._consistency.shares)
 
     def _values(self, view: View) -> dict[str, Array]:
         """The parameters (P,) of the detection models that are estimated, by block."""
@@ -236,7 +240,7 @@ class TagSensor(Sensor):
         if observation.found or observation.t > self._heard:
             lasted = self._silence.lasts
             if self._silence.add(observation.found, evidence) and not lasted:
-                self._diagnostics.event(observation.t, SilenceMonitor.EVENT)
+                self._diagnostics.event(observation.t, "silent", SILENT)
                 self.tags.silent()
             self._heard = max(self._heard, observation.t)
         return not self._silence.lasts

@@ -116,7 +116,7 @@ def said(one: Attempt, right: Attempt) -> str:
     if one.failure:
         return short(one.failure)
     parts = [short(text.partition(": ")[2]) for text in one.warnings if text not in right.warnings]
-    events = Counter(re.sub(r" since [\d.]+ s", "", text) for text in one.events if text not in right.events)
+    events = Counter(text for text in one.events if text not in right.events)
     parts += [short(text) + (f" ({times} times)" if times > 1 else "") for text, times in events.items()]
     for name, key in (("NIS", "nis.camera.median_ratio"), ("rejected", "rejected.total"), ("late", "late.total")):
         now, before = one.figures.get(key), right.figures.get(key)

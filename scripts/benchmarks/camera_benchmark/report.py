@@ -19,7 +19,7 @@ from factorgraph_loc.model.log import Log
 @dataclass(frozen=True)
 class Attempt:
     """A run: ``errors``, ``figures`` (:func:`factorgraph_loc.evaluation.metrics.score`) and ``warnings``; or its ``failure``.
-    ``events``: each text once."""
+    ``events``: the text of each, without its time."""
 
     errors: RunErrors | None
     figures: Mapping[str, Any]
@@ -39,7 +39,7 @@ def attempt(log: Log, config: RunConfig) -> Attempt:
         return Attempt(None, {}, failure=str(error))
     except Exception as error:
         return Attempt(None, {}, failure=repr(error))
-    events = tuple(dict.fromkeys(text for _, text in result.diagnostics.events))
+    events = tuple(f"{e.kind}: {e.fields['why']}" if "why" in e.fields else str(e) for e in result.diagnostics.events)
     return Attempt(run_errors(result, log), score(result, log), result.warnings, events)
 
 

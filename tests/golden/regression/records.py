@@ -195,11 +195,11 @@ def _of_diagnostics(diagnostics: Diagnostics) -> tuple[dict[str, Any], dict[str,
         },
         "residuals": {name: len(values) for name, values in sorted(diagnostics.residuals.items())},
         **{name: dict(sorted(getattr(diagnostics, name).items())) for name in ("ignored", "rejected", "late")},
-        "events": [what for _, what in diagnostics.events],
+        "events": [str(event) for event in diagnostics.events],
         "dead_tags": sorted(dead := diagnostics.doubted.get("dead_tags", {})),
     }
     numbers = {
-        "events.t": np.array([t for t, _ in diagnostics.events]),
+        "events.t": np.array([event.t for event in diagnostics.events]),
         "dead_tags.probabilities": np.array([p for _, p in sorted(dead.items())]),
     }
     if moved := diagnostics.doubted.get("moved_tags"):
