@@ -130,7 +130,7 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
         write_ply(log.world.points, out)
     elif out.suffix == ".g2o":
         run = _only(runs, out)
-        sensors = run.folder.config.sensors or log.rig.sensors
+        sensors = run.folder.sensors or log.rig.sensors
         write_g2o(log, run.final, sensors, out, run.landmarks)
     else:
         write_trajectory(_trajectory(log, runs, out), out, log.t0_ns)

@@ -5,7 +5,6 @@ import traceback
 from typing import Annotated, Any
 
 import typer
-from typer.completion import install_callback, show_callback
 from typer.core import TyperGroup
 
 from factorgraph_loc.cli import (
@@ -29,8 +28,6 @@ from factorgraph_loc.threads import use_one_thread
 from factorgraph_loc.version import __version__
 
 DEBUG = "--debug"
-COMPLETION = {"--install-completion": install_callback, "--show-completion": show_callback}
-SHELLS = ("bash", "zsh", "fish", "powershell", "pwsh")
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, or that of Typer's own copy of click
 UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: an internal error
 
@@ -39,9 +36,7 @@ class Commands(TyperGroup):
     """Turns errors into a line on stderr and an exit code."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Accept ``--debug`` anywhere on the line, and a shell's name after a completion option."""
-        if len(args) == 2 and args[0] in COMPLETION and args[1] in SHELLS:
-            COMPLETION[args[0]](ctx, self.params[0], args[1])
+        """Accept ``--debug`` anywhere on the line."""
         if DEBUG in args:
             args = [DEBUG, *(arg for arg in args if arg != DEBUG)]
         return super().parse_args(ctx, args)

@@ -7,9 +7,9 @@ with an import time of a second.
 from collections.abc import Callable, Iterable
 
 from factorgraph_loc.files.shipped import manifests, rigs
+from factorgraph_loc.model.scoring import NAMED_PRIORS
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS, ESTIMATORS, MAP_ESTIMATORS, POLICIES, PRESETS, READERS, SENSORS
 
-PRIORS = ("reference", "log", "unknown")
 Completion = Callable[[str], list[str]]
 
 
@@ -37,7 +37,7 @@ logs = _one_of(manifests)  # without a match the shell completes file names
 estimator = _one_of(lambda: ESTIMATORS)
 estimators = _some_of(lambda: ESTIMATORS)
 preset = _one_of(lambda: PRESETS)
-prior = _one_of(lambda: PRIORS)
+prior = _one_of(lambda: NAMED_PRIORS)
 sensor = _one_of(lambda: SENSORS)
 sensors = _some_of(lambda: [channel.name for sensor in SENSORS.values() for channel in sensor.channels])
 rig = _one_of(lambda: ("default", *rigs(), *PRESETS))

@@ -109,10 +109,10 @@ def run(
 def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
     show.outcome(done.warnings, done.failures, SHOWN, f", see `fgloc experiment status {file}`")
     if json:
-        results = {"runs": done.rows.to_dicts(), "failures": done.failures, "warnings": done.warnings}
+        results = {"runs": done.rows, "failures": done.failures, "warnings": done.warnings}
         show.document({"folder": str(prepared.folder), **results})
         return
-    header, lines = _summary(done.rows.to_dicts(), prepared.experiment.report.metrics)
+    header, lines = _summary(done.rows, prepared.experiment.report.metrics)
     show.table(header, lines)
     show.line()
     show.line(f"results are in {prepared.folder}: results.parquet, store/")
@@ -318,12 +318,13 @@ def active(
             progress=report,
         )
     show.outcome((), results.failures)
+    rows = results.rows
     if json:
-        tables = {"summaries": summaries(results.rows), "differences": differences(results.rows)}
-        show.document({"runs": results.rows, **tables, "failures": results.failures})
+        tables = {"summaries": summaries(rows), "differences": differences(rows)}
+        show.document({"runs": rows, **tables, "failures": results.failures})
     else:
-        show.table(*summary_cells(results.rows))
-        header, lines = difference_cells(results.rows)
+        show.table(*summary_cells(rows))
+        header, lines = difference_cells(rows)
         if lines:
             show.line()
             show.table(header, lines)

@@ -9,6 +9,7 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, LogOptions, takes_options
+from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 
 if TYPE_CHECKING:
     from factorgraph_loc.exports.runs import StoredRun
@@ -35,14 +36,13 @@ def view(
             metavar="ADDRESS",
             help="IP address that the viewer listens on, without credentials; only this machine reaches the default one.",
         ),
-    ] = "127.0.0.1",
+    ] = LOOPBACK,
     *,
     source: LogOptions,
     json: Json = False,
 ) -> None:
     """Show a log and its runs over time, in Rerun."""
     from factorgraph_loc.api import results
-    from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 
     log, runs = results.stored(what, source.load_one)
     results.show(log, runs, rrd, bind)

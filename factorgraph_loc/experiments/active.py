@@ -5,7 +5,7 @@ The runs are executed and stored like those of other experiments, so that an int
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from factorgraph_loc.experiments.active_results import (
     summary_cells,
 )
 from factorgraph_loc.experiments.execute import Files, execute, failure
+from factorgraph_loc.experiments.experiment import Done
 from factorgraph_loc.experiments.experiment_file import NO_TIME_LIMIT, Limits
 from factorgraph_loc.experiments.keys import digest_of
 from factorgraph_loc.experiments.pool import Processes
@@ -95,15 +96,6 @@ class ActiveJob:
         return row | ({"status": "refused"} if stored["kind"] == "refused" else {})
 
 
-@dataclass(frozen=True)
-class ActiveResults:
-    """``rows``: one per run, with the keys of :data:`ROW`; ``status`` is ok, refused (bad input) or failed; unless ok, there are
-    only the identification of the run and a ``reason``. ``failures``: one line for each of those."""
-
-    rows: list[Row]
-    failures: list[str] = field(default_factory=list)
-
-
 def active(
     world: str | Path | SimulationSettings,
     out: str | Path,
@@ -115,7 +107,7 @@ def active(
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> ActiveResults:
+) -> Done:
     """Drive simulated robots from an unknown start until they are localized: each policy with each estimator on each seed.
 
     ``jobs``: number of parallel processes (None: one per core).
@@ -141,8 +133,9 @@ def active(
         path.unlink(missing_ok=True)
     work = jobs_of(simulation, policies, estimators, seeds, settings, pictured=seeds[0])
     results = run_jobs(work, out, jobs or os.cpu_count() or 1, progress)
-    if all(row["status"] == "refused" for row in results.rows):
-        raise InputError(str(results.rows[0]["reason"]))
+    rows = results.rows
+    if all(row["status"] == "refused" for row in rows):
+        raise InputError(str(rows[0]["reason"]))
     config: dict[str, Any] = {
         "version": __version__,
         "policies": list(policies),
@@ -152,9 +145,9 @@ def active(
     for name, model in (("settings", settings), ("simulation", simulation)):
         config[name] = model.model_dump(mode="json", exclude_none=True)
     write_toml(out / "config.toml", config)
-    write_tables(results.rows, out)
-    write_picture(comparison(results.rows), out / PLOTS / "comparison.png")
-    for job, row in zip(work, results.rows, strict=True):
+    write_tables(rows, out)
+    write_picture(comparison(rows), out / PLOTS / "comparison.png")
+    for job, row in zip(work, rows, strict=True):
         if job.pictured and row["status"] == "ok":
             name = file_name(f"{job.source}-{job.estimator}-{job.policy}-seed{job.seed}.png")
             write_bytes(out / PLOTS / name, Store(out).read(job.key, PICTURE))
@@ -202,8 +195,10 @@ def run_jobs(
     folder: Path,
     workers: int,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> ActiveResults:
-    """The rows of all jobs in order. Results in the store below ``folder`` are read, new ones are stored."""
+) -> Done:
+    """The results of all jobs in order, with the columns :data:`ROW`. Stored ones below ``folder`` are read, new ones are stored.
+
+    ``status`` is ok, refused (bad input) or failed; unless ok, there are only the identification of the run and a ``reason``."""
     store = Store(folder)
     store.create()
     left = [job for job in jobs if store.state(job.key) != "ok"]
@@ -219,7 +214,7 @@ def run_jobs(
         for row in rows
         if row["status"] != "ok"
     ]
-    return ActiveResults(rows, failures)
+    return Done(pl.DataFrame(rows, schema=ROW), failures, [])
 
 
 def figures_of(run: ActiveRun) -> dict[str, float | None]:

@@ -16,6 +16,7 @@ from factorgraph_loc.evaluation.statistics import mcnemar, median_difference, me
 from factorgraph_loc.evaluation.warned import Row
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
+from factorgraph_loc.text import number
 from factors.se2 import Array
 
 if TYPE_CHECKING:
@@ -134,8 +135,8 @@ def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
                 *(metres_text(summary["median"]), metres_text(summary["p90"])),
                 f"{summary['failures']} ({low:.0f} % to {high:.0f} %)",
                 str(summary["claimed_wrong"]),
-                *(_text(summary["error_position"], 2), _text(np.degrees(summary["error_heading"]), 1)),
-                *(_text(summary["seconds"], 0), _text(summary["planning_ms"], 1)),
+                *(number(summary["error_position"], 2), number(np.degrees(summary["error_heading"]), 1)),
+                *(number(summary["seconds"], 0), number(summary["planning_ms"], 1)),
             ]
         )
     return header, lines
@@ -165,18 +166,14 @@ def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def metres_text(value: float) -> str:
-    return NEVER if math.isinf(value) else _text(value, 1)
+    return NEVER if math.isinf(value) else number(value, 1)
 
 
 def _interval_text(interval: Sequence[float], digits: int) -> str:
-    value, low, high = (_text(bound, digits) for bound in interval)
+    value, low, high = (
+        f"{bound:.{digits}f}".replace("inf", "∞") if math.isinf(bound) else number(bound, digits) for bound in interval
+    )
     return f"{value} ({low} to {high})"
-
-
-def _text(value: float, digits: int) -> str:
-    if math.isnan(value):
-        return "–"
-    return ("∞" if value > 0 else "-∞") if math.isinf(value) else f"{value:.{digits}f}"
 
 
 def _median(rows: Sequence[Row], key: str) -> float:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from factorgraph_loc.evaluation.inference import DIFFERENCES, differences
 from factorgraph_loc.evaluation.plots import plot_log, remove_plots
 from factorgraph_loc.evaluation.scores import REPORT
 from factorgraph_loc.evaluation.tables import BASELINE, comparison_cells, further_tables, markdown, unscored, verdict
-from factorgraph_loc.experiments.experiment import Prepared, run_experiment
+from factorgraph_loc.experiments.experiment import Done, Prepared, run_experiment
 from factorgraph_loc.experiments.experiment_file import NO_TIME_LIMIT, Experiment
 from factorgraph_loc.experiments.log_source import GivenSource
 from factorgraph_loc.experiments.output import TABLES, write_tables
@@ -41,14 +41,8 @@ FINISHED = (
 )  # results that are not replaced; an unfinished comparison, which is continued, has none of them
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """``rows``: one per run, all with the same keys: log, estimator, seed, status (ok, failed), reason, the scalar scores (None
-    in a failed run), and ``warnings``, one per line. ``failures``: one line per failed run; ``warnings``: each once."""
-
-    rows: list[dict[str, Any]]
-    failures: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+class Comparison(Done):
+    """The results of a comparison, which print as its table."""
 
     def __repr__(self) -> str:
         return summary_text(self.rows)
@@ -118,9 +112,9 @@ def compare(
     done = run_experiment(prepared, jobs=jobs, again=True, progress=lambda made, total, _: progress(made, total))
     report_experiment(prepared)
     _plot(logs, prepared, out / "plots")
-    rows = done.rows.to_dicts()
-    write_tables(done.rows, pl.DataFrame(differences(rows), schema=DIFFERENCES), _table(rows, rpe=rpe), out)
-    return Comparison(rows, done.failures, done.warnings)
+    compared = pl.DataFrame(differences(done.rows), schema=DIFFERENCES)
+    write_tables(done.table, compared, _table(done.rows, rpe=rpe), out)
+    return Comparison(done.table, done.failures, done.warnings)
 
 
 def _named(

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import lines
@@ -23,7 +23,7 @@ from factorgraph_loc.files.bounded import kind
 if TYPE_CHECKING:
     import polars as pl
 
-STATES = ("ok", "failed", "missing", "damaged")
+STATES = get_args(State)
 PACE = 20.0  # assumed ratio of log time to computing time of an unknown estimator
 
 
@@ -60,12 +60,17 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Done:
-    """The results: a row per run, see :func:`~factorgraph_loc.experiments.result_table.load_results`; a line for each failure, and
-    each warning once."""
+    """The results of several runs. ``table``: a row per run, see
+    :func:`~factorgraph_loc.experiments.result_table.load_results`. ``failures``: a line each; ``warnings``: each once."""
 
-    rows: pl.DataFrame
+    table: pl.DataFrame
     failures: list[str]
     warnings: list[str]
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows of the table, all with the same keys."""
+        return self.table.to_dicts()
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -48,8 +49,30 @@ def _fixed_part(pattern: str) -> str:
     return str(Path(*parts))
 
 
+class LogSource(ABC):
+    """The source of a log: number ``number`` of those that it stands for."""
+
+    number: int = 0
+
+    @abstractmethod
+    def load_all(self) -> list[Log]:
+        """All logs that it stands for. Raises InputError as the reader does."""
+
+    @abstractmethod
+    def files(self) -> dict[str, Path]:
+        """The files that the log is read from, by names independent of their location."""
+
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """The values that, with the content of the files, determine the log."""
+
+    def load(self) -> Log:
+        """The log."""
+        return self.load_all()[self.number]
+
+
 @dataclass(frozen=True)
-class RecordedSource:
+class RecordedSource(LogSource):
     """Log ``number`` of those that ``log`` stands for, in the sense of :func:`~factorgraph_loc.io.readers.load`.
 
     ``options``: of the reader, as JSON. ``rig``, ``world``: files replacing the log's own. ``data_root``: folder of the data of
@@ -65,25 +88,18 @@ class RecordedSource:
     data_root: str | None = None
 
     def load_all(self) -> list[Log]:
-        """All logs that ``log`` stands for. Raises InputError as the reader does."""
         from factorgraph_loc.io.readers import load  # noqa: PLC0415
 
         rig, world, root = (None if name is None else Path(name) for name in (self.rig, self.world, self.data_root))
         options = json.loads(self.options)
         return load(self.log, data_root=root, reader=self.reader, options=options, rig=rig, world=world)
 
-    def load(self) -> Log:
-        """The log."""
-        return self.load_all()[self.number]
-
     def files(self) -> dict[str, Path]:
-        """The files that the log is read from, by names independent of their location."""
         given = {"rig": self.rig, "world": self.world}
         named = [(f"{what}/{name}", file) for what, path in given.items() for name, file in _of_toml(path)]
         return dict(named) | dict(self._data())
 
     def identity(self) -> dict[str, Any]:
-        """The values that, with the content of the files, determine the log."""
         path = Path(self.log)
         name = path.stem if path.is_file() else path.name
         return {"log": name, "number": self.number, "reader": self.reader, "options": json.loads(self.options)}
@@ -119,7 +135,7 @@ class RecordedSource:
 
 
 @dataclass(frozen=True)
-class SimulatedSource:
+class SimulatedSource(LogSource):
     """The log of a ``preset`` (a name, or a TOML file), with changed ``settings`` (JSON) and a ``seed``."""
 
     preset: str
@@ -127,49 +143,32 @@ class SimulatedSource:
     seed: int = 0
 
     def load_all(self) -> list[Log]:
-        """Simulate the log."""
         from factorgraph_loc.simulation import named_settings, simulate  # noqa: PLC0415
 
         return [simulate(named_settings(self.preset, json.loads(self.settings)), self.seed)]
 
-    def load(self) -> Log:
-        """The log."""
-        return self.load_all()[0]
-
     def files(self) -> dict[str, Path]:
-        """The file of the settings, if any, and those that it names."""
         return dict(_of_toml(self.preset)) if self.preset.endswith(".toml") else {}
 
     def identity(self) -> dict[str, Any]:
-        """The values that, with the content of the files, determine the log."""
         return {"simulated": Path(self.preset).name, "settings": json.loads(self.settings), "seed": self.seed}
 
 
 @dataclass(frozen=True)
-class GivenSource:
-    """A ``log`` in memory, whose content has the ``digest``."""
+class GivenSource(LogSource):
+    """A ``log`` in memory, whose content has the ``digest``, in place of files."""
 
     log: Log = field(compare=False)
     digest: str
 
     def load_all(self) -> list[Log]:
-        """The log alone."""
         return [self.log]
 
-    def load(self) -> Log:
-        """The log."""
-        return self.log
-
     def files(self) -> dict[str, Path]:
-        """No files: the digest replaces them."""
         return {}
 
     def identity(self) -> dict[str, Any]:
-        """The digest of the content."""
         return {"given": self.digest}
-
-
-LogSource = RecordedSource | SimulatedSource | GivenSource
 
 
 def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSource]:

@@ -20,8 +20,6 @@ from factorgraph_loc.text import listed, quoted
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
 
-KNOWN = "reference, log or X,Y,HEADING"
-
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
     """The Gaussian prior of the start of a run, and the name of its source.

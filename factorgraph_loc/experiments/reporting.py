@@ -65,14 +65,13 @@ def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:
 
     path = out or prepared.folder / PAGE
     settings = prepared.experiment.report
-    is_there = settings.baseline in (rows["label"].to_list() if len(rows) else ())
     with writing(path):
         write_report(
             rows,
             files,
             path,
             metrics=settings.metrics,
-            baseline=settings.baseline if is_there else None,  # the baseline may be missing from partial results
+            baseline=settings.baseline,
             title=prepared.experiment.name,
             experiment=json.loads(prepared.experiment.model_dump_json(exclude_unset=True)),
             damaged=damaged,

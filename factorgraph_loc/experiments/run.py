@@ -15,7 +15,6 @@ from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.causal_run import CausalRun, rare_garbage_collection, span_of
 from factorgraph_loc.experiments.doubts import in_bent_map, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.preparation import (
-    KNOWN,
     at_origin,
     checked_use,
     resolve_prior,
@@ -121,7 +120,7 @@ def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior |
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
             f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
-            f"expected a prior {KNOWN}"
+            "expected a prior reference, log or X,Y,HEADING"
         )
     finds = finds_heading(estimator) and detecting(log.world, use.sensors)
     if prior is not None and not prior.has_heading and not finds:
@@ -156,7 +155,6 @@ def _result(
     log = use.log
     reviews = {name: review(use, end) for name, review in functions("review")}
     reliability = {name: result.reliability for name, result in reviews.items() if result.reliability is not None}
-    versions = _versions()
     effective = {
         "log": log.name,
         "estimator": config.estimator,
@@ -167,7 +165,7 @@ def _result(
         "max_gap": config.max_gap,
         "tick_gap": config.tick_gap,
         "rig": log.rig.model_dump(mode="json", exclude_none=True),
-        "versions": versions,
+        "versions": _versions(),
     }
     warnings = (
         *log.warnings,
@@ -194,7 +192,6 @@ def _result(
         diagnostics=end.final_diagnostics,
         learnt=end.learnt,
         timings=causal.timings(final_seconds, prepared),
-        versions=versions,
         warnings=tuple(dict.fromkeys(warnings)),
         reliability=reliability,
     )

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import polars as pl
@@ -36,31 +36,14 @@ class _Learnt(FileModel, extra="ignore"):
     landmarks: dict[str, _Landmark]
 
 
-class StoredConfig(FileModel, extra="ignore"):
-    """The part of ``config.toml``, the effective configuration of a run, that is read."""
+class RunFolder(FileModel, extra="ignore"):
+    """The folder of a run, with what is read of its effective configuration, ``config.toml``."""
 
+    path: Path
     log: Annotated[str, Field(min_length=1)]
     estimator: Annotated[str, Field(min_length=1)]
     sensors: tuple[str, ...] | None = None
-    prior: str | None = None
     seed: Annotated[int, Field(ge=0)] = 0
-    settings: dict[str, Any] = Field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class RunFolder:
-    """The folder of a run, with its log, estimator and seed."""
-
-    path: Path
-    config: StoredConfig
-
-    @property
-    def log(self) -> str:
-        return self.config.log
-
-    @property
-    def estimator(self) -> str:
-        return self.config.estimator
 
 
 @dataclass(frozen=True)
@@ -95,7 +78,10 @@ def find_runs(path: Path) -> list[RunFolder]:
     folders = [path] if (path / COMPLETE).is_file() else _stored(path) if is_results(path) else []
     if not folders:
         raise InputError(f"{path}: holds no results, expected a folder that `fgloc run` or `fgloc compare` wrote")
-    return [RunFolder(folder, _config(folder)) for folder in folders]
+    return [
+        parse_model(RunFolder, read_toml(folder / results.CONFIG) | {"path": folder}, folder / results.CONFIG)
+        for folder in folders
+    ]
 
 
 def _stored(path: Path) -> list[Path]:
@@ -112,7 +98,7 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
     Raises InputError if a run is not of this log, or if a file is damaged.
     """
     names = [folder.estimator for folder in folders]
-    with_seeds = [f"{folder.estimator}-seed{folder.config.seed}" for folder in folders]
+    with_seeds = [f"{folder.estimator}-seed{folder.seed}" for folder in folders]
     if len(set(names)) < len(names):
         names = with_seeds
     if len(set(names)) < len(names):
@@ -154,11 +140,6 @@ def _check_times(run: StoredRun, log: Log) -> None:
                 f"{run.folder.path}: has estimates from {trajectory.t[0]:.1f} s to {trajectory.t[-1]:.1f} s of the log's time, "
                 f"expected some between {first:.1f} s and {last:.1f} s: is it a run of another log {log.name}?"
             )
-
-
-def _config(folder: Path) -> StoredConfig:
-    path = folder / results.CONFIG
-    return parse_model(StoredConfig, read_toml(path), path)
 
 
 def _landmarks(path: Path) -> dict[str, LearntPoint]:

@@ -72,7 +72,6 @@ class RunResult:
     diagnostics: Diagnostics
     learnt: Learnt
     timings: Timings
-    versions: Mapping[str, str]
     warnings: tuple[str, ...] = ()
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
     doubts_model: tuple[bool, ...] = ()

@@ -18,7 +18,8 @@ Alignment = Literal["none", "origin", "se2", "se3", "sim3"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "se3", "sim3")
 Association = Literal["nearest", "interpolate"]
 ASSOCIATIONS: tuple[Association, ...] = ("nearest", "interpolate")
-PRIORS = "reference, log, unknown, X,Y or X,Y,HEADING"
+NAMED_PRIORS = ("reference", "log", "unknown")
+PRIORS = f"{', '.join(NAMED_PRIORS)}, X,Y or X,Y,HEADING"
 RATE = 10  # Hz
 TICK_GAP = 60.0  # s; gaps without measurements above this length have no ticks
 SHORTEST, LONGEST = 1.0, 86400.0  # s; bounds of the setting
@@ -62,7 +63,7 @@ def check_tick_gap(gap: float) -> None:
 
 def check_prior(prior: str | None) -> None:
     """InputError for a text that is no start of a run on any log."""
-    if prior not in (None, "unknown", "log", "reference"):
+    if prior is not None and prior not in NAMED_PRIORS:
         parse_position(prior)
 
 

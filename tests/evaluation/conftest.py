@@ -47,7 +47,7 @@ class Made:
     rows: pl.DataFrame
     tables: dict[str, bytes]
     scene: Scene
-    config: bytes = b'estimator = "made"\n\n[versions]\ngtsam = "4.3.0"\n'
+    config: bytes = b'estimator = "made"\n'
 
     def runs(self, key):
         """The files of a run."""

@@ -35,7 +35,7 @@ def drive(n=600, dt=0.1, speed=0.4):
 def result_of(t, poses, status, diagnostics=NOTHING, learnt=NOTHING_LEARNT, config=NO_CONFIG):
     covariances = np.tile(np.eye(3), (len(t), 1, 1))
     final = Trajectory(t, poses, covariances)
-    return RunResult("log", config, t, poses, covariances, status, final, diagnostics, learnt, TIMINGS, {})
+    return RunResult("log", config, t, poses, covariances, status, final, diagnostics, learnt, TIMINGS)
 
 
 def test_in_a_gap_of_the_reference_nothing_is_scored():

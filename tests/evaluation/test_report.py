@@ -114,8 +114,9 @@ def test_every_string_is_escaped(made, tmp_path):
         kind=pl.lit(BAD),
         warnings=pl.lit(BAD),
     )
-    bad.config = f"log = {json.dumps(BAD)}\n[versions]\n{json.dumps(BAD)} = {json.dumps(BAD)}\n".encode()
-    page = page_of(bad, tmp_path, title=BAD, experiment={"name": BAD, BAD: [BAD, None]}, baseline=BAD)
+    bad.config = f"log = {json.dumps(BAD)}\n".encode()
+    names = {"title": BAD, "experiment": {"name": BAD, BAD: [BAD, None]}, "versions": {BAD: BAD}}
+    page = page_of(bad, tmp_path, baseline=BAD, **names)
     elements = Elements(page).found
     drawn = [one for picture in pictures_of(page) for one in picture.iter()]
     assert not [one for one in drawn if one.tag.rpartition("}")[2] in ("script", "img", "image", "foreignObject")]
@@ -136,7 +137,7 @@ def test_failures_and_warnings_stand_with_their_runs(made, tmp_path):
 
 @pytest.mark.usefixtures("blank_pictures")
 def test_rows_of_tables_have_a_cell_in_each_column(made, tmp_path):
-    tables = Elements(page_of(troubled(made), tmp_path)).tables
+    tables = Elements(page_of(troubled(made), tmp_path, versions={"gtsam": "4.3.0"})).tables
     assert len(tables) == 11  # results, differences, five metrics, times, warnings, failures, versions
     for widths in tables:
         assert len(widths) > 1
@@ -177,10 +178,8 @@ def test_a_swept_simulation_makes_other_logs(made):
     assert results.compare(metric_of("causal.position_rmse")).pooled["ekf"].logs == 1
 
 
-def test_wrong_asks_are_told(made, tmp_path):
+def test_without_runs_there_is_no_page(made, tmp_path):
     some = made({"ekf": 0.1}, LOGS[:1], count=40)
-    with pytest.raises(InputError, match="the baseline is 'ekv', expected one of ekf"):
-        page_of(some, tmp_path, baseline="ekv")
     with pytest.raises(InputError, match="no runs"):
         write_report(some.rows[:0], some.runs, tmp_path / "none.html")
     assert not (tmp_path / "none.html").exists()

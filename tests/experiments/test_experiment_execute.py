@@ -147,7 +147,7 @@ def test_the_table_has_a_row_a_run_and_names_stay_what_they_are(experiment, out,
     text = "estimators = ['ekf', {name = 'smoother', label = 'short'}]\nsensors = ['odometry']\n[sweep]\nshort.lag = [1, 2]"
     done = run_experiment(experiment(text), progress=lambda *numbers: told.append(numbers))
     rows = load_results(out)
-    assert rows.equals(done.rows)
+    assert rows.equals(done.table)
     assert rows["log"].to_list() == [NASTY] * 3
     assert rows["label"].to_list() == ["ekf", "short", "short"]
     assert rows["sensors"].to_list() == ["odometry"] * 3
@@ -177,13 +177,13 @@ def test_failures_are_rows_and_are_tried_again_if_told(experiment, fake, monkeyp
 
 
 def test_a_damaged_result_is_found_and_done_again(experiment, out):
-    first = run_experiment(experiment()).rows
+    first = run_experiment(experiment()).table
     key = first["key"][1]
     (Store(out).path(key) / "estimates.parquet").write_bytes(b"")
     prepared = experiment()
     assert Counter(prepared.states.values()) == {"ok": 1, "damaged": 1}
     assert [one.key for one in prepared.todo()] == [key]
-    second = run_experiment(prepared).rows
+    second = run_experiment(prepared).table
     times = [name for name in first.columns if name.startswith("timing.")]
     assert second.drop(times).equals(first.drop(times))
 

@@ -17,7 +17,6 @@ from factorgraph_loc.evaluation.report.results import Results, RunFiles, read_ru
 from factorgraph_loc.evaluation.scores import REPORT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.files.models import write_text
-from factorgraph_loc.text import listed, quoted
 
 SHOWN = 8  # variants whose trajectories are visible initially
 _SWEPT = 3  # metrics that are plotted over a swept setting
@@ -39,22 +38,17 @@ def write_report(
 
     ``rows``: one per run, with key, log, estimator, seed, status (ok, failed), reason, scores, and optionally label, sensors,
     kind (of a failure), warnings and ``sweep.*``. ``runs``: the files of a successful run, by its key. ``metrics``: scores to
-    show. ``baseline``: the label that the others are compared with, by default the first. ``experiment``: the experiment file as
-    plain values. ``damaged``: descriptions of runs with unusable results. ``versions``: of the software used, by default those
-    in the configuration of the first run.
-
-    Raises InputError for no rows, or a baseline that is no label.
+    show. ``baseline``: the label that the others are compared with; the first without one, or if no run has it. ``experiment``:
+    the experiment file as plain values. ``damaged``: descriptions of runs with unusable results. ``versions``: of the software
+    used. Raises InputError for no rows.
     """
     if not len(rows):
         raise InputError(f"there are no runs to report on{f' ({len(damaged)} are damaged)' if damaged else ''}")
     results = Results(rows)
     labels = {label: name for name, label in reversed(results.variants.items())}
-    if baseline is not None and baseline not in labels:
-        raise InputError(f"the baseline is {quoted(baseline)}, expected one of {listed(sorted(labels))}")
-    reference = labels[baseline] if baseline else next(iter(results.variants))
+    reference = labels.get(baseline or "", next(iter(results.variants)))
     shown = _known(results, metrics)
     values = _compared(results, shown, reference) | _read(results, shown[0].key, runs)
-    values["versions"] = versions or values["versions"]
     asked = tomli_w.dumps(_toml(experiment)) if experiment else ""
     sections = {
         "results": "Results",
@@ -78,6 +72,7 @@ def write_report(
         results=results,
         asked=asked,
         damaged=damaged,
+        versions=versions or {},
         p_value=tables.p_value,
         uncertainty=tables.uncertainty,
         **values,
@@ -122,7 +117,6 @@ def _read(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> dic
         "underconfident": [v for v, (mean, low, _) in read.trust.items() if mean < low],
         "consistent": [v for v, (mean, low, high) in read.trust.items() if low <= mean <= high],
         "configs": read.configs,
-        "versions": read.versions,
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -50,7 +49,7 @@ class RunData:
     ``tracks``: by log, its scene and thinned trajectories, as plain values. ``errors``: by kind, then by variant and log,
     quantiles of the position error [m]. ``nees``: by variant and log, mean NEES of the causal poses per degree of freedom;
     ``trust``: by variant, the mean over logs and its 95 % band for correct covariances. ``configs``: the configuration of each
-    drawn run, by its description; ``versions``: of the software used by the first run.
+    drawn run, by its description.
     """
 
     tracks: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -58,7 +57,6 @@ class RunData:
     nees: dict[tuple[str, str], float] = field(default_factory=dict)
     trust: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     configs: dict[str, str] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=dict)
 
 
 def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> RunData:
@@ -86,7 +84,7 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
             if left > 0:
                 plain = {kind: tracks.thinned(s, poses) for kind, s in series.items()}
                 drawn.append({"v": place, "seed": row["seed"], **plain})
-                _add_config(data, f"{variant}, {log}, seed {row['seed']}", files.read(CONFIG).decode())
+                data.configs[f"{variant}, {log}, seed {row['seed']}"] = files.read(CONFIG).decode()
             trust = tracks.consistency(series["causal"]) if "causal" in series else None
             if trust is not None and score(row, "causal.position_rmse") is not None:
                 counts.setdefault(variant, []).append(trust)
@@ -115,13 +113,6 @@ def _series(files: RunFiles) -> dict[str, Estimates]:
     """The estimates of a run by kind, without kinds that it lacks."""
     estimates_by_kind = ResultFiles(files.read, files.scene.t0_ns if files.scene else None).estimates()
     return {kind: estimates for kind, estimates in estimates_by_kind.items() if len(estimates.trajectory)}
-
-
-def _add_config(data: RunData, run: str, text: str) -> None:
-    data.configs[run] = text
-    if not data.versions:
-        content = tomllib.loads(text)
-        data.versions = {str(name): str(version) for name, version in content.get("versions", {}).items()}
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def cases_of_section(section: str, report: Report) -> list[Case]:
         experiment = prepare(FILES / f"{name}.toml", out=report.options.out / name)
         done = run_experiment(experiment, jobs=report.options.jobs)
         report.failed += done.failures
-        cases += cases_of(done.rows.to_dicts(), names)
+        cases += cases_of(done.rows, names)
     return cases
 
 
