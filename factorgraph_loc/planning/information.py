@@ -20,22 +20,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.fusion.cloud import pose_moments, systematic
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.planning import particle_kernels
 from factorgraph_loc.planning.paths import Path, free_steps
 from factorgraph_loc.planning.sensors import SPEED, Sensors
 from factorgraph_loc.sensors.interfaces import Array32, Places
-from factorgraph_loc.text import quoted
 from factors import se2
 from factors.motion import ChainState, propagate
 from factors.odometry import model as odometry
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
-DIMS = ("x", "y", "heading")
-POSITION = ("x", "y")
+POSITION, POSE = 2, 3  # leading coordinates of a pose whose entropy counts: x and y, or all
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; an integer number of headings
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
 LOOK = 1.5  # m between stations; a station represents the rounds on that distance, or in turns of the same duration
@@ -46,27 +43,22 @@ SEVERAL = 0.5  # nats: largest difference of a unimodal belief's entropy from th
 WIDEST_HEADING = 0.8  # rad: largest standard deviation of a Gaussian heading
 
 
-def gaussian_entropy(covariance: Array, dims: Sequence[str] = DIMS) -> Array:
-    """Entropy (...) [nats] of Gaussians with ``covariance`` (..., 3, 3) of x, y, heading, in the dimensions ``dims``: ``log(det(2
-    pi e C)) / 2`` (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1).
+def gaussian_entropy(covariance: Array, dims: int = POSE) -> Array:
+    """Entropy (...) [nats] of Gaussians with ``covariance`` (..., 3, 3) of x, y, heading, in the first ``dims`` of these:
+    ``log(det(2 pi e C)) / 2`` (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1).
     """
-    chosen = _columns(dims)
-    part = np.asarray(covariance)[..., chosen, :][..., chosen]
-    return np.asarray(0.5 * (len(chosen) * math.log(2.0 * math.pi * math.e) + np.linalg.slogdet(part)[1]))
+    part = np.asarray(covariance)[..., :dims, :dims]
+    return np.asarray(0.5 * (dims * math.log(2.0 * math.pi * math.e) + np.linalg.slogdet(part)[1]))
 
 
-def particle_entropy(poses: Array, weights: Array, dims: Sequence[str] = DIMS, cell: Array = CELL) -> Array:
-    """Histogram entropy (...) [nats] of particles ``poses`` (M, 3) with ``weights`` (..., M), in the dimensions ``dims``.
+def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
+    """Histogram entropy [nats] of particles ``poses`` (M, 3) with ``weights`` (M,), in the first ``dims`` coordinates.
 
-    ``cell`` (3,) [m, m, rad]: size of the cells. Comparable with :func:`gaussian_entropy` for beliefs wider than a cell and more
-    particles than cells.
+    Comparable with :func:`gaussian_entropy` for beliefs wider than a cell and more particles than cells.
     """
-    chosen = _leading(dims)
-    flat = np.atleast_2d(weights).reshape(-1, len(poses)).astype(np.float32)
-    out = np.empty(len(flat))
+    even: Array32 = weights[None].astype(np.float32)
     at = np.ascontiguousarray(poses, dtype=float)[None]
-    particle_kernels.cell_entropies(at, np.zeros(len(flat), dtype=np.int64), flat, cell, chosen, out)
-    return out.reshape(np.shape(weights)[:-1])
+    return float(_entropies(at, np.zeros(1, dtype=np.int64), even, dims, several=True)[0])
 
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
@@ -88,7 +80,7 @@ def expected_gain(
     paths: Sequence[Path],
     rng: np.random.Generator,
     *,
-    dims: Sequence[str] = POSITION,
+    dims: int = POSITION,
     space: FreeSpace | None = None,
     places: NDArray[np.int64] | None = None,
     noise: OdometryModel | None = None,
@@ -98,13 +90,12 @@ def expected_gain(
     """Expected reduction of entropy (C,) [nats] on each of C paths.
 
     The belief has particles (M, 3) in the world frame with weights (M,). The entropy afterwards is that of the pose at the end.
-    ``dims``: position, or position and heading. ``space``: a particle whose path leads into a wall stops and measures no more.
+    ``dims``: :data:`POSITION` or :data:`POSE`. ``space``: a particle whose path leads into a wall stops and measures no more.
     ``places`` (M,): the mode of each particle; the entropy is then that of the mode index. ``noise``: of the odometry on the path,
     none by default. ``samples``: number of particles that are weighted; ``scans`` of these draw measurements of all ``sensors``.
     """
     if not paths:
         return np.empty(0)
-    chosen = _leading(dims)
     several = places is not None or has_several_modes(particles, weights)
     rows = rng.permutation(
         systematic(weights, rng, samples if len(particles) < FEWEST else min(samples, len(particles)))
@@ -116,12 +107,13 @@ def expected_gain(
     scans = min(scans, count)
     seed = np.uint64(rng.integers(2**63))
     passed = [path.passed(1.0, sensors.metres_per_radian) for path in paths]
-    stations = [_stations(metres, LOOK) for metres in passed]
+    stations = [_stations(metres) for metres in passed]
     normals = rng.standard_normal((max(len(s) for s in stations), count, 3))
     last = np.full((len(paths), count), np.iinfo(np.int64).max) if space is None else free_steps(space, poses, paths)
     posterior = np.empty((len(paths), scans))
     even: Array32 = np.full((1, count), 1.0 / count, dtype=np.float32)
-    prior = _entropies(poses[None] if cells is None else cells, np.zeros(1, dtype=np.int64), even, chosen, several)[0]
+    start = poses[None] if cells is None else cells
+    prior = _entropies(start, np.zeros(1, dtype=np.int64), even, dims, several=several)[0]
     for c, (path, steps) in enumerate(zip(paths, stations, strict=True)):
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
@@ -136,29 +128,12 @@ def expected_gain(
         if cells is not None or (several and noise is None):
             # the entropy at the end of the path, up to the alignment with the histogram's cells
             index = np.zeros_like(index)
-        posterior[c] = _entropies(at if cells is None else cells, index, np.exp(log_weights), chosen, several)
+        weighed = at if cells is None else cells
+        posterior[c] = _entropies(weighed, index, np.exp(log_weights), dims, several=several)
     return np.asarray(prior - posterior.mean(axis=1))
 
 
-def _columns(dims: Sequence[str]) -> list[int]:
-    """Columns of a pose. Raises InputError for a wrong dimension."""
-    if not dims:
-        raise InputError(f"dims: are none, expected some of {', '.join(DIMS)}")
-    for name in dims:
-        if name not in DIMS:
-            raise InputError(f"dims: is {quoted(name)}, expected some of {', '.join(DIMS)}")
-    return sorted({DIMS.index(name) for name in dims})
-
-
-def _leading(dims: Sequence[str]) -> int:
-    """Number of leading coordinates in ``dims``. Raises InputError if there is a gap."""
-    columns = _columns(dims)
-    if columns != list(range(len(columns))):
-        raise InputError(f"dims: are {', '.join(dims)}, expected x, y or x, y, heading")
-    return len(columns)
-
-
-def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several: bool) -> Array:
+def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, several: bool) -> Array:
     """Entropies (J,) of particles at stations ``index`` (J,) of ``poses`` (S, M, 3), with weights (J, M)."""
     if several:
         out = np.empty(len(index))
@@ -166,14 +141,14 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, several
         return out
     covariances = np.empty((len(index), 3, 3))
     particle_kernels.covariances(poses, index, weights, covariances)
-    return gaussian_entropy(covariances + np.diag(FINEST**2), DIMS[:dims])
+    return gaussian_entropy(covariances + np.diag(FINEST**2), dims)
 
 
-def _stations(passed: Array, each: float) -> Places:
+def _stations(passed: Array) -> Places:
     """Indices of the stations among the poses of a path, given the metres ``passed`` (S,): the start, the observations, each in
-    the middle of about ``each`` metres, and the end.
+    the middle of about :data:`LOOK` metres, and the end.
     """
-    count = min(max(1, round(passed[-1] / each)), LOOKS)
+    count = min(max(1, round(passed[-1] / LOOK)), LOOKS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
     observations = np.searchsorted(passed, middles - 1e-9)
     return np.concatenate(([0], observations, [len(passed) - 1])).astype(np.int64)
@@ -211,9 +186,9 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
 
 
 def fisher_gain(
-    mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors, *, dims: Sequence[str] = POSITION
+    mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors, *, dims: int = POSITION
 ) -> Array:
-    """Expected reduction of entropy (C,) [nats] on each of C paths, in the dimensions ``dims``; see :func:`expected_covariance`.
+    """Expected reduction of entropy (C,) [nats] on each of C paths, in ``dims`` coordinates; see :func:`expected_covariance`.
     Accuracy better than :data:`~factorgraph_loc.planning.information.FINEST` counts nothing.
     """
     fine = np.diag(FINEST**2)

@@ -109,14 +109,14 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """Gains (C,) with respect to the whole belief."""
     settings = s.settings.policy
     if settings.expectation == "fisher" and not has_several_modes(s.particles, s.weights):
-        return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=settings.dimensions)
+        return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=len(settings.dimensions))
     gains = expected_gain(
         s.sensors,
         s.particles,
         s.weights,
         paths,
         s.rng,
-        dims=settings.dimensions,
+        dims=len(settings.dimensions),
         samples=settings.samples,
         space=s.space,
     )
@@ -124,7 +124,7 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
         return gains
     # otherwise the robot would go back and forth to compensate the noise of the odometry
     alone, (mode,) = replace(s.sensors, forecasts=()), s.modes
-    return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=settings.dimensions)
+    return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=len(settings.dimensions))
 
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
@@ -133,7 +133,7 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
-        return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=s.settings.policy.dimensions)
+        return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=len(s.settings.policy.dimensions))
     # which of equal modes is the heavier is random
     weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
     return expected_gain(

@@ -40,7 +40,7 @@ def test_it_agrees_with_the_closed_form_where_the_belief_is_narrow():
     drawn = expected_gain(still, particles, weights, paths, rng, samples=2000, scans=200)
     fine = np.diag(FINEST**2)
     after = np.array([expected_covariance(MEAN, covariance, path, exact) for path in paths])
-    closed = gaussian_entropy(covariance + fine, ("x", "y")) - gaussian_entropy(after + fine, ("x", "y"))
+    closed = gaussian_entropy(covariance + fine, 2) - gaussian_entropy(after + fine, 2)
     assert closed.min() > 0.1
     assert abs(drawn - closed).max() < 0.15
 
@@ -67,7 +67,7 @@ def test_what_is_far_or_behind_a_wall_tells_nothing():
 
     def gain(*forecasts):
         draws, sensors = np.random.default_rng(1), replace(NOTHING, forecasts=forecasts)
-        return expected_gain(sensors, particles, weights, ways, draws, dims=("x", "y", "heading"))[0]
+        return expected_gain(sensors, particles, weights, ways, draws, dims=3)[0]
 
     nothing = gain()
     wall = ((3.6, -10.0, 3.6, 10.0),)
