@@ -12,28 +12,18 @@ import time
 import traceback
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.experiments.keys import VanishedError
-from factorgraph_loc.experiments.store import FAILURE, Store, StoreError
+from factorgraph_loc.experiments.store import FAILURE, State, Store, StoreError
 from factorgraph_loc.text import error_text, json_text
 
 Files = dict[str, bytes]
 Kind = Literal["error", "timeout", "memory", "killed", "vanished", "refused"]
 RETRY_INTERVAL = 0.5  # s after which a run that another process has claimed is tried again
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The outcome of a run: its results are stored (``ok``), or its failure is."""
-
-    key: str
-    status: Literal["ok", "failed"]
-    reason: str | None = None
 
 
 class Planned(Protocol):
@@ -60,7 +50,7 @@ class Executor(AbstractContextManager[Any], Protocol):
     """Computes runs with :func:`compute`, in other processes. The end of the context ends all computations."""
 
     def submit(self, take: Take, left: int) -> None:
-        """Begin as many runs as there is room for; ``left``: the number of runs that have no outcome yet."""
+        """Begin as many runs as there is room for; ``left``: the number of runs that are not stored yet."""
 
     def finished(self) -> Iterable[tuple[str, Files]]:
         """The keys of runs that have ended, with their files; returns within about half a second."""
@@ -96,15 +86,18 @@ class _Queue:
         self._runs.setdefault(run.source, []).append(run)
 
 
-def execute(runs: Sequence[Planned], folder: Path, executor: Executor, *, again: bool = False) -> Iterator[Outcome]:
-    """Make ``runs``, store their results or failures in the store below ``folder`` unless they exist, and yield their outcomes.
+def execute(
+    runs: Sequence[Planned], folder: Path, executor: Executor, *, again: bool = False
+) -> Iterator[tuple[str, State]]:
+    """Make ``runs``, store their results or failures in the store below ``folder`` unless they exist, and yield the key and the
+    state of each.
 
     ``again``: repeat stored failures. A run that another process has claimed is waited for. When the generator is closed, the
     executor ends without delay, and unfinished runs are not stored. Raises StoreError if the store cannot be written.
     """
     store, queue = Store(folder), _Queue(runs)
     claims: dict[str, ExitStack] = {}
-    outcomes: list[Outcome] = []
+    stored: list[tuple[str, State]] = []  # by other processes
 
     def take(loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
         while (run := queue.next(loaded, avoided)) is not None:
@@ -116,19 +109,19 @@ def execute(runs: Sequence[Planned], folder: Path, executor: Executor, *, again:
                 if state not in ("ok", "failed") or (state == "failed" and again):
                     claims[run.key] = claim.pop_all()
                     return run
-            outcomes.append(stored_outcome(run.key, store))
+            stored.append((run.key, state))
         return None
 
     try:
         with executor:
             while left := len(queue) + len(claims):
                 executor.submit(take, left)
-                yield from outcomes
-                outcomes.clear()
+                yield from stored
+                stored.clear()
                 for key, files in executor.finished():
                     with claims.pop(key):
                         store.put(key, files)
-                    yield stored_outcome(key, store)
+                    yield key, store.state(key)
     finally:
         for claim in claims.values():
             claim.close()
@@ -161,13 +154,6 @@ def failure(kind: Kind, reason: str, details: str = "") -> Files:
     """The files of a failed run; ``details``: a traceback."""
     content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
     return {FAILURE: json_text(content).encode()}
-
-
-def stored_outcome(key: str, store: Store) -> Outcome:
-    """The outcome of a run whose results, or whose failure, are stored."""
-    if store.state(key) == "failed":
-        return Outcome(key, "failed", str(store.row(key)["reason"]))
-    return Outcome(key, "ok")
 
 
 def _forget_peak_memory() -> None:

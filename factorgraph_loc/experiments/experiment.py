@@ -183,12 +183,12 @@ def run_experiment(
     else:
         executor = Cluster(scheduler, limits)
     try:
-        for outcome in execute(todo, prepared.folder, executor, again=again) if todo else ():
-            states[outcome.key] = outcome.status
-            made, failed = made + 1, failed + (outcome.status == "failed")
+        for key, state in execute(todo, prepared.folder, executor, again=again) if todo else ():
+            states[key] = state
+            made, failed = made + 1, failed + (state == "failed")
             progress(made, len(todo), failed)
     finally:
-        for run in todo:  # an interrupt may come between a run's end and its outcome
+        for run in todo:  # an interrupt may come between a run's end and its state
             if states[run.key] not in ("ok", "failed"):
                 states[run.key] = prepared.store.state(run.key, thorough=True)
         finished = [run for run in prepared.runs if states[run.key] in ("ok", "failed")]

@@ -73,7 +73,7 @@ def test_a_worker_that_is_killed_loses_no_run_and_none_is_stored_twice(workers, 
             os.kill(workers.workers[0].pid, signal.SIGKILL)
     keys = {run.key for run in runs}
     assert len(runs) == len(keys) == 8
-    assert [outcome.status for outcome in outcomes] == ["ok"] * 8
+    assert [state for _, state in outcomes] == ["ok"] * 8
     assert stored == dict.fromkeys(keys, 1)
     store = Store(folder)
     assert all(store.state(key, thorough=True) == "ok" for key in keys)
@@ -85,18 +85,18 @@ def test_a_run_that_another_process_has_is_waited_for(workers, planned, stored):
     claim = Store(folder).claim(runs[0].key)
     assert claim.__enter__()
     outcomes = execute(runs, folder, Cluster(workers.scheduler_address, Limits()))
-    assert next(outcomes).key == runs[1].key
+    assert next(outcomes) == (runs[1].key, "ok")
     assert not stored[runs[0].key]
     claim.__exit__(None, None, None)
-    assert [outcome.key for outcome in outcomes] == [runs[0].key]
+    assert list(outcomes) == [(runs[0].key, "ok")]
 
 
 def test_a_run_that_takes_too_long_is_a_failure_and_its_worker_begins_anew(workers, planned):
     runs, folder = planned(1)
     before = {worker.pid for worker in workers.workers.values()}
-    outcomes = list(execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits(time=1e-3))))
-    assert [(o.status, o.reason) for o in outcomes] == [("failed", "it took more than 0.001 s")]
-    assert Store(folder).row(runs[0].key)["kind"] == "timeout"
+    list(execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits(time=1e-3))))
+    row = Store(folder).row(runs[0].key)
+    assert (row["status"], row["kind"], row["reason"]) == ("failed", "timeout", "it took more than 0.001 s")
     assert {worker.pid for worker in workers.workers.values()} != before
 
 
@@ -125,13 +125,13 @@ def test_a_run_that_ends_its_workers_is_a_failure_and_the_others_go_on(workers, 
     monkeypatch.setattr(workers.scheduler, "allowed_failures", 0)
     with monkeypatch.context() as patch:
         patch.setattr(cluster, "make", lambda *_: os._exit(1))
-        (outcome,) = execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()))
-    assert outcome.status == "failed"
+        ((_, state),) = execute(runs[:1], folder, Cluster(workers.scheduler_address, Limits()))
+    assert state == "failed"
     assert Store(folder).row(runs[0].key)["kind"] == "killed"
     with distributed.Client(workers) as client:
         client.wait_for_workers(1)  # the one that died is replaced
     others = list(execute(runs[1:], folder, Cluster(workers.scheduler_address, Limits())))
-    assert [other.status for other in others] == ["ok"]
+    assert [state for _, state in others] == ["ok"]
 
 
 def test_no_scheduler_and_no_package_are_told_in_a_line(planned, monkeypatch):

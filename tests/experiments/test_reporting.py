@@ -28,7 +28,7 @@ def prepared(tmp_path):
     def prepare_it(made=2):
         found = prepare(tmp_path / "tiny.toml", out=tmp_path / "out")
         for run in found.runs[:made]:
-            assert run_planned(run, tmp_path / "out").status == "ok"
+            assert run_planned(run, tmp_path / "out") == "ok"
         return prepare(tmp_path / "tiny.toml", out=tmp_path / "out")
 
     return prepare_it

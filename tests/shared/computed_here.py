@@ -26,9 +26,9 @@ class Here(Executor):
 
 
 def run_planned(run, folder, *, again=False):
-    """The outcome of one run, stored below ``folder``."""
-    (outcome,) = execute([run], folder, Here(), again=again)
-    return outcome
+    """The state of one run, stored below ``folder``."""
+    ((_, state),) = execute([run], folder, Here(), again=again)
+    return state
 
 
 def sent(what):
