@@ -13,7 +13,6 @@ from factorgraph_loc.plugins import PRESETS
 
 if TYPE_CHECKING:
     from factorgraph_loc.api.lookups import NamedSettings, SensorDescription
-    from factorgraph_loc.files.columns import Column
     from factorgraph_loc.files.settings import Setting
     from factorgraph_loc.fusion.registry import Description
 
@@ -62,9 +61,9 @@ def sensors(
         known = known_sensors()
         rows = [(s.name, s.about, ", ".join(s.channels), _sections(s)) for s in known]
         header = ("name", "what it is", "--sensors", "rig")
-        _print_list(json, [_summary(sensor) for sensor in known], header, rows, ("what it is", "--sensors"))
+        _print_list(json, known, header, rows, ("what it is", "--sensors"))
     elif json:
-        show.document(_document(describe_sensor(name)))
+        show.document(describe_sensor(name))
     else:
         _print_sensor(describe_sensor(name))
 
@@ -114,21 +113,6 @@ def _print_one(
     show.fields(about)
     show.line()
     _print_settings(choice.settings, hint, word)
-
-
-def _summary(sensor: SensorDescription) -> dict[str, Any]:
-    return {"name": sensor.name, "about": sensor.about, "channels": sensor.channels, "rig": list(sensor.rig)}
-
-
-def _document(sensor: SensorDescription) -> dict[str, Any]:
-    tables = [{"name": name, "columns": [_column(c) for c in columns]} for name, columns in sensor.tables.items()]
-    return {**_summary(sensor), "tables": tables, "settings": sensor.rig}
-
-
-def _column(column: Column) -> dict[str, Any]:
-    low, high = (column.low, column.high) if column.units else (None, None)
-    about = {"name": column.name, "kind": column.kind, "unit": column.unit, "low": low, "high": high}
-    return about | {"may_lack": column.may_lack, "meaning": column.doc}
 
 
 def _print_sensor(sensor: SensorDescription) -> None:

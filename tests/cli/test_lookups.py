@@ -45,11 +45,11 @@ def test_the_list_of_sensors_has_their_channels(fgloc):
 
 def test_a_sensor_has_columns_with_units_and_the_keys_of_the_rig(fgloc):
     found = json.loads(fgloc("sensors", "rfid", "--json").stdout)
-    tables = {table["name"]: {column["name"]: column for column in table["columns"]} for table in found["tables"]}
+    tables = {name: {column["name"]: column for column in columns} for name, columns in found["tables"].items()}
     assert list(tables) == ["rfid", "inventories", "reads", "tags"]
-    assert (tables["rfid"]["rssi"]["unit"], tables["rfid"]["rssi"]["may_lack"]) == ("dBm", True)
+    assert (tables["rfid"]["rssi"]["units"], tables["rfid"]["rssi"]["may_lack"]) == ({"dBm": 1.0}, True)
     assert tables["rfid"]["epc"]["high"] is None
-    keys = {setting["key"]: setting for setting in found["settings"]["rfid"]}
+    keys = {setting["key"]: setting for setting in found["rig"]["rfid"]}
     assert (keys["round_gap"]["default"], keys["round_gap"]["unit"]) == (0.05, "s")
     printed = fgloc("sensors", "rfid").stdout
     assert "-200 to 200 dBm, or empty" in printed
