@@ -8,7 +8,6 @@ __all__ = [
     "experiment_file",
     "maps",
     "output",
-    "plan",
     "preparation",
     "reporting",
     "result_table",

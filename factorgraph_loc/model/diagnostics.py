@@ -12,7 +12,7 @@ Addition = tuple[dict[str, Any], str, Any]
 
 @dataclass(frozen=True)
 class Event:
-    """What happened at ``t`` [s], by its ``kind`` and ``fields``. Printed, it is the ``sentence`` with the fields in its braces."""
+    """An event at ``t`` [s], of a ``kind``, with ``fields``. Printed, it is its ``sentence`` with the fields in the braces."""
 
     t: float
     kind: str

@@ -106,7 +106,7 @@ def expected_gain(
     count = len(poses)
     scans = min(scans, count)
     seed = np.uint64(rng.integers(2**63))
-    passed = [path.passed(1.0, sensors.metres_per_radian) for path in paths]
+    passed = [path.passed(sensors.metres_per_radian) for path in paths]
     stations = [_stations(metres) for metres in passed]
     normals = rng.standard_normal((max(len(s) for s in stations), count, 3))
     last = np.full((len(paths), count), np.iinfo(np.int64).max) if space is None else free_steps(space, poses, paths)
@@ -146,7 +146,7 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, seve
 
 def _stations(passed: Array) -> Places:
     """Indices of the stations among the poses of a path, given the metres ``passed`` (S,): the start, the observations, each in
-    the middle of about :data:`LOOK` metres, and the end.
+    the middle of its part of the path, and the end.
     """
     count = min(max(1, round(passed[-1] / LOOK)), LOOKS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
@@ -171,7 +171,7 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
     """
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
-    passed = path.passed(1.0, sensors.metres_per_radian)
+    passed = path.passed(sensors.metres_per_radian)
     by_pose = expected_information(poses[1:], np.diff(passed), sensors)
     columns = (path.metres.tolist(), path.poses.tolist(), path.turned.tolist())
     states = [

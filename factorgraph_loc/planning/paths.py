@@ -48,16 +48,11 @@ class Path:
         """Length [m]."""
         return float(self.metres[-1])
 
-    def passed(self, per_metre: float, per_radian: float) -> Array:
-        """Expected counts (S,) up to each pose of events with rates ``per_metre`` and ``per_radian``, the larger of both per
-        step.
-        """
-        steps = np.maximum(np.diff(self.metres) * per_metre, np.diff(self.turned) * per_radian)
+    def passed(self, metres_per_radian: float) -> Array:
+        """The metres (S,) that a robot could have driven in the time up to each pose; a turn by a radian takes the time of
+        ``metres_per_radian``."""
+        steps = np.maximum(np.diff(self.metres), np.diff(self.turned) * metres_per_radian)
         return np.concatenate((np.zeros(1), np.cumsum(steps)))
-
-    def duration(self, speed: float, turn_rate: float) -> float:
-        """Duration [s] at ``speed`` [m/s] with a turn rate of at most ``turn_rate`` [rad/s]."""
-        return float(self.passed(1.0 / speed, 1.0 / turn_rate)[-1])
 
     def until(self, length: float) -> Path:
         """The path up to the last pose within ``length`` [m]."""

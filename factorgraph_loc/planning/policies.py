@@ -17,10 +17,9 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
-from factorgraph_loc.fusion.cloud import pose_moments
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.belief import Mode
-from factorgraph_loc.planning.information import expected_gain, fisher_gain, has_several_modes
+from factorgraph_loc.planning.information import expected_gain, fisher_gain
 from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -108,8 +107,6 @@ def information(s: Situation, sign: float = 1.0) -> Choice:
 def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """Gains (C,) with respect to the whole belief."""
     settings = s.settings.policy
-    if settings.expectation == "fisher" and not has_several_modes(s.particles, s.weights):
-        return fisher_gain(*pose_moments(s.particles, s.weights), paths, s.sensors, dims=len(settings.dimensions))
     gains = expected_gain(
         s.sensors,
         s.particles,
@@ -150,9 +147,7 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
     """Costs (K,) [nats] of the candidates ``rows`` (K,)."""
-    paths = [s.candidates[i] for i in rows]
-    seconds = [p.duration(s.settings.speed, s.settings.turn_rate) for p in paths]
-    return per_metre * np.array([p.length for p in paths]) + s.settings.policy.per_second * np.array(seconds)
+    return per_metre * np.array([s.candidates[i].length for i in rows])
 
 
 def random(s: Situation) -> Choice:

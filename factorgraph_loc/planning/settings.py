@@ -23,10 +23,6 @@ class PolicySettings(FileModel):
     """least distance driven before choosing again: half of a longer arc, the whole path to a place"""
     per_metre: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/m")] = 0.3
     """cost of a near path by its length; far ones have none"""
-    expectation: Literal["sampled", "fisher"] = "sampled"
-    """sampled: over sampled scans; fisher: by the Fisher information in closed form, if the belief is unimodal"""
-    per_second: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/s")] = 0.0
-    """cost of a path by its duration"""
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
     """number of particles for the expectation"""
     dimensions: tuple[Dimension, ...] = ("x", "y", "heading")

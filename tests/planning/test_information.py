@@ -191,7 +191,7 @@ def test_a_turn_in_place_tells_something_but_not_without_rounds():
     poses, weights = drawn(1000)
     found, turn = beam((4.0, 2.0), (-1.0, 4.0)), [look_around()]
     assert turn[0].length == 0.0
-    assert turn[0].duration(0.5, 1.0) == pytest.approx(2.0 * np.pi)
+    assert turn[0].passed(0.5)[-1] == pytest.approx(np.pi)
     (gain,) = expected_gain(found, poses, weights, turn, np.random.default_rng(0))
     slow, fast = replace(found, metres_per_radian=2.0), replace(found, metres_per_radian=0.0)
     (more,) = expected_gain(slow, poses, weights, turn, np.random.default_rng(0))

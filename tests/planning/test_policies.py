@@ -12,7 +12,7 @@ from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.planning.paths import primitives, waypoint_paths
 from factorgraph_loc.planning.policies import Situation, policy, usable
 from factorgraph_loc.planning.sensors import Sensors
-from factorgraph_loc.planning.settings import ActiveSettings, PolicySettings
+from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.rfid.forecast import RfidForecast
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
@@ -129,17 +129,6 @@ def test_a_far_tag_that_both_places_would_read_alike_tells_nothing():
     middles = ((8.0, 20.0, 0.0), (32.0, 20.1, math.pi))
     s, _ = two_modes((20.0, 20.0, 1.2), middles, (0.2, 0.2, 0.05), ((19.0, 20.0),))
     assert policy("information")(s).path.kind == "patrol"
-
-
-def test_the_expectation_in_closed_form_goes_where_tags_are():
-    s = situation()
-    settings = ActiveSettings(policy=PolicySettings(expectation="fisher"))
-    world = World(tags={f"T{i}": {"x": x, "y": y, "z": z} for i, (x, y, z) in enumerate(TAGS.tolist())})
-    sensors = Sensors.of(world, RIG)
-    choice = policy("information")(replace(s, settings=settings, sensors=sensors))
-    assert abs(direction(choice) - math.pi / 2.0) < 0.8
-    drawn = policy("information")(replace(s, sensors=sensors))
-    assert not np.allclose(drawn.values, choice.values, atol=1e-6)
 
 
 def test_they_go_where_landmarks_are():
