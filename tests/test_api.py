@@ -88,12 +88,8 @@ def test_an_experiment_gives_its_table(tmp_path):
         tmp_path / "drives.toml", changes={"simulation.drive.duration": 6.0}, out=tmp_path / "out", verify=True
     )
     assert found.labels == {"dead_reckoning": {"ok": 2, "failed": 0, "missing": 0, "damaged": 0}}
-    page = fgloc.report(
-        tmp_path / "drives.toml",
-        changes={"simulation.drive.duration": 6.0},
-        out=tmp_path / "out",
-        page=tmp_path / "p.html",
-    )
+    changed = {"simulation.drive.duration": 6.0}
+    page = fgloc.report(tmp_path / "drives.toml", changes=changed, out=tmp_path / "out")
     assert "dead_reckoning" in page.page.read_text()
 
 

@@ -146,19 +146,11 @@ def status(
 
 @app.command()
 @takes_options
-def report(
-    file: File,
-    *,
-    options: ExperimentOptions,
-    page: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The page to write; by default report.html in OUT.")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Write the stored results of an experiment as one HTML page; damaged ones are left out."""
+def report(file: File, *, options: ExperimentOptions, json: Json = False) -> None:
+    """Write the stored results of an experiment as one HTML page, report.html in OUT; damaged ones are left out."""
     from factorgraph_loc.experiments.reporting import report as write_page
 
-    written = write_page(file, **options.given(), page=page)
+    written = write_page(file, **options.given())
     if json:
         show.document({"page": str(written.page), "damaged": written.damaged})
         return

@@ -34,19 +34,15 @@ def report(
     changes: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
     data_root: str | Path | None = None,
-    page: str | Path | None = None,
 ) -> Report:
-    """Write the results of an experiment as an HTML page: ``page``, by default ``report.html`` in its folder.
-
-    Damaged results are listed on the page and left out. For the other arguments see
-    :func:`~factorgraph_loc.experiments.experiment.prepare`.
+    """Write the results of an experiment as an HTML page into its folder; for the arguments see
+    :func:`~factorgraph_loc.experiments.experiment.prepare`. Damaged results are listed on the page and left out.
     """
-    prepared = prepare(file, changes, out=out, data_root=data_root)
-    return report_experiment(prepared, None if page is None else Path(page))
+    return report_experiment(prepare(file, changes, out=out, data_root=data_root))
 
 
-def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:
-    """Write the report of all existing results of an experiment, by default into its folder.
+def report_experiment(prepared: Prepared) -> Report:
+    """Write the report of all existing results of an experiment into its folder.
 
     All results are compared with their checksums; damaged ones are named and excluded. Scenes of the logs are kept in the store.
     Raises InputError without any results, or if the page cannot be written.
@@ -63,7 +59,7 @@ def report_experiment(prepared: Prepared, out: Path | None = None) -> Report:
             scenes[run.log_digest] = _scene(run, prepared.store.folder / "scenes" / f"{run.log_digest}.json")
         return RunFiles(partial(prepared.store.read, key), scenes[run.log_digest])
 
-    path = out or prepared.folder / PAGE
+    path = prepared.folder / PAGE
     settings = prepared.experiment.report
     with writing(path):
         write_report(
