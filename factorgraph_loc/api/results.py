@@ -12,7 +12,7 @@ from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
-from factorgraph_loc.exports.trajectories import TIMES_SUFFIX, write_g2o, write_trajectory
+from factorgraph_loc.exports.trajectories import write_g2o, write_trajectory
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.files.temporary import require_free
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
@@ -133,8 +133,8 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
         sensors = run.folder.sensors or log.rig.sensors
         write_g2o(log, run.final, sensors, out, run.landmarks)
     else:
-        write_trajectory(_trajectory(log, runs, out), out, log.t0_ns)
-    return [out, out.with_name(out.stem + TIMES_SUFFIX)] if out.suffix == ".kitti" else [out]
+        return write_trajectory(_trajectory(log, runs, out), out, log.t0_ns)
+    return [out]
 
 
 def _only(runs: list[StoredRun], out: Path) -> StoredRun:

@@ -15,8 +15,6 @@ with scale 1. In the plane the rotation is one angle, and reflections cannot occ
 """
 
 import bisect
-import itertools
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -164,15 +162,3 @@ def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, in
         if abs(covered[best] - start - length) <= PIECE_TOLERANCE * length:
             pieces.append((first + i, first + best))
     return pieces
-
-
-def between(count: int, breaks: Iterable[int]) -> list[tuple[int, int]]:
-    """The half-open ranges of ``count`` indices that are split before each of ``breaks``."""
-    bounds = [0, *sorted({b for b in breaks if 0 < b < count}), count]
-    return list(itertools.pairwise(bounds))
-
-
-def indices(pieces: list[tuple[int, int]]) -> tuple[Integers, Integers]:
-    """First and last poses (K,) of ``pieces``."""
-    begins, ends = np.array(pieces, dtype=np.int64).reshape(-1, 2).T
-    return begins, ends

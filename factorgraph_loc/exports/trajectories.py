@@ -29,34 +29,28 @@ from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
-KITTI = ".kitti"
-TIMES_SUFFIX = ".times.txt"
 LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, to keep its information finite
 
 
-def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> None:
-    """Write a trajectory in TUM format, or in KITTI format with a file of times if the name ends with .kitti. ``t0_ns``: time zero
-    of a planar one."""
-    if Path(path).suffix == KITTI:
-        write_kitti(trajectory, Path(path))
-    else:
-        write_tum(trajectory, path, t0_ns)
+def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
+    """Write a trajectory in TUM format, or in KITTI format if the name ends with .kitti; return the files. ``t0_ns``: time zero of a
+    planar one.
 
-
-def write_kitti(trajectory: Trajectory | PosePath, path: Path) -> Path:
-    """Write poses in KITTI format, and their times [s], of a planar trajectory from the log's start, to ``NAME.times.txt``; return
-    the latter's path.
-
-    Poses are of the robot's frame (x forward, z up), not of a camera, and not relative to the first one.
+    In KITTI format times [s], of a planar trajectory from the log's start, go to ``NAME.times.txt``. Poses are of the robot's frame
+    (x forward, z up), not of a camera, and not relative to the first one.
     """
+    path = Path(path)
+    if path.suffix != ".kitti":
+        write_tum(trajectory, path, t0_ns)
+        return [path]
     poses = trajectory.path("trajectory") if isinstance(trajectory, Trajectory) else trajectory
     rows = np.concatenate((poses.rotations, poses.positions[:, :, None]), axis=2).reshape(-1, 12)
     t = trajectory.t if isinstance(trajectory, Trajectory) else trajectory.seconds()
-    times = path.with_name(path.stem + TIMES_SUFFIX)
+    times = path.with_name(path.stem + ".times.txt")
     with writing(path):
         write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows.tolist()))
         write_text(times, "".join(f"{seconds:.9f}\n" for seconds in t.tolist()))
-    return times
+    return [path, times]
 
 
 def write_g2o(

@@ -8,6 +8,7 @@ package evo.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -189,8 +190,9 @@ def _relative(
 ) -> PoseErrors:
     """The translation and rotation of ``Q^-1 P`` for the motions Q of the reference and P of the estimate over each piece."""
     cut = pairing.all_pairs if all_pairs else pairing.successive
-    ranges = pairing.between(len(estimate), gaps.tolist())
-    begins, ends = pairing.indices([piece for a, b in ranges for piece in cut(steps[a : b - 1], length, a)])
+    inner = np.unique(gaps[(gaps > 0) & (gaps < len(estimate))]).tolist()
+    pieces = [piece for a, b in pairwise([0, *inner, len(estimate)]) for piece in cut(steps[a : b - 1], length, a)]
+    begins, ends = np.array(pieces, dtype=np.int64).reshape(-1, 2).T
     (turn, shift), (true_turn, true_shift) = (_motions(path, begins, ends) for path in (estimate, truth))
     back = true_turn.transpose(0, 2, 1)
     error = np.linalg.norm(np.einsum("kij,kj->ki", back, shift - true_shift), axis=1)
