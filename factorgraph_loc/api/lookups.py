@@ -108,11 +108,7 @@ def sources_of_rigs() -> dict[str, tuple[str, Callable[[], Rig]]]:
     """The rigs by name: whose each is, and how it is made."""
     default: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
     recorded = {name: ("a known log", partial(read_rig, file)) for name, file in shipped().items()}
-    return default | recorded | {name: ("fgloc simulate", partial(_of_preset, name)) for name in PRESETS}
-
-
-def _of_preset(name: str) -> Rig:
-    return preset(name).rig
+    return default | recorded | {name: ("fgloc simulate", lambda name=name: preset(name).rig) for name in PRESETS}
 
 
 def new_rig(

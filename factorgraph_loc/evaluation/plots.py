@@ -31,8 +31,8 @@ _FILES = (
 )
 
 
-def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> list[Path]:
-    """Write the plots of a log, for estimators by name, into ``folder`` and return their paths.
+def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path) -> list[Path]:
+    """Write the plots of a log NAME, for estimators by name, into ``folder`` and return their paths.
 
     ``NAME-trajectories.png``, and for several estimators with a reference ``NAME-error-distribution.png``. For each with a
     trajectory: ``NAME-consistency-ESTIMATOR.png``, with a reference or innovations; with a reference
@@ -43,13 +43,17 @@ def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path, name: str) -> 
         figures["error-distribution"] = error_distribution(log, log.reference, tracks)
     for estimator, track in tracks.items():
         figures |= _of_one(log, estimator, track)
-    return _write(figures, folder, name)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {folder / f"{file_name(log.name)}-{what}.png": figure for what, figure in figures.items()}
+    for path, figure in paths.items():
+        write_picture(figure, path)
+    return list(paths)
 
 
 def write_plots(result: RunResult, log: Log, out: Path) -> None:
     """Write the plots of a run into ``out/plots``, replacing those of a previous one."""
     remove_plots(out / "plots")
-    plot_log(log, {str(result.config["estimator"]): Track.of(result)}, out / "plots", file_name(log.name))
+    plot_log(log, {str(result.config["estimator"]): Track.of(result)}, out / "plots")
 
 
 def remove_plots(folder: Path) -> None:
@@ -71,16 +75,6 @@ def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
     if track.reliability:
         figures[f"reliability-{estimator}"] = reliability_diagram(log, estimator, track.reliability)
     return figures
-
-
-def _write(figures: Mapping[str, Figure], folder: Path, name: str) -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for what, figure in figures.items():
-        path = folder / f"{name}-{what}.png"
-        write_picture(figure, path)
-        paths.append(path)
-    return paths
 
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:

@@ -25,7 +25,7 @@ from factorgraph_loc.experiments.plan import plan
 from factorgraph_loc.experiments.preparation import fill_cache, use_of
 from factorgraph_loc.experiments.reporting import PAGE, report_experiment
 from factorgraph_loc.experiments.store import Store
-from factorgraph_loc.files.models import file_name, parse_model
+from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all
@@ -199,7 +199,7 @@ def _plot(logs: Sequence[Log], prepared: Prepared, folder: Path) -> None:
             if run.log == log.name and run.label not in tracks and store.state(run.key) == "ok":
                 tracks[run.label] = Track.read(ResultFiles(partial(store.read, run.key), log.t0_ns), run.max_gap)
         if tracks:
-            plot_log(log, tracks, folder, file_name(log.name))
+            plot_log(log, tracks, folder)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], *, rpe: bool) -> str:

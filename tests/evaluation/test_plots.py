@@ -33,7 +33,7 @@ def log_of(track, *, reference=True):
 
 def test_files(track, tmp_path):
     offline = Track(None, track.final)
-    paths = plot_log(log_of(track), {"ekf": track, "batch": offline}, tmp_path / "plots", "log")
+    paths = plot_log(log_of(track), {"ekf": track, "batch": offline}, tmp_path / "plots")
     names = {"trajectories", "error-distribution"}
     names |= {f"{what}-{who}" for what in ("errors", "consistency") for who in ("ekf", "batch")}
     assert {path.name for path in paths} == {f"log-{name}.png" for name in names}
@@ -61,19 +61,19 @@ def test_walls_and_tags_are_drawn_where_the_estimators_take_them_to_be(track):
 
 def test_without_reference(track, tmp_path):
     log = log_of(track, reference=False)
-    paths = plot_log(log, {"ekf": track}, tmp_path, "log")
+    paths = plot_log(log, {"ekf": track}, tmp_path)
     assert {path.name for path in paths} == {"log-trajectories.png"}
     told = replace(track, nis={"bearing_range": np.array([(1.0, 2.0, 2.0)])})
-    paths = plot_log(log, {"ekf": told}, tmp_path, "log")
+    paths = plot_log(log, {"ekf": told}, tmp_path)
     assert {path.name for path in paths} == {"log-trajectories.png", "log-consistency-ekf.png"}
 
 
 def test_a_run_that_nothing_told_the_pose(track, tmp_path):
     """Its log is plotted, with an empty line; one that found its place stands beside it."""
     nowhere = Track(None, Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3))))
-    paths = plot_log(log_of(track), {"ekf": nowhere}, tmp_path, "log")
+    paths = plot_log(log_of(track), {"ekf": nowhere}, tmp_path)
     assert [path.name for path in paths] == ["log-trajectories.png"]
-    paths = plot_log(log_of(track), {"ekf": nowhere, "batch": track}, tmp_path, "log")
+    paths = plot_log(log_of(track), {"ekf": nowhere, "batch": track}, tmp_path)
     assert {path.name for path in paths if "ekf" in path.name or "errors" in path.name} == {"log-errors-batch.png"}
 
 
