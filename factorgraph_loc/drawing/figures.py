@@ -9,6 +9,7 @@ import io
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,10 +68,8 @@ def dress(axes: Iterable[Axes]) -> None:
 
 def styles() -> Iterator[dict[str, Any]]:
     """Yield the colour and line style of the first, second, ... estimator."""
-    i = 0
-    while True:
-        yield {"color": COLOURS[i % len(COLOURS)], "linestyle": _STYLES[i % len(_STYLES)]}
-        i += 1
+    for colour, line in zip(cycle(COLOURS), cycle(_STYLES), strict=False):
+        yield {"color": colour, "linestyle": line}
 
 
 def ellipses(centres: Array, covariances: Array, scale: float) -> Array:

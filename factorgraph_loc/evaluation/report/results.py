@@ -204,12 +204,14 @@ class Results:
         figures = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
         best = _best(metric, scores, figures)
         against = reference or best or next(iter(self.variants))
-        contrasts = {
-            name: c
+        compared = {
+            name: contrast(
+                scores[name], scores[against], rms=metric.rms, interval=reference is not None, alike=self.logs
+            )
             for name in scores
             if name != against
-            and (c := self._contrast(metric, scores[name], scores[against], interval=reference is not None)) is not None
         }
+        contrasts = {name: c for name, c in compared.items() if c is not None}
         corrected = holm([c.p for c in contrasts.values()])
         return MetricComparison(metric, figures, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
@@ -226,9 +228,6 @@ class Results:
                 for kind in kinds
             )
         ]
-
-    def _contrast(self, metric: Metric, a: ByLog, b: ByLog, *, interval: bool) -> Contrast | None:
-        return contrast(a, b, rms=metric.rms, interval=interval, alike=self.logs)
 
     def _pool(self, metric: Metric, variant: str, scores: ByLog) -> Pooled | None:
         key = (metric.key, variant)
