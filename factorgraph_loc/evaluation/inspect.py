@@ -27,9 +27,7 @@ class StreamSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The content of a log: streams and reference, results of each sensor (``sensors``, by name), and problems as lines of text.
-
-    The sensors' results are also attributes, by key (``unseen``, ``rfid``, ...)."""
+    """The content of a log: streams and reference, results of each sensor (``sensors``, by name), and problems as lines of text."""
 
     streams: Mapping[str, StreamSummary]
     reference: StreamSummary | None
@@ -38,19 +36,13 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The results of all sensors, by key."""
+        """The results of all sensors, by key (``unseen``, ``rfid``, ...)."""
         return {key: value for summary in self.sensors.values() for key, value in summary.found.items()}
 
     @property
     def in_map(self) -> dict[str, int]:
         """The number of objects in each layer of the map."""
         return {layer: count for summary in self.sensors.values() for layer, count in summary.in_map.items()}
-
-    def __getattr__(self, name: str) -> Any:
-        results = self.found if "sensors" in self.__dict__ else {}  # missing while being unpickled
-        if name in results:
-            return results[name]
-        raise AttributeError(f"an inspection has no {name!r}")
 
 
 def inspect(log: Log) -> Inspection:

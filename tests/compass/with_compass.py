@@ -166,7 +166,7 @@ def test_a_simulated_drive_has_it():
     assert logs[0].rig.sensors[-1] == "compass"
     assert len(logs[0].streams["compass"].t) == 30
     np.testing.assert_array_equal(*(log.streams["compass"].heading for log in logs[:2]))
-    biases = [fgloc.info(log).compass["bias"] for log in logs]
+    biases = [fgloc.info(log).found["compass"]["bias"] for log in logs]
     assert biases[1] != biases[2]
     assert all(abs(bias - 0.1) < 0.8 for bias in biases)
 

@@ -99,8 +99,8 @@ def test_gaps_unseen_and_unknown_landmarks_and_missing_streams_are_named() -> No
     found = inspect(
         dataclasses.replace(log, streams={"bearing_range": late}, world=world_of(places), warnings=("mended",))
     )
-    assert found.unseen == ("z",)
-    assert found.unknown == {"a": 240}
+    assert found.found["unseen"] == ("z",)
+    assert found.found["unknown"] == {"a": 240}
     assert found.streams["bearing_range"].gaps == ((60.0, pytest.approx(30.5)),)
     assert found.streams["bearing_range"].rate == pytest.approx(2.0)
     text = "\n".join(found.problems)

@@ -36,11 +36,12 @@ def log(tmp_path):
 def test_counts(log):
     found = inspect(log)
     assert found.problems == ()
-    assert (found.images.images, found.images.looked_at, found.images.readable) == (50, 40, 40)
-    assert found.images.sizes == {"160x120": 40}
-    assert found.images.feature == "orb"
-    assert 10 <= found.images.features <= 30
-    assert (found.pixels.rows, found.pixels.frames, found.pixels.known, found.pixels.unknown) == (4, 2, 2, {})
+    images, pixels = found.found["images"], found.found["pixels"]
+    assert (images.images, images.looked_at, images.readable) == (50, 40, 40)
+    assert images.sizes == {"160x120": 40}
+    assert images.feature == "orb"
+    assert 10 <= images.features <= 30
+    assert (pixels.rows, pixels.frames, pixels.known, pixels.unknown) == (4, 2, 2, {})
     assert found.streams["camera"].rate == pytest.approx(5.0)
 
 

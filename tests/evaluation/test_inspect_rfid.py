@@ -51,7 +51,7 @@ def only(keep: np.ndarray) -> dict[str, object]:
 
 def test_counts() -> None:
     found = inspect(make_log())
-    rfid = found.rfid
+    rfid = found.found["rfid"]
     assert rfid is not None
     assert (rfid.reads, rfid.rounds, rfid.scans, rfid.known, found.problems) == (300, 240, 120, 2, ())
     right = rfid.antennas["right"]
@@ -62,18 +62,18 @@ def test_counts() -> None:
 
 def test_a_log_without_reads() -> None:
     log = make_log()
-    assert inspect(dataclasses.replace(log, streams={"odometry": log.streams["odometry"]})).rfid is None
+    assert inspect(dataclasses.replace(log, streams={"odometry": log.streams["odometry"]})).found["rfid"] is None
     none = inspect(make_log(**only(np.zeros(360, dtype=bool)[: len(stream_of(log).t)])))
-    assert none.rfid is not None
-    assert none.rfid.reads == none.rfid.rounds == 0
+    assert none.found["rfid"] is not None
+    assert none.found["rfid"].reads == none.found["rfid"].rounds == 0
     assert "antenna left of the rig is never active" in none.problems
 
 
 def test_tags_that_do_not_match_the_map() -> None:
     world = World(tags={name: Tag(x=0.0, y=0.0) for name in ("A", "C", "D")})
     found = inspect(dataclasses.replace(make_log(), world=world))
-    assert found.rfid is not None
-    assert (found.rfid.unread, found.rfid.unknown) == (("C", "D"), {"B": 120})
+    assert found.found["rfid"] is not None
+    assert (found.found["rfid"].unread, found.found["rfid"].unknown) == (("C", "D"), {"B": 120})
     assert found.problems == (
         "2 of 3 tags of the map are never read: C, D",
         "120 reads are of 1 tags that the map lacks: B",
