@@ -33,8 +33,8 @@ LEAST = 1e-12  # m^2 or rad^2: least variance of an edge, to keep its informatio
 
 
 def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
-    """Write a trajectory in TUM format, or in KITTI format if the name ends with .kitti; return the files. ``t0_ns``: time zero of a
-    planar one.
+    """Write a trajectory in TUM format, or in KITTI format if the name ends with .kitti; return the files. ``t0_ns``: time zero of
+    a planar one.
 
     In KITTI format times [s], of a planar trajectory from the log's start, go to ``NAME.times.txt``. Poses are of the robot's frame
     (x forward, z up), not of a camera, and not relative to the first one.

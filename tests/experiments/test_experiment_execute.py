@@ -163,14 +163,14 @@ def test_failures_are_rows_and_are_tried_again_if_told(experiment, fake, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(fake, "process", fail)
         done = run_experiment(experiment())
-    assert done.rows["status"].to_list() == ["failed", "ok"]
-    assert done.rows["reason"].to_list() == ["cannot go on", None]
+    assert done.table["status"].to_list() == ["failed", "ok"]
+    assert done.table["reason"].to_list() == ["cannot go on", None]
     assert done.failures == [f"{NASTY}, fake, seed 0: cannot go on"]
     assert experiment().todo() == []
     (again,) = experiment().todo(again=True)
     assert again.label == "fake"
     done = run_experiment(experiment(), again=True)
-    assert done.rows["status"].to_list() == ["ok", "ok"]
+    assert done.table["status"].to_list() == ["ok", "ok"]
 
 
 def test_a_damaged_result_is_found_and_done_again(experiment, out):

@@ -95,7 +95,7 @@ def test_the_gain_is_the_fall_of_entropy():
     after = expected_covariance(MEAN, COVARIANCE, STRAIGHT, sensors)
     # of what is not finer than counts
     fine = np.diag(FINEST**2)
-    before, left = (gaussian_entropy(covariance + fine, ("x", "y")) for covariance in (COVARIANCE, after))
+    before, left = (gaussian_entropy(covariance + fine, 2) for covariance in (COVARIANCE, after))
     assert gain == pytest.approx(before - left)
     assert fisher_gain(MEAN, COVARIANCE, [], sensors).shape == (0,)
 
