@@ -10,7 +10,6 @@ from factorgraph_loc.evaluation.figures import write_picture
 from factorgraph_loc.evaluation.inspect import Inspection, inspect
 from factorgraph_loc.evaluation.plots import overview
 from factorgraph_loc.experiments.run import run
-from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import temporary_folder, writing
 from factorgraph_loc.io.bags.file import is_bag
 from factorgraph_loc.io.bags.manifest import manifest_of_bag
@@ -69,23 +68,12 @@ def convert(
     write_native(read_log(log, rig=rig, world=world), out, format, overwrite=overwrite)
 
 
-def manifest(log: str | Path, out: str | Path | None = None, *, overwrite: bool = False) -> Proposal:
-    """Propose a manifest for a folder of tables or a ROS bag: which file or topic is which sensor. ``out``: a file to write it to,
-    beside the log or in a folder above, which can be read as a log once it is checked.
-
-    InputError if the log cannot be read, or the file is elsewhere or exists.
-    """
-    path, file = Path(log), None if out is None else Path(out)
+def manifest(log: str | Path) -> Proposal:
+    """Propose a manifest for a folder of tables or a ROS bag: which file or topic is which sensor. Its ``text``, written to a file
+    in its ``folder`` and checked, can be read as a log. InputError if the log cannot be read."""
+    path = Path(log)
     propose = manifest_of_folder if path.is_dir() and not is_bag(path) else manifest_of_bag
-    if file is None:
-        return propose(path, Path.cwd())
-    if file.exists() and not overwrite:
-        raise InputError(f"{file}: exists already, expected a new file")
-    proposal = propose(path, file.parent)
-    if proposal.folder != file.parent.resolve():
-        raise InputError(f"{file}: the log is in {proposal.folder}, expected a file there or in a folder above")
-    write_text(file, proposal.text)
-    return proposal
+    return propose(path, Path.cwd())
 
 
 def simulate(
