@@ -1,7 +1,7 @@
 """Arguments and results of the functions of sensors: the use of a sensor in a run, its summary for ``fgloc info``, its drawings,
 simulated drives, and the expected information along a planned path."""
 
-from collections.abc import Callable, Collection, Container, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -104,6 +104,13 @@ def line(name: str, shift: float, than: str, setting: str, offset: float) -> str
     late = "later" if shift > 0.0 else "earlier"
     mends = f"{setting}.time_offset = {offset:+.2f}"
     return f"{name} is stamped about {abs(shift):.2f} s {late} than {than}: set {mends} in the rig"
+
+
+def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
+    """The ``names`` that the map has only with other capital letters."""
+    mapped = set(in_map)
+    known = {name.casefold() for name in mapped}
+    return [name for name in names if name not in mapped and name.casefold() in known]
 
 
 @dataclass(frozen=True, eq=False)

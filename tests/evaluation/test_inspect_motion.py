@@ -81,7 +81,7 @@ def test_a_reference_by_another_clock_is_told(log, shift, has_heading):
 
 
 def test_headings_that_run_clockwise_are_told(log):
-    reference = Trajectory(log.reference.t, se2.wrap(log.reference.poses * (1.0, 1.0, -1.0)))
+    reference = Trajectory(log.reference.t, log.reference.poses * (1.0, 1.0, -1.0))
     lines = motion_problems(replace(log, reference=reference, streams={"odometry": log.streams["odometry"]}))
     assert lines == [
         "the reference turns in the opposite direction of the odometry: angles are counter-clockwise, seen from above"
@@ -108,7 +108,9 @@ def test_a_reference_that_is_shorter_than_the_log_is_told(log):
     assert "the reference has no pose while there is odometry" in motion_problems(beside)
 
 
-@pytest.mark.parametrize(("factors", "what"), [((1.3, 1.0), "travels 1.30"), ((1.0, 0.8), "turns 0.80")])
+@pytest.mark.parametrize(
+    ("factors", "what"), [((1.3, 1.0), "travels 1.30"), ((0.1, 1.0), "travels 0.10"), ((1.0, 0.8), "turns 0.80")]
+)
 def test_a_scale_that_is_off_is_told(log, factors, what):
     moved = log.streams["odometry"]
     scaled = replace(moved, v=moved.v / factors[0], w=moved.w / factors[1])

@@ -21,7 +21,18 @@ from factorgraph_loc.fitting.posterior import MAD_TO_SIGMA
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors import interfaces
-from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Marks, Summary, Use
+from factorgraph_loc.sensors.interfaces import (
+    BETTER,
+    FEWEST,
+    LARGE,
+    SHIFTS,
+    SLOWEST,
+    STEP,
+    Marks,
+    Summary,
+    Use,
+    in_other_case,
+)
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream
 from factors import se2
 from factors.landmarks import model as bearing_range
@@ -63,6 +74,7 @@ def summarize(log: Log) -> Summary:
         *_shifted(log),
         *(f"landmark {name} of the map is never seen" for name in unseen),
         *(f"landmark {name} is not in the map: {count} sightings" for name, count in unknown.items()),
+        *(f"landmark {name} is in the map with other capital letters" for name in in_other_case(unknown, unseen)),
         *map(str, suspects),
     ]
     entries = {"unseen": unseen, "unknown": unknown, "suspects": suspects}

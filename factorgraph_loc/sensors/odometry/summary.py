@@ -42,12 +42,14 @@ class RateMatch:
 def summarize(log: Log) -> Summary:
     """Warnings about the odometry of a log, and its scales against the reference."""
     ratios, still = against_reference(log)
+    stream = log.streams.get("odometry")
+    covered = _coverage(log, stream) if stream is not None and len(stream.t) > 1 else []
     problems = [*motion_problems(log), *still]
     text = [
         Paragraph(f"the reference {what} {ratio:.3f} times as much as the odometry") for what, ratio in ratios.items()
     ]
     entries = {f"odometry.{what}_ratio": ratio for what, ratio in ratios.items()}
-    return Summary(found=entries, problems=problems or _doubtful(ratios), text=text)
+    return Summary(found=entries, problems=[*covered, *(problems or _doubtful(ratios))], text=text)
 
 
 def against_reference(log: Log) -> tuple[dict[str, float], list[str]]:
@@ -78,12 +80,12 @@ def _ratio(theirs: Array, ours: Array) -> float | None:
 
 
 def _doubtful(ratios: Mapping[str, float]) -> list[str]:
-    """Warnings about scales that differ; wrong signs and units are detected from the rates."""
+    """Warnings about scales that differ; signs and units of turns are compared by their rates."""
     keys = {"travels": "scale_distance", "turns": "scale_rotation"}
     return [
         f"the reference {what} {ratio:.2f} times as much as the odometry ({keys[what]}, or fgloc calibrate)"
         for what, ratio in ratios.items()
-        if 0.5 < ratio < 1.0 - SCALED or 1.0 + SCALED < ratio < 2.0
+        if abs(ratio - 1.0) > SCALED and (what == "travels" or 0.5 < ratio < 2.0)
     ]
 
 
@@ -103,12 +105,12 @@ def _chords(places: Array, steps: int) -> Array:
 
 
 def motion_problems(log: Log) -> list[str]:
-    """Warnings about a gyro and a reference that contradict the odometry, and a reference that is shorter. In a log with long
-    gaps the longest part between them is compared."""
+    """Warnings about a gyro and a reference that contradict the odometry. In a log with long gaps the longest part between them is
+    compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return []
-    lines = _coverage(log, stream)
+    lines = list[str]()
     begin, end = _longest(stream.t)
     t = np.arange(begin, end, STEP) + log.rig.time_offset("odometry")
     states = integrated(log, odometry_model(log.rig)).states(t)

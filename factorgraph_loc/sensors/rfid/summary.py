@@ -18,7 +18,7 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use, line
+from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use, in_other_case, line
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
@@ -135,6 +135,10 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
     if found.unknown:
         reads = sum(found.unknown.values())
         out.append(f"{reads} reads are of {len(found.unknown)} tags that the map lacks: {listed(found.unknown, SHOWN)}")
+    if other := in_other_case(found.unknown, found.unread):
+        out.append(
+            f"tags are in the map with other capital letters: {listed(other, SHOWN)}: set epc_case for reads or map"
+        )
     carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
         f"antenna {name} is not on the rig: {antenna.reads} reads, {antenna.rounds} rounds"
