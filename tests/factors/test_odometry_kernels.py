@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factors import se2
-from factors.motion import ChainState, Increment
+from factors.motion import ChainState
 from factors.odometry import kernels as odometry_kernels
 from factors.odometry.model import (
     MINIMUM_HEADING_VARIANCE,
@@ -27,11 +27,6 @@ END = ChainState(1.7, 0.1, 0.4, 3.6, 4.9, 5.8, 0.6)
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
-
-
-def covariance(rng):
-    root = rng.standard_normal((3, 3))
-    return root @ root.T
 
 
 @pytest.mark.parametrize(("start", "end"), [(START, END), (END, START), (START, START)])
@@ -64,27 +59,3 @@ def test_an_increment_alone_is_recalibrated_as_with_its_jacobian(rng):
     increment, changes = relative_motion(MODEL, START, END), 0.1 * rng.standard_normal(4)
     alone = odometry_kernels.recalibrated(increment.delta, increment.duration, changes, np.arange(4))
     np.testing.assert_allclose(alone, recalibrated(increment, changes)[0], atol=1e-12)
-
-
-@pytest.mark.parametrize("places", [(), (2,), (0, 3)])
-def test_a_gaussian_is_predicted_by_its_jacobians(rng, places):
-    first, count = 5, len(places)
-    root = rng.standard_normal((8 + count, 8 + count))
-    before, noise, pose, constants = root @ root.T, covariance(rng), rng.standard_normal(3), rng.standard_normal(count)
-    increment = Increment(rng.standard_normal(3), noise, 0.7, 0.1)
-    changes = np.zeros(4)
-    changes[list(places)] = constants
-    delta, by_changes = recalibrated(increment, changes)
-    transition = np.zeros((3, 8 + count))
-    transition[:, :3] = se2.adjoint(se2.inverse(delta))
-    transition[:, first : first + count] = by_changes[:, list(places)]
-    whole = np.concatenate((transition, np.eye(8 + count)[3:]))
-    expected = whole @ before @ whole.T
-    expected[:3, :3] += noise
-    indices = np.array(places, dtype=np.int64)
-    found = np.empty(3), np.empty((3, 8 + count)), np.empty((8 + count, 8 + count))
-    odometry_kernels.predicted(
-        increment.delta, noise, increment.moving, pose, before, constants, indices, first, *found
-    )
-    for one, other in zip(found, (se2.compose(pose, delta), transition, expected), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-12)
