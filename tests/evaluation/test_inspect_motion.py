@@ -109,7 +109,7 @@ def test_a_reference_that_is_shorter_than_the_log_is_told(log):
 
 
 @pytest.mark.parametrize(
-    ("factors", "what"), [((1.3, 1.0), "travels 1.30"), ((0.1, 1.0), "travels 0.10"), ((1.0, 0.8), "turns 0.80")]
+    ("factors", "what"), [((1.3, 1.0), "travels 1.30"), ((0.3, 1.0), "travels 0.30"), ((1.0, 0.8), "turns 0.80")]
 )
 def test_a_scale_that_is_off_is_told(log, factors, what):
     moved = log.streams["odometry"]

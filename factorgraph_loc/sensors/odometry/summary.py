@@ -42,8 +42,7 @@ class RateMatch:
 def summarize(log: Log) -> Summary:
     """Warnings about the odometry of a log, and its scales against the reference."""
     ratios, still = against_reference(log)
-    stream = log.streams.get("odometry")
-    covered = _coverage(log, stream) if stream is not None and len(stream.t) > 1 else []
+    covered = _coverage(log)
     problems = [*motion_problems(log), *still]
     text = [
         Paragraph(f"the reference {what} {ratio:.3f} times as much as the odometry") for what, ratio in ratios.items()
@@ -207,8 +206,9 @@ def _speeds(places: Array, window: float) -> Array:
     return np.asarray(np.hypot(_rates(places[:, 0], window), _rates(places[:, 1], window)))
 
 
-def _coverage(log: Log, stream: VelocityStream | IncrementStream) -> list[str]:
-    if log.reference is None:
+def _coverage(log: Log) -> list[str]:
+    stream = log.streams.get("odometry")
+    if log.reference is None or stream is None or len(stream.t) < 2:
         return []
     first, last = float(stream.t[0]), float(stream.t[-1])
     begin, end = max(first, float(log.reference.t[0])), min(last, float(log.reference.t[-1]))
