@@ -64,6 +64,18 @@ class ExperimentOptions:
 
 
 @app.command()
+def new(file: File, overwrite: Overwrite = False) -> None:
+    """Write a first experiment file, with comments.
+
+    Example: fgloc experiment new lags.toml
+    """
+    from factorgraph_loc.experiments.experiment_file import write_new
+
+    write_new(file, overwrite=overwrite)
+    show.line(f"wrote {file}; `fgloc experiment run {file}` runs it")
+
+
+@app.command()
 @takes_options
 def run(
     file: File,
@@ -81,7 +93,10 @@ def run(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
     json: Json = False,
 ) -> None:
-    """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time."""
+    """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time.
+
+    Example: fgloc experiment run lags.toml
+    """
     from factorgraph_loc.experiments.experiment import prepare, run_experiment
 
     prepared = prepare(file, **options.given(), verify=verify)
@@ -127,7 +142,10 @@ def status(
     verify: Annotated[bool, typer.Option("--verify", help="Read all results and compare their checksums.")] = False,
     json: Json = False,
 ) -> None:
-    """Show how many runs of an experiment are done, failed, missing or damaged."""
+    """Show how many runs of an experiment are done, failed, missing or damaged.
+
+    Example: fgloc experiment status lags.toml
+    """
     from factorgraph_loc.experiments.experiment import STATES
     from factorgraph_loc.experiments.experiment import status as count_states
 
@@ -147,7 +165,10 @@ def status(
 @app.command()
 @takes_options
 def report(file: File, *, options: ExperimentOptions, json: Json = False) -> None:
-    """Write the stored results of an experiment as one HTML page, report.html in OUT; damaged ones are left out."""
+    """Write the stored results of an experiment as one HTML page, report.html in OUT; damaged ones are left out.
+
+    Example: fgloc experiment report lags.toml
+    """
     from factorgraph_loc.experiments.reporting import report as write_page
 
     written = write_page(file, **options.given())
@@ -295,7 +316,10 @@ def active(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds."""
+    """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds.
+
+    Example: fgloc active office --seeds 0:5 -o out/active
+    """
     from factorgraph_loc.experiments.active import active as seek
     from factorgraph_loc.experiments.active_results import difference_cells, differences, summaries, summary_cells
 

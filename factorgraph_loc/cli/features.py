@@ -30,7 +30,10 @@ def evaluate(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Compare features on images of planar scenes: repeatability, matching, time."""
+    """Compare features on images of planar scenes: repeatability, matching, time.
+
+    Example: fgloc features evaluate images/graffiti
+    """
     from factorgraph_loc.api import learning
     from factorgraph_loc.evaluation.features import scores as evaluation
 

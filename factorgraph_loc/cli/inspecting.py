@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 
 def datasets(data_root: DataRoot = None, json: Json = False) -> None:
-    """List the logs that are known by name, and whether their files exist."""
+    """List the logs that are known by name, and whether their files exist.
+
+    Example: fgloc datasets
+    """
     from factorgraph_loc.io.readers import describe
 
     known = [asdict(dataset) for dataset in describe(data_root)]
@@ -41,7 +44,10 @@ def info(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Summarize a log, with warnings about its content; for a ROS bag, its topics."""
+    """Summarize a log, with warnings about its content; for a ROS bag, its topics.
+
+    Example: fgloc info monday.toml -o monday.png
+    """
     from factorgraph_loc.api.logs import draw
     from factorgraph_loc.evaluation.inspect import inspect
     from factorgraph_loc.files.shipped import manifests
@@ -82,7 +88,10 @@ def convert(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the log that OUT is.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a log as a folder in the native format."""
+    """Write a log as a folder in the native format.
+
+    Example: fgloc convert monday.toml out/monday
+    """
     from factorgraph_loc.api import logs
 
     loaded = source.load_one(log)

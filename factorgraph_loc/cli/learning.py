@@ -40,7 +40,10 @@ def calibrate(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Calibrate a rig from logs, all with reference poses or all without; write the rig and a report."""
+    """Calibrate a rig from logs, all with reference poses or all without; write the rig and a report.
+
+    Example: fgloc calibrate monday.toml friday.toml -o cart.rig.toml
+    """
     from factorgraph_loc.api import learning
     from factorgraph_loc.calibration import report
 
@@ -113,7 +116,10 @@ def map_(
     source: LogOptions,
     json: Json = False,
 ) -> None:
-    """Make a map of the landmarks, RFID tags or points in a log; compare it with the log's map of landmarks or tags, if any."""
+    """Make a map of the landmarks, RFID tags or points in a log; compare it with the log's map of landmarks or tags, if any.
+
+    Example: fgloc map monday.toml -o hall.world.toml
+    """
     from factorgraph_loc.api import learning
     from factorgraph_loc.experiments import maps
 

@@ -22,7 +22,10 @@ def _name(what: str, complete: completion.Completion) -> Any:
 
 
 def estimators(name: Annotated[str | None, _name("settings", completion.estimator)] = None, json: Json = False) -> None:
-    """List the estimators, or the settings of one."""
+    """List the estimators, or the settings of one.
+
+    Example: fgloc estimators smoother
+    """
     from factorgraph_loc.api.lookups import known_estimators
     from factorgraph_loc.fusion.registry import describe
 
@@ -39,7 +42,10 @@ def estimators(name: Annotated[str | None, _name("settings", completion.estimato
 
 
 def readers(name: Annotated[str | None, _name("options", completion.reader)] = None, json: Json = False) -> None:
-    """List the readers of logs, or the options of one."""
+    """List the readers of logs, or the options of one.
+
+    Example: fgloc readers mapped
+    """
     from factorgraph_loc.api.lookups import describe_reader, known_readers
 
     if name is None:
@@ -54,7 +60,10 @@ def readers(name: Annotated[str | None, _name("options", completion.reader)] = N
 def sensors(
     name: Annotated[str | None, _name("tables and settings", completion.sensor)] = None, json: Json = False
 ) -> None:
-    """List the sensors, or the tables and the rig's settings of one."""
+    """List the sensors, or the tables and the rig's settings of one.
+
+    Example: fgloc sensors rfid
+    """
     from factorgraph_loc.api.lookups import describe_sensor, known_sensors
 
     if name is None:
@@ -69,7 +78,10 @@ def sensors(
 
 
 def presets(name: Annotated[str | None, _name("settings", completion.preset)] = None, json: Json = False) -> None:
-    """List the presets of simulated logs, or the settings of one."""
+    """List the presets of simulated logs, or the settings of one.
+
+    Example: fgloc presets office
+    """
     from factorgraph_loc.api.lookups import describe_preset
 
     if name is None:
@@ -84,7 +96,10 @@ def presets(name: Annotated[str | None, _name("settings", completion.preset)] = 
 
 
 def policies(json: Json = False) -> None:
-    """List the policies of active robots, and the settings of `fgloc active`."""
+    """List the policies of active robots, and the settings of `fgloc active`.
+
+    Example: fgloc policies information
+    """
     from factorgraph_loc.api.lookups import known_policies
 
     known = known_policies()

@@ -25,7 +25,10 @@ app = typer.Typer(rich_markup_mode=None)
 
 @app.callback(invoke_without_command=True)
 def rigs(context: typer.Context, json: Json = False) -> None:
-    """List the rigs that there are; print one; write a new one."""
+    """List the rigs that there are; print one; write a new one.
+
+    Example: fgloc rigs
+    """
     if context.invoked_subcommand is not None:
         return
     from factorgraph_loc.api.lookups import sources_of_rigs
@@ -44,7 +47,10 @@ def show_(
     ],
     json: Json = False,
 ) -> None:
-    """Print a rig as TOML, each key with its meaning."""
+    """Print a rig as TOML, each key with its meaning.
+
+    Example: fgloc rigs show plaza1
+    """
     from factorgraph_loc.api.lookups import sources_of_rigs
     from factorgraph_loc.files.models import nearest
     from factorgraph_loc.io.native.rig_file import read_rig, rig_text
@@ -72,7 +78,10 @@ def new(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Write the rig of a robot with some sensors, with comments. At a terminal, options that are not given are asked for."""
+    """Write the rig of a robot with some sensors, with comments. At a terminal, options that are not given are asked for.
+
+    Example: fgloc rigs new --antennas 2 -o cart.rig.toml
+    """
     from factorgraph_loc.api.lookups import write_new_rig
     from factorgraph_loc.io.native.rig_file import RobotOptions, new_rig
 

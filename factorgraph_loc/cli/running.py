@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -61,7 +62,10 @@ def run(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Run one estimator on one log; write trajectories, estimates, scores and plots."""
+    """Run one estimator on one log; write trajectories, estimates, scores and plots.
+
+    Example: fgloc run plaza1 -e smoother -o out/plaza1
+    """
     from factorgraph_loc.api import running
     from factorgraph_loc.experiments.output import MAP
     from factorgraph_loc.files.temporary import require_free
@@ -110,7 +114,10 @@ def run(
 def compare(
     logs: LogNames,
     estimators: Estimators,
-    out: Out,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; by default a new one below out."),
+    ] = None,
     seeds: Seeds = "0",
     jobs: Jobs = None,
     *,
@@ -118,7 +125,10 @@ def compare(
     options: RunOptions,
     json: Json = False,
 ) -> None:
-    """Run several estimators on several logs; write a table and plots."""
+    """Run several estimators on several logs; write a table and plots.
+
+    Example: fgloc compare monday.toml -e ekf,smoother
+    """
     from factorgraph_loc.evaluation.tables import comparison_cells, further_tables, unscored, verdict
     from factorgraph_loc.experiments.compare import FINISHED
     from factorgraph_loc.experiments.compare import compare as compare_estimators
@@ -127,7 +137,8 @@ def compare(
 
     names = parse_list(estimators)
     check_names(names)
-    require_free(out, FINISHED, overwrite=options.overwrite)  # before the logs are read
+    if out is not None:
+        require_free(out, FINISHED, overwrite=options.overwrite)  # before the logs are read
     settings = parse_settings(options.set_ or (), names)
     chosen = parse_seeds(seeds)
     loaded = source.load(logs)
@@ -156,7 +167,7 @@ def compare(
             show.line(line)
         show.line()
         show.line(
-            f"results are in {out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, store/"
+            f"results are in {comparison.out}: report.html, table.md, results.csv, results.parquet, differences.csv, plots/, store/"
         )
     if comparison.failures:
         raise typer.Exit(1)

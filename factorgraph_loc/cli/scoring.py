@@ -10,6 +10,7 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, MaxGap, Overwrite, takes_options
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association
 
 
@@ -59,15 +60,21 @@ def score(
         ),
     ],
     reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Another one, of any of these kinds.")],
+    aligned: Annotated[bool, typer.Option("-a", help="As in evo: --align se3.")] = False,
     *,
     options: ScoreOptions,
     json: Json = False,
 ) -> None:
-    """Score any trajectory against any other: absolute and relative errors, with or without alignment."""
+    """Score any trajectory against any other: absolute and relative errors, with or without alignment.
+
+    Example: fgloc score out/plaza1 plaza1 --align se2
+    """
     from factorgraph_loc.api import results
     from factorgraph_loc.evaluation.trajectories.page import errors_table, extents
 
-    result = results.score(estimate, reference, **vars(options))
+    if aligned and options.align not in ("none", "se3"):
+        raise InputError(f"-a is --align se3, but --align is {options.align}: give one of them")
+    result = results.score(estimate, reference, **(vars(options) | ({"align": "se3"} if aligned else {})))
     show.warnings(result.warnings)
     if json:
         show.document(result.document())

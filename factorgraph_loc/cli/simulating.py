@@ -78,7 +78,10 @@ def simulate(
     data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
-    """Simulate logs with known ground truth: a world, a drive, and the measurements of odometry, RFID antennas and camera."""
+    """Simulate logs with known ground truth: a world, a drive, and the measurements of odometry, RFID antennas and camera.
+
+    Example: fgloc simulate office --duration 60 -o out/office
+    """
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
     from factorgraph_loc.api import logs
     from factorgraph_loc.files.models import file_name

@@ -41,7 +41,10 @@ def view(
     source: LogOptions,
     json: Json = False,
 ) -> None:
-    """Show a log and its runs over time, in Rerun."""
+    """Show a log and its runs over time, in Rerun.
+
+    Example: fgloc view out/plaza1
+    """
     from factorgraph_loc.api import results
 
     log, runs = results.stored(what, source.load_one)
@@ -73,7 +76,10 @@ def export(
     source: LogOptions,
     json: Json = False,
 ) -> None:
-    """Write runs for Foxglove and RViz, or the final trajectory of a run or the reference of a log for other programs."""
+    """Write runs for Foxglove and RViz, or the final trajectory of a run or the reference of a log for other programs.
+
+    Example: fgloc export out/plaza1 -o plaza1.tum
+    """
     from factorgraph_loc.api import results
 
     results.require_format(out)

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from factorgraph_loc.experiments.preparation import fill_cache, use_of
 from factorgraph_loc.experiments.reporting import PAGE, report_experiment
 from factorgraph_loc.experiments.store import Store
 from factorgraph_loc.files.models import parse_model
-from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder
+from factorgraph_loc.files.temporary import new_below, of_system, require_free, temporary_folder
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all
 from factorgraph_loc.io.results import FILES, INDEX, ResultFiles
@@ -41,8 +41,11 @@ FINISHED = (
 )  # results that are not replaced; an unfinished comparison, which is continued, has none of them
 
 
+@dataclass(frozen=True, repr=False)
 class Comparison(Done):
-    """The results of a comparison, which print as its table."""
+    """The results of a comparison, which print as its table. ``out``: their folder."""
+
+    out: Path
 
     def __repr__(self) -> str:
         return summary_text(self.rows)
@@ -58,7 +61,7 @@ def summary_text(rows: Sequence[Mapping[str, Any]]) -> str:
 def compare(
     logs: LogLike | Sequence[LogLike],
     estimators: Sequence[str],
-    out: str | Path,
+    out: str | Path | None = None,
     *,
     settings: Mapping[str, Mapping[str, Any]] | None = None,
     sensors: Sequence[str] | None = None,
@@ -82,15 +85,15 @@ def compare(
     can do without. A run that fails, or whose process dies, becomes a row with its reason; the others continue. Runs whose
     results are stored are not repeated.
 
-    Written into ``out``: ``results.parquet`` and ``results.csv`` (the rows), ``differences.csv`` (see
-    :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
+    Written into ``out``, by default a new folder below ``out``: ``results.parquet`` and ``results.csv`` (the rows),
+    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
     :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the folder ``store``, by
     its key (see :class:`~factorgraph_loc.experiments.store.Store`). ``rpe``: also show relative errors, in ``table.md`` and in
     the report. ``progress`` is called with the number of runs done and of all.
 
     Raises InputError, before anything runs, for invalid or missing input, and for results in ``out`` without ``overwrite``.
     """
-    out = Path(out)
+    out = new_below(Path("out"), "compare") if out is None else Path(out)
     require_free(out, FINISHED, overwrite=overwrite)
     named = _named(estimators, settings or {}, final_only=final_only)
     logs = load_all(logs, rig, world)
@@ -114,7 +117,7 @@ def compare(
     _plot(logs, prepared, out / "plots")
     compared = pl.DataFrame(differences(done.rows), schema=DIFFERENCES)
     write_tables(done.table, compared, _table(done.rows, rpe=rpe), out)
-    return Comparison(done.table, done.failures, done.warnings)
+    return Comparison(done.table, done.failures, done.warnings, out)
 
 
 def _named(

@@ -15,7 +15,16 @@ from pydantic import Field, field_validator, model_validator
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.scores import SUMMARY
 from factorgraph_loc.evaluation.warned import SIMULATION
-from factorgraph_loc.files.models import FileModel, check_content, flattened, nearest, parse_model, read_toml, set_key
+from factorgraph_loc.files.models import (
+    FileModel,
+    check_content,
+    flattened,
+    nearest,
+    parse_model,
+    read_toml,
+    set_key,
+    write_text,
+)
 from factorgraph_loc.model.scoring import (
     LARGEST_SEED,
     LONGEST,
@@ -32,6 +41,20 @@ LONGEST_NAME = 200  # maximum characters of the experiment's name, which is a fo
 MOST = 1000  # maximum number of logs, estimators, sets of sensors and metrics in a file; globs and seeds may expand to more
 NO_TIME_LIMIT = 1e9  # s: no limit of a run
 MOST_SWEPT, MOST_VALUES = 50, 10_000  # maximum number of swept settings, and of values of one
+FIRST = """\
+name = "{name}"  # the results go to out/{name}
+logs = [{{ simulate = "office", seeds = "0:3" }}]  # or names and files of logs: ["plaza1", "monday.toml"]
+estimators = ["ekf", "smoother"]
+# sensors = ["odometry", "rfid"]  # by default those of each rig
+# prior = "unknown"  # of the start; by default that of the log
+# seeds = "0:5"  # of the estimators that draw random numbers
+
+# [sweep]  # values of settings, by estimator
+# "smoother.lag" = [5.0, 10.0, 20.0]
+
+[report]
+baseline = "ekf"  # the others are compared with it
+"""
 Name = Annotated[str, Field(min_length=1)]
 Seeds = Annotated[
     tuple[Annotated[int, Field(ge=0, le=LARGEST_SEED)], ...], Field(min_length=1, max_length=MOST_SEEDS, fail_fast=True)
@@ -225,6 +248,15 @@ class Experiment(FileModel):
     def folder(self) -> Path:
         """The folder of the results."""
         return Path("out", self.name) if self.out is None else Path(self.out)
+
+
+def write_new(file: Path, *, overwrite: bool = False) -> None:
+    """Write a first experiment, with comments. InputError if the file exists, unless it is to ``overwrite``."""
+    if file.suffix != ".toml":
+        raise InputError(f"{file}: is no name of an experiment, expected one that ends in .toml")
+    if file.exists() and not overwrite:
+        raise InputError(f"{file}: exists already; choose another name or give --overwrite")
+    write_text(file, FIRST.format(name=file.stem))
 
 
 def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Experiment:

@@ -5,6 +5,7 @@ processes that have ended are removed when a command that writes to the same fol
 """
 
 import fcntl
+import itertools
 import os
 import re
 import secrets
@@ -137,6 +138,12 @@ def writing(path: object) -> Iterator[None]:
         raise InputError(f"{path}: cannot be written: {error_text(error)}") from error
     except UnicodeEncodeError as error:
         raise InputError(f"{path}: cannot be written: {message_of(error)}") from error
+
+
+def new_below(folder: Path, name: str) -> Path:
+    """The first of ``name``, ``name-2``, ``name-3``, ... that does not exist in a folder."""
+    numbered = (name if i == 1 else f"{name}-{i}" for i in itertools.count(1))
+    return next(path for text in numbered if not (path := folder / text).exists())
 
 
 def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:

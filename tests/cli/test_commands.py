@@ -63,3 +63,17 @@ def test_convert_overwrites_a_log_alone(fgloc, refused, short_log, tmp_path):
     (out / "run.toml").unlink()
     assert "expected a new one, or one with a log" in refused("convert", short_log, out, "--overwrite")
     assert (out / "notes.md").read_text() == "mine"
+
+
+def test_every_command_shows_an_example(fgloc):
+    from typer.main import get_command
+
+    from factorgraph_loc.cli.app import app
+
+    def leaves(command, *names):
+        children = getattr(command, "commands", {})
+        return [leaf for name, child in children.items() for leaf in leaves(child, *names, name)] or [names]
+
+    for names in leaves(get_command(app)):
+        help_text = fgloc(*names, "--help").stdout
+        assert f"Example: fgloc {' '.join(names)}" in " ".join(help_text.split()), names

@@ -21,6 +21,13 @@ def test_compare_prints_one_table_with_seeds_pooled_and_the_best_in_words(fgloc,
     assert "--overwrite" in refused("compare", short_log, "-e", "ekf", "-o", out)
 
 
+def test_compare_without_a_folder_makes_a_new_one(fgloc, short_log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("compare", "compare-2"):
+        assert f"results are in out/{name}: " in fgloc("compare", short_log, "-e", "dead_reckoning").stdout
+        assert (tmp_path / "out" / name / "report.html").exists()
+
+
 def test_compare_reports_a_failed_run_and_goes_on(fgloc, short_log, tmp_path):
     nowhere = tmp_path / "nowhere"
     shutil.copytree(short_log, nowhere)

@@ -96,3 +96,12 @@ def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, proc
     (line,) = [line for line in status.stdout.splitlines() if line.startswith("(all)")]
     assert line.split()[1:] == ["1", "0", "1", "0"]
     assert list((tmp_path / "out" / "lags" / "store" / "tmp").iterdir()) == []
+
+
+def test_a_first_experiment_can_be_planned(fgloc, tmp_path):
+    file = tmp_path / "lags.toml"
+    assert fgloc("experiment", "new", str(file)).exit_code == 0
+    planned = fgloc("experiment", "run", str(file), "--dry-run", "-o", str(tmp_path / "out"))
+    assert planned.exit_code == 0
+    assert "6 runs" in planned.stdout
+    assert fgloc("experiment", "new", str(file)).exit_code == 2  # it exists
