@@ -5,8 +5,10 @@ import subprocess
 import sys
 
 import pytest
+from typer.main import get_command
 
 from factorgraph_loc import __version__
+from factorgraph_loc.cli.app import app
 
 
 def test_version_and_help(fgloc):
@@ -66,10 +68,6 @@ def test_convert_overwrites_a_log_alone(fgloc, refused, short_log, tmp_path):
 
 
 def test_every_command_shows_an_example(fgloc):
-    from typer.main import get_command
-
-    from factorgraph_loc.cli.app import app
-
     def leaves(command, *names):
         children = getattr(command, "commands", {})
         return [leaf for name, child in children.items() for leaf in leaves(child, *names, name)] or [names]
