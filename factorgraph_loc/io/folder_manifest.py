@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,31 +39,31 @@ APART = 5.0  # s that clocks may begin apart
 
 @dataclass
 class _Roles:
-    """The table of each role, the tables without one, and ``remarks``."""
+    """The table of each role, and ``remarks``."""
 
     tables: dict[str, Guess] = field(default_factory=dict)
-    unused: list[Guess] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
 
 
 def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
-    """Propose a manifest for the tables in a folder, to be saved in ``folder`` if ``tables`` is below it, else beside ``tables``.
+    """Propose a manifest for the tables in a folder.
 
+    It is to be saved in ``folder`` if ``tables`` is below it, else in the folder that contains ``tables``.
     InputError if no file of the folder is a table with times.
     """
     path, folder = Path(os.path.realpath(tables)), folder.resolve()
-    guesses = [guess(sample) for file in _tables(path) if (sample := sample_of(file)) is not None]
-    if not any(found.has("t") for found in guesses):
+    guesses = _guesses(path)
+    if not any(table.has("t") for table in guesses):
         raise InputError(
             f"{tables}: has no table with times, expected files such as odometry.csv: {', '.join(SUFFIXES)}"
         )
     roles = _roles(guesses)
     options: dict[str, Any] = {}
-    for role, found in list(roles.tables.items()):
+    for role, table in list(roles.tables.items()):
         if role in MAPS:
             options.setdefault("world", {})[role] = _in_map(role, roles)
         else:
-            options[role] = _described(role, found, roles)
+            options[role] = _described(role, table, roles)
     if "odometry" not in options:
         roles.remarks.append(
             "no file looks like odometry, which every estimator needs: describe one in [options.odometry]"
@@ -71,53 +72,58 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
         options["rfid"]["antenna"] = "antenna"
         roles.remarks.append("the reads name no antenna: all are assigned to one, set in antenna")
     _add_clocks(options, roles)
-    for found in roles.tables.values():
-        roles.remarks += [f"{found.name}: {reason}" for reason in found.reasons]
-    read = {found.name for found in roles.tables.values()}
-    others = [
+    for table in roles.tables.values():
+        roles.remarks += [f"{table.name}: {reason}" for reason in table.reasons]
+    read = {table.name for table in roles.tables.values()}
+    unused = [
         entry.name for entry in sorted(path.iterdir()) if entry.name not in read and not entry.name.startswith(".")
     ]
-    if others:
-        roles.remarks.append(f"not used: {listed(others)}")
+    if unused:
+        roles.remarks.append(f"not used: {listed(unused)}")
     if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
         antennas = dict.fromkeys(roles.tables["rfid"].sample.columns[roles.tables["rfid"].fields["antenna"]])
         roles.remarks.append(f"the rig needs the antennas {listed(antennas)}, by these names in [rfid.antennas]")
-    beside = [] if "world" in options or any(path.parent.glob("*.world.toml")) else _map_beside(path, roles)
+    beside = [] if "world" in options or any(path.parent.glob("*.world.toml")) else _map_in_parent(path, roles)
     roles.remarks += beside
     return proposal_of("mapped", path, folder, options, roles.remarks, with_map=not beside and "world" not in options)
 
 
-def _map_beside(path: Path, roles: _Roles) -> list[str]:
-    """The lines of a world file for a map that is a table beside the folder."""
-    for file in _tables(path.parent):
-        found = None if (sample := sample_of(file)) is None else guess(sample)
-        role = None if found is None else _role(found)
-        if found is not None and role in MAPS:
-            roles.tables[role] = found
+def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
+    """The lines of a world file for a map that is a table in the parent folder."""
+    for table in _guesses(path.parent):
+        role = _role(table)
+        if role in MAPS:
+            roles.tables[role] = table
             name = path.parent.name
             walls = next(
                 (y.name for y in sorted(path.parent.glob("*.yaml")) if "resolution:" in read_text(y, YAML)), None
             )
             world = {"name": name, **({} if walls is None else {"walls": walls}), role: _in_map(role, roles)}
             lines = toml_of(world).splitlines()
-            return [f"{file.name} looks like a map: save these lines as {name}.world.toml beside it", *lines]
+            return [f"{table.name} looks like a map: save these lines as {name}.world.toml next to it", *lines]
     return []
 
 
 def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
     """The keys of a table of a map; EPCs in the letter case of the reads."""
-    found, reads = roles.tables[role], roles.tables.get("rfid")
-    settings = found.mapping(FIELDS[role])
+    table, reads = roles.tables[role], roles.tables.get("rfid")
+    settings = table.mapping(FIELDS[role])
     if role == "tags" and reads is not None:
-        tags, read = (set(g.sample.columns[g.fields["epc"]]) for g in (found, reads))
+        tags, read = (set(g.sample.columns[g.fields["epc"]]) for g in (table, reads))
         case = next((case for case in ("upper", "lower") if all(epc == getattr(epc, case)() for epc in read)), None)
         if case is not None and not tags & read and {getattr(epc, case)() for epc in tags} & read:
             settings["epc_case"] = case
     return settings
 
 
-def _tables(folder: Path) -> list[Path]:
-    return sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES and entry.is_file())
+def _guesses(folder: Path) -> list[Guess]:
+    """The guesses about the tables in a folder, without files that cannot be read as tables."""
+    out = []
+    for file in sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES and entry.is_file()):
+        with suppress(InputError):
+            if (sample := sample_of(file)) is not None:
+                out.append(guess(sample))
+    return out
 
 
 def _roles(guesses: Sequence[Guess]) -> _Roles:
@@ -125,12 +131,12 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
     out = _Roles()
     poses = [g for g in guesses if g.has("t", "x", "y") and not g.has("epc") and not g.has("landmark")]
     truths = [g for g in poses if TRUTH.search(g.name)]
-    for found in guesses:
-        role = _role(found)
+    for table in guesses:
+        role = _role(table)
         if role is not None and role not in out.tables:
-            out.tables[role] = found
+            out.tables[role] = table
         elif role is not None:
-            out.remarks.append(f"{role} could also be {found.name}")
+            out.remarks.append(f"{role} could also be {table.name}")
     rest = [g for g in poses if g not in out.tables.values() and g not in truths]
     if "odometry" not in out.tables and rest:
         out.tables["odometry"] = rest.pop(0)
@@ -144,87 +150,86 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
     return out
 
 
-def _role(found: Guess) -> str | None:
+def _role(table: Guess) -> str | None:
     """The role that the fields of a table show; None for poses and for unknown tables."""
-    if not found.has("t"):
-        return "tags" if found.has("epc", "x", "y") else "landmarks" if found.has("landmark", "x", "y") else None
-    if found.has("epc"):
+    if not table.has("t"):
+        return "tags" if table.has("epc", "x", "y") else "landmarks" if table.has("landmark", "x", "y") else None
+    if table.has("epc"):
         return "rfid"
-    if found.has("landmark") and (found.has("range") or found.has("bearing")):
+    if table.has("landmark") and (table.has("range") or table.has("bearing")):
         return "bearing_range"
-    if _sides(found) or found.has("v", "w"):
+    if _sides(table) or table.has("v", "w"):
         return "odometry"
-    if found.has("antenna"):
+    if table.has("antenna"):
         return "inventories"
-    return "imu" if found.has("w") else None
+    return "imu" if table.has("w") else None
 
 
-def _sides(found: Guess) -> tuple[str, ...]:
+def _sides(table: Guess) -> tuple[str, ...]:
     """The fields of a left and a right wheel, if the table has them."""
-    return tuple(name for name in found.fields if name.startswith(("left", "right")))
+    return tuple(name for name in table.fields if name.startswith(("left", "right")))
 
 
-def _described(role: str, found: Guess, roles: _Roles) -> dict[str, Any]:
+def _described(role: str, table: Guess, roles: _Roles) -> dict[str, Any]:
     """The keys of a table of the manifest."""
-    sides = _sides(found) if role == "odometry" else ()
+    sides = _sides(table) if role == "odometry" else ()
     names = ("t", *sides) if sides else FIELDS[role]
-    if role == "odometry" and found.has("v", "w"):
+    if role == "odometry" and table.has("v", "w"):
         names = ("t", "v", "w")
-    if role in ("odometry", "reference") and not sides and not found.has("heading") and not found.has(*QUATERNION):
-        found.reasons.append("has no headings")
-    settings = found.mapping(names)
+    settings = table.mapping(names)
     if sides:
-        _add_sizes(settings, found, sides, roles)
-    if role == "reference" and not found.has("heading") and not found.has(*QUATERNION):
+        _add_sizes(settings, table, sides, roles)
+    if role == "reference" and not table.has("heading") and not table.has(*QUATERNION):
         settings["has_heading"] = False
+        roles.remarks.append(f"{table.name}: has no headings")
     return settings
 
 
-def _add_sizes(settings: dict[str, Any], found: Guess, sides: Sequence[str], roles: _Roles) -> None:
+def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], roles: _Roles) -> None:
     """The distance between the wheels, and the distance per unit of counters: from the reference, or examples."""
     settings["track"] = TRACK
     if sides[0] != "left":
         if sides[0] in ("left_angle", "left_rate"):
             settings["radius"] = 0.1
         roles.remarks.append(
-            f"{found.name}: measure the distance between the wheels, and their radius: track, radius [m]"
+            f"{table.name}: measure the distance between the wheels, and their radius: track, radius [m]"
         )
         return
-    left, right = (_unwrapped(found.values(name)) for name in sides)
+    left, right = (_unwrapped(table.values(name)) for name in sides)
     tick, track = TICK, None
     if (reference := roles.tables.get("reference")) is not None:
         travelled = float(np.nansum(np.abs(np.diff((left + right) / 2.0))))
-        way = _way(reference)
-        if travelled > 0.0 and way > 0.0:
-            tick = float(f"{way / travelled:.3g}")
+        length = _path_length(reference)
+        if travelled > 0.0 and length > 0.0:
+            tick = float(f"{length / travelled:.3g}")
             roles.remarks.append(
-                f"{found.name}: {tick:g} m per unit of {quoted(found.fields['left'])}, as the reference travels {way:.1f} m over "
-                f"{travelled:.0f} of them; replace it by the size of your wheels"
+                f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])}, as the reference travels {length:.1f} m "
+                f"over {travelled:.0f} of them; replace it by the size of your wheels"
             )
-        track = _track(found.times(), tick * (right - left), reference)
+        track = _track(table.times(), tick * (right - left), reference)
     else:
-        roles.remarks.append(f"{found.name}: replace {tick:g} by the metres per unit of {quoted(found.fields['left'])}")
+        roles.remarks.append(f"{table.name}: replace {tick:g} by the metres per unit of {quoted(table.fields['left'])}")
     if track is None:
-        roles.remarks.append(f"{found.name}: measure the distance between the wheels: track [m]")
+        roles.remarks.append(f"{table.name}: measure the distance between the wheels: track [m]")
     else:
         settings["track"] = track
         roles.remarks.append(
-            f"{found.name}: track = {track:g} m, as the reference turns; replace it by what you measure"
+            f"{table.name}: track = {track:g} m, as the reference turns; replace it by what you measure"
         )
     settings.setdefault("units", {}).update(left=tick, right=tick)
 
 
 def _unwrapped(counts: Array) -> Array:
-    """The values of a counter without its wraps, for the fewest bits that it fits in."""
+    """The values of a counter without its wraps. It has the fewest bits that hold its values."""
     for bits in WIDTHS:
-        if np.nanmax(np.abs(counts)) < 2.0**bits and np.nanmax(np.abs(np.diff(counts)), initial=0.0) > 2.0 ** (
-            bits - 1
-        ):
+        if np.nanmax(np.abs(counts), initial=0.0) < 2.0**bits and np.nanmax(
+            np.abs(np.diff(counts)), initial=0.0
+        ) > 2.0 ** (bits - 1):
             return np.asarray(np.unwrap(counts, period=2.0**bits))
     return counts
 
 
-def _way(reference: Guess) -> float:
+def _path_length(reference: Guess) -> float:
     """The length of the way of a reference [m], between poses that are a second apart."""
     poses = _poses(reference)
     steps = np.searchsorted(poses[:, 0], np.arange(poses[0, 0], poses[-1, 0], WINDOW))
@@ -257,14 +262,14 @@ def _track(t: Array, difference: Array, reference: Guess) -> float | None:
 
 def _add_clocks(options: dict[str, Any], roles: _Roles) -> None:
     """Offsets of clocks that begin at another time than that of most tables: as if all logs began together."""
-    starts = {role: float(np.nanmin(found.times())) for role, found in roles.tables.items() if found.has("t")}
+    starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}
     if not starts:
         return
 
     def agreeing(role: str) -> tuple[int, bool]:
-        others = sum(ends[role] > starts[other] and starts[role] < ends[other] for other in starts)
-        return others, role == "reference"
+        count = sum(ends[role] > start and starts[role] < ends[name] for name, start in starts.items())
+        return count, role == "reference"
 
     usual = max(starts, key=agreeing)
     for role, start in starts.items():

@@ -57,6 +57,7 @@ ENDS: dict[str, Mapping[str, str]] = {
     "w": RATES,
     "frequency": {"hz": "Hz", "khz": "kHz", "mhz": "MHz"},
 }
+TEXTS = ("epc", "antenna", "landmark")  # fields that need no numbers
 DEGREES, FASTEST, TURNING = 6.4, 15.0, 12.0  # larger angles are in degrees; m/s and rad/s that no robot has
 # units of values of at most this size
 LARGER = {
@@ -188,7 +189,7 @@ def guess(sample: Sample) -> Guess:
         if name in taken or not ranked:
             continue
         best = min(ranked)[1]
-        if best not in out.fields:
+        if best not in out.fields and (best in TEXTS or sample.numbers(name) is not None):
             out.fields[best] = name
             if unit := ENDS.get(best, {}).get(end):
                 out.units[best] = unit
@@ -218,11 +219,11 @@ def _add_time(out: Guess) -> None:
     named = [name for name in names if TIME.match(plain(_split(name)[0]))] if sample.header else names[:1]
     for name in [*named, *names[:1]]:
         texts = sample.columns[name]
-        if _is_time(texts[0]) and _is_time(texts[-1]):
+        if all(map(_is_time, texts)):
             out.fields["t"], out.units["t"] = name, "iso"
             return
         values = sample.numbers(name)
-        if values is None or len(values) < 2 or np.mean(np.diff(values) < 0.0) > 0.2 or np.ptp(values) == 0.0:
+        if values is None or np.mean(np.diff(values) < 0.0) > 0.2 or np.nanmin(values) == np.nanmax(values):
             continue
         end = _split(name)[1] or plain(name)
         out.fields["t"] = name
@@ -234,11 +235,12 @@ def _add_time(out: Guess) -> None:
 
 def _unit_of_times(values: Array) -> str:
     """The unit of timestamps, by their size since 1970, or by the steps of a clock that begins with the log."""
-    first = float(np.abs(values[np.isfinite(values)][0]))
+    values = values[np.isfinite(values)]
+    first = float(np.abs(values[0]))
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
         if first > least:
             return unit
-    step = float(np.nanmedian(np.diff(np.unique(values))))
+    step = float(np.median(np.diff(np.unique(values))))
     whole = bool(np.all(values == np.floor(values)))
     return "s" if not whole or step <= 1.0 else "ms" if step < 1e4 else "us" if step < 1e7 else "ns"
 
@@ -265,6 +267,8 @@ def _add_wheels(out: Guess) -> None:
     if len(sides["left"]) > 1:
         out.reasons.append(f"of several wheels on a side, those of {quoted(sides['left'][0])} are used")
     left, right = (sides[side][0] for side in ("left", "right"))
+    if out.sample.numbers(left) is None or out.sample.numbers(right) is None:
+        return
     parts = set(words[left])
     kind = next(
         (

@@ -27,9 +27,10 @@ class Proposal:
 def proposal_of(
     reader: str, path: Path, folder: Path, options: Mapping[str, Any], remarks: Sequence[str], *, with_map: bool = True
 ) -> Proposal:
-    """The manifest of a log at ``path`` with the ``options`` of a reader, in ``folder`` if the log is below it, else beside it.
+    """The manifest of a log at ``path`` with the ``options`` of a reader, in ``folder`` if the log is below it, else in its parent.
 
-    Rig and map are files beside the log that begin with its name. Without ``with_map``, the options have the map.
+    Rig and map are files in the parent folder: those that begin with the log's name, or the only ones. Without ``with_map``, the
+    options have the map.
     """
     root = folder if path.is_relative_to(folder) else path.parent
     kind = "bag" if reader == "rosbag" else "folder"

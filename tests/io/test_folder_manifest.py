@@ -1,5 +1,7 @@
 """A proposed manifest for a folder of tables: a log that is read with it has the values in our units."""
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -125,3 +127,14 @@ def test_a_folder_without_a_table_is_refused(tmp_path):
     write(tmp_path / "day" / "notes.txt", ["drove twice round the hall", "battery low"])
     with pytest.raises(InputError, match=r"day: has no table with times, expected files such as odometry.csv"):
         manifest(tmp_path / "day")
+
+
+CELLS = st.sampled_from(["t", "x", "y", "left", "epc", "1", "2.5", "", "-7e9", "nan", "a b"])
+
+
+@given(st.lists(st.lists(CELLS, min_size=1, max_size=9)))
+def test_any_table_is_guessed_or_refused(tmp_path_factory, rows):
+    day = tmp_path_factory.mktemp("day")
+    write(day / "odometry.csv", ["t,x,y,left,right,antenna,epc,when,heading", *(",".join(row) for row in rows)])
+    with suppress(InputError):
+        assert manifest(day).content["reader"] == "mapped"
