@@ -12,8 +12,9 @@ from scipy.spatial import cKDTree
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.rfid.known_tags import tag_map, whole_scans
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
+from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factors import se2
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
@@ -91,31 +92,20 @@ def recorded_looks(logs: list[Log]) -> RecordedLooks:
 
 def _looks(log: Log) -> tuple[Array, Array]:
     rfid, reference, stream = log.rig.find(RfidSettings), log.reference, log.streams.get("rfid")
-    if rfid is None or reference is None or stream is None or not reference.has_heading:
+    if rfid is None or reference is None or not isinstance(stream, RfidStream) or not reference.has_heading:
         raise InputError(f"{log.name}: expected a log with rfid, antennas in its rig and a reference with headings")
-    scans = whole_scans(log)
-    tags = tag_map(log.world, log.rig.of(SurveySettings), {epc for scan in scans for epc in scan.tags})
+    tags = tag_map(log.world, log.rig.of(SurveySettings), set(stream.epc))
     if not np.isfinite(tags.tags.facing).all():
         raise InputError(f"{log.name}: has tags without a facing, which resampling needs")
-    poses = reference.at(np.array([scan.t for scan in scans]), max_gap=MAX_GAP)
+    first, hits = stream.first_rows, stream.hits(tags.index)
+    poses = reference.at(stream.t[first] + log.rig.time_offset("rfid"), max_gap=MAX_GAP)
+    listening = np.array(stream.antenna, dtype=str)[first]
     features, reads = [], []
     for name, antenna in rfid.all_antennas().items():
-        rows, hits = [], []
-        for i, scan in enumerate(scans):
-            if not np.isfinite(poses[i, 0]):
-                continue
-            for k, listening in enumerate(scan.antennas):
-                if listening == name:
-                    rows.append(i)
-                    read = {
-                        tags.index[scan.tags[j]]
-                        for j in np.flatnonzero(scan.antenna == k)
-                        if scan.tags[j] in tags.index
-                    }
-                    hits.append([float(t in read) for t in range(len(tags.names))])
-        if rows:
+        rows = np.flatnonzero(np.isfinite(poses[:, 0]) & (listening == name))
+        if len(rows):
             features.append(_features(antenna, tags.tags, poses[rows]).reshape(-1, 4))
-            reads.append(np.array(hits).ravel())
+            reads.append(hits[rows].astype(float).ravel())
     if not features:
         raise InputError(f"{log.name}: has no round of a known antenna within the reference")
     return np.concatenate(features), np.concatenate(reads)

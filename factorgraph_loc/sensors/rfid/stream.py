@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -114,6 +115,26 @@ class RfidStream(Stream):
     rssi: Array
     phase: Array
     frequency: Array
+
+    @cached_property
+    def number(self) -> Integers:
+        """The number (N,) of each row's round among all R rounds, in order of arrival."""
+        scan = np.cumsum(np.diff(self.t, prepend=np.nan) != 0.0).tolist()
+        numbers: dict[tuple[int, int], int] = {}
+        keys = zip(scan, self.round.tolist(), strict=True)
+        return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)
+
+    @property
+    def first_rows(self) -> Integers:
+        """The first row (R,) of each round."""
+        return np.asarray(np.unique(self.number, return_index=True)[1])
+
+    def hits(self, tags: Mapping[str, int]) -> NDArray[np.bool_]:
+        """Whether each round read each of T ``tags``, (R, T), which are given by EPC with their columns."""
+        out = np.zeros((len(self.first_rows), len(tags)), dtype=bool)
+        columns = np.array([tags.get(epc, -1) for epc in self.epc], dtype=np.int64)
+        out[self.number[columns >= 0], columns[columns >= 0]] = True
+        return out
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         for i, j in self.scans():

@@ -19,15 +19,17 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use, in_other_case, line
+from factorgraph_loc.sensors.rfid.calibration.rounds import overdispersion
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
 from factorgraph_loc.text import listed, quoted
+from factors.rfid import kernels
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.rfid.parameters import MOST_CERTAIN, rate_of
-from factors.se2 import Array, Integers, transform_from, wrap_scalar
+from factors.se2 import Array, Integers, wrap_scalar
 
 STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
 CLOCK_STEP = 1.0  # s
@@ -90,13 +92,9 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
         return None
-    scan = np.cumsum(np.diff(stream.t, prepend=np.nan) != 0.0)
-    _, first = np.unique(np.column_stack((scan, stream.round)), axis=0, return_index=True)
-    first.sort()  # the first row of each round
+    first, antenna = stream.first_rows, np.array(stream.antenna, dtype=str)
     is_read = np.array([bool(epc) for epc in stream.epc], dtype=bool)
-    antenna = np.array(stream.antenna, dtype=str)
-    read_rounds = set(zip(scan[is_read].tolist(), stream.round[is_read].tolist(), strict=True))
-    silent = np.array([(int(scan[i]), int(stream.round[i])) not in read_rounds for i in first], dtype=bool)
+    silent = np.bincount(stream.number[is_read], minlength=len(first)) == 0
     antennas = {}
     for name in dict.fromkeys(stream.antenna):
         mine = antenna[first] == name
@@ -115,7 +113,7 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
     late = np.maximum.accumulate(t) - t if len(t) else t
     return RfidSummary(
         reads=int(np.count_nonzero(is_read)),
-        scans=int(scan[-1]) if len(scan) else 0,
+        scans=len(list(stream.scans())),
         rounds=len(first),
         antennas=antennas,
         known=sum(epc in counts for epc in log.world.tags),
@@ -290,57 +288,33 @@ def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Traje
     dead = diagnostics.doubted.get("dead_tags", {})
     kept = [name for name in log.world.tags if name not in dead]
     looks = _observed(use, stream, settings, learnt, final, kept)
-    if looks is None:
-        return None
     names = list(settings.all_antennas())
     return _counted(log.name, looks, names, settings.tempering)
 
 
 def _observed(
     use: Use, stream: RfidStream, settings: RfidSettings, learnt: Learnt, final: Trajectory, kept: list[str]
-) -> _Looks | None:
+) -> _Looks:
     log, tags = use.log, tag_map(use.log.world, use.log.rig.of(SurveySettings), kept)
     likelihood = RfidLikelihood(settings.model(), tags.tags)
     estimated = settings.estimated()
     changes = np.array([learnt.values.get(f"rfid.{name}", (0.0, 0.0))[0] for name in estimated.names])
     likelihood = likelihood.adjusted(estimated.full(changes, len(likelihood.parameters)))
-    first, inverse = np.unique(np.rec.fromarrays((stream.t, stream.round)), return_index=True, return_inverse=True)[1:]
+    first, hits = stream.first_rows, stream.hits(tags.index)
     t = stream.t[first] + log.rig.time_offset("rfid") + likelihood.packed.delay[0]
     block = ((t - t.min()) // BLOCK).astype(np.int64)
-    read = np.array([epc in tags.index for epc in stream.epc], dtype=bool)
-    is_read = np.zeros(int(block.max()) + 1, dtype=bool)
-    is_read[block[inverse[read]]] = True
+    is_read = np.isin(block, block[hits.any(axis=1)])
     numbers = {name: i for i, name in enumerate(settings.all_antennas())}
     antenna = np.array([numbers.get(stream.antenna[i], -1) for i in first.tolist()], dtype=np.int64)
     poses = possible_poses(final, t, REFERENCE_GAP)
-    used = np.isfinite(poses[:, 0]) & (antenna >= 0) & is_read[block]
-    used[np.flatnonzero(used)[_left_out(int(used.sum()))]] = False
-    rows = np.flatnonzero(read)
-    place = np.array([tags.index[stream.epc[i]] for i in rows.tolist()], dtype=np.int64)
-    parts = []
-    for a, mounted in enumerate(settings.all_antennas().values()):
-        mine = np.flatnonzero(used & (antenna == a))
-        if not len(mine):
-            continue
-        p = likelihood.probabilities(poses[mine], a)
-        row_of = np.full(len(first), -1, dtype=np.int64)
-        row_of[mine] = np.arange(len(mine))
-        hits = np.zeros(p.shape, dtype=bool)
-        ours = row_of[inverse[rows]] >= 0
-        hits[row_of[inverse[rows[ours]]], place[ours]] = True
-        n, tag = np.nonzero(p > POSSIBLE)
-        at = np.array([transform_from(pose, np.array((mounted.x, mounted.y))) for pose in poses[mine]])
-        distance = np.hypot(*(tags.tags.points[tag, :2] - at[n]).T)
-        parts.append((p[n, tag], hits[n, tag].astype(float), np.full(len(n), a), tag, block[mine][n], distance))
-    if not parts:
-        return None
-    return _Looks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _left_out(count: int) -> Integers:
-    """Of so many rounds, those that are more than :data:`MOST_ROUNDS` are."""
-    kept = np.unique(np.linspace(0, count - 1, min(count, MOST_ROUNDS)).astype(np.int64)) if count else np.empty(0, int)
-    return np.setdiff1d(np.arange(count), kept)
+    used = np.flatnonzero(np.isfinite(poses[:, 0]) & (antenna >= 0) & is_read)
+    if len(used) > MOST_ROUNDS:
+        used = used[np.linspace(0, len(used) - 1, MOST_ROUNDS).astype(np.int64)]
+    survey = tags.tags.points, tags.tags.normals
+    p, distance = kernels.probabilities(likelihood.packed, antenna[used], poses[used], *survey)
+    n, tag = np.nonzero(p > POSSIBLE)
+    rows = used[n]
+    return _Looks(p[n, tag], hits[rows, tag].astype(float), antenna[rows], tag, block[rows], distance[n, tag])
 
 
 def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Reliability | None:
@@ -371,18 +345,12 @@ def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> 
 
 
 def _overdispersion(looks: _Looks, band: Integers) -> float:
-    """How many rounds are worth an independent one, at least 1: by the scatter of each tag's reads by each antenna in blocks of
-    time, about the share of the predicted reads that the band has."""
+    """:func:`.overdispersion` about the share of the predicted reads that the band has."""
     share = np.ones(int(band.max(initial=0)) + 1)
     predicted, observed = np.bincount(band, looks.p), np.bincount(band, looks.hit)
     np.divide(observed, predicted, out=share, where=predicted > 0.0)
     p = np.clip(looks.p * share[band], 0.0, 1.0 - 1e-3)
-    key = (looks.block * (looks.tag.max(initial=0) + 1) + looks.tag) * (
-        looks.antenna.max(initial=0) + 1
-    ) + looks.antenna
-    cell = np.unique(key, return_inverse=True)[1]
-    excess, variance = np.bincount(cell, looks.hit - p), np.bincount(cell, p * (1.0 - p))
-    return max(1.0, float(np.sum(excess**2)) / max(float(np.sum(variance)), 1e-9))
+    return overdispersion(looks.hit, np.ones(len(p)), p, looks.antenna, looks.tag, looks.block)[0]
 
 
 def draw(log: Log) -> Marks:

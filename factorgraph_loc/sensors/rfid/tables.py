@@ -196,8 +196,7 @@ def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers
 
 def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
     """The columns of both tables, in the order of the rounds; a round lasts from its first read to its end."""
-    number = _numbered(stream)
-    _, first = np.unique(number, return_index=True)
+    number, first = stream.number, stream.first_rows
     end_ns = np.rint(stream.t * 1e9).astype(np.int64) + t0_ns
     age_ns = np.rint(stream.age * 1e9).astype(np.int64)
     order = np.argsort(number, kind="stable")
@@ -220,11 +219,3 @@ def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
             "duration": duration_ns / 1e9,
         },
     )
-
-
-def _numbered(stream: RfidStream) -> Integers:
-    """The number (N,) of each row's round among all rounds, in order."""
-    scan = np.cumsum(np.diff(stream.t, prepend=np.nan) != 0.0).tolist()
-    numbers: dict[tuple[int, int], int] = {}
-    keys = zip(scan, stream.round.tolist(), strict=True)
-    return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)

@@ -30,7 +30,7 @@ from factorgraph_loc.sensors.rfid.calibration.pairs import (
 )
 from factorgraph_loc.sensors.rfid.calibration.parametric import STEP, SURVEY, family_of, fit_model, place, places_of
 from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
-from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, cells, rounds_of
+from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, overdispersion, rounds_of
 from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
 from factorgraph_loc.sensors.rfid.settings import (
     BeamSettings,
@@ -104,7 +104,7 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
     settings = _with_models(settings, models, which, grids, floor)
     settings = _with_signals(logs, settings, survey, focused=phase is not None)
     single = [rounds_of(log, settings, merged=False) for log in logs]
-    excess, _ = bursts(pairs, modelled(models, which, pairs), floor)
+    excess, _ = _bursts(pairs, modelled(models, which, pairs), floor)
     share = min(pose_share(single, settings, survey, models, which, floor), 1.0 / excess)
     rows = [{"model": tried.label(), "held_out_nll": nll, "best": tried == kind} for tried, nll in scores.items()]
     figures = {"independent_share": share, "models": rows}
@@ -139,7 +139,7 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
             constants += fitted[1]
             models[name] = written(fitted[0], name, grids).model_copy(update={"prior": _prior(traced, labels)})
     fits = [models[name].model() for name in names]
-    excess, error = bursts(pairs, modelled(fits, [names.index(model) for model in of_antenna], pairs), floor)
+    excess, error = _bursts(pairs, modelled(fits, [names.index(model) for model in of_antenna], pairs), floor)
     known = initial.tempering
     tempering = 1.0 / excess if excess > BURSTS and excess * known > 1.0 else known
     constants.append(FittedConstant("rfid", "tempering", known, tempering, max(error / excess**2, 1e-4)))
@@ -228,21 +228,9 @@ def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
     )
 
 
-def bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
-    """The number of rounds with the information of an independent one, at least 1, and its standard error: by the scatter of each
-    tag's reads by each antenna in blocks of time. ``logit`` (M,): of the model.
-
-    Unlike the gradient by the pose, this scatter hardly depends on trajectories that were estimated from the same reads. It is a
-    ratio of variances (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
-    """
-    p = floor.probability(logit)
-    first, cell = cells(np.column_stack((pairs.block, pairs.tag, pairs.antenna)), (1.0, 1.0, 1.0))
-    excess, variance = np.bincount(cell, pairs.hits - pairs.count * p), np.bincount(cell, pairs.count * p * (1.0 - p))
-    observed, expected = by_block(np.column_stack((excess**2, variance)), pairs.block[first]).T
-    total = max(float(expected.sum()), 1e-9)
-    ratio = float(observed.sum()) / total
-    error = float(np.sqrt(np.sum((observed - ratio * expected) ** 2))) / total
-    return max(1.0, ratio), error
+def _bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
+    """:func:`.overdispersion` of pairs with these logits (M,)."""
+    return overdispersion(pairs.hits, pairs.count, floor.probability(logit), pairs.antenna, pairs.tag, pairs.block)
 
 
 def pose_share(

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.posterior import by_block
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.settings import RfidSettings
+from factorgraph_loc.sensors.rfid.known_tags import tag_map
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factorgraph_loc.text import listed
@@ -59,10 +60,8 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     stream = log.streams["rfid"]
     assert isinstance(stream, RfidStream)
     assert log.reference is not None
-    keys = np.rec.fromarrays((stream.t, stream.round))
-    first, inverse = np.unique(keys, return_index=True, return_inverse=True)[1:]
-    read = np.array([bool(epc) for epc in stream.epc], dtype=bool)
-    t = stream.t[first] + log.rig.time_offset("rfid") - _middle(stream.age, inverse, read, len(first))
+    first, read = stream.first_rows, np.array([bool(epc) for epc in stream.epc], dtype=bool)
+    t = stream.t[first] + log.rig.time_offset("rfid") - _middle(stream.age, stream.number, read, len(first))
     antennas = {name: i for i, name in enumerate(settings.all_antennas())}
     antenna = np.array([antennas.get(stream.antenna[i], -1) for i in first], dtype=np.int64)
     if np.all(antenna < 0):
@@ -70,27 +69,18 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
             f"{log.name}: its antennas are {listed(dict.fromkeys(stream.antenna))}, those of the rig {listed(antennas)}: "
             "give them the same names in [rfid.antennas]"
         )
-    epcs = set(stream.epc)
-    names = tuple(name for name in log.world.tags if name in epcs)
-    index = {name: i for i, name in enumerate(names)}
-    hits = np.zeros((len(first), len(names)))
-    columns = np.array([index.get(epc, -1) for epc in stream.epc], dtype=np.int64)
-    known = columns >= 0
-    hits[inverse[known], columns[known]] = 1.0
+    tags = tag_map(log.world, SurveySettings(), set(stream.epc))
     order = np.argsort(t, kind="stable")
     poses = log.reference.at(t[order], max_gap=REFERENCE_GAP)
     good = np.isfinite(poses[:, 0]) & (antenna[order] >= 0)
     order, poses = order[good], poses[good]
-    if len(order) < MIN_ROUNDS or len(names) < 2:
+    if len(order) < MIN_ROUNDS or len(tags.names) < 2:
         raise InputError(
             f"{log.name}: has {len(order)} inventory rounds of the rig's antennas within the reference, where "
-            f"{len(names)} tags of the map were read, expected {MIN_ROUNDS} rounds and 2 tags or more"
+            f"{len(tags.names)} tags of the map were read, expected {MIN_ROUNDS} rounds and 2 tags or more"
         )
-    tags = [log.world.tags[name] for name in names]
-    points = np.array([(tag.x, tag.y, tag.z) for tag in tags])
-    facing = np.array([np.nan if tag.facing is None else tag.facing for tag in tags])
-    count = np.ones(len(order))
-    rounds = Rounds(log.name, t[order], poses, antenna[order], count, hits[order], TagArray(points, facing), names)
+    count, hits = np.ones(len(order)), stream.hits(tags.index)[order].astype(float)
+    rounds = Rounds(log.name, t[order], poses, antenna[order], count, hits, tags.tags, tags.names)
     return _merged(rounds) if merged else rounds
 
 
@@ -113,6 +103,24 @@ def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integ
     flat = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1))
     _, first, cell = np.unique(flat, return_index=True, return_inverse=True)
     return first, cell
+
+
+def overdispersion(
+    hits: Array, count: Array, p: Array, antenna: Integers, tag: Integers, block: Integers
+) -> tuple[float, float]:
+    """The number of rounds with the information of an independent one, at least 1, and its standard error: by the scatter of each
+    tag's reads by each antenna in blocks of time, ``hits`` (M,) of ``count`` rounds with the probability ``p``.
+
+    Unlike the gradient by the pose, this scatter hardly depends on trajectories that were estimated from the same reads. It is a
+    ratio of variances (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
+    """
+    first, cell = cells(np.column_stack((block, tag, antenna)), (1.0, 1.0, 1.0))
+    excess, variance = np.bincount(cell, hits - count * p), np.bincount(cell, count * p * (1.0 - p))
+    observed, expected = by_block(np.column_stack((excess**2, variance)), block[first]).T
+    total = max(float(expected.sum()), 1e-9)
+    ratio = float(observed.sum()) / total
+    error = float(np.sqrt(np.sum((observed - ratio * expected) ** 2))) / total
+    return max(1.0, ratio), error
 
 
 def _merged(rounds: Rounds) -> Rounds:
