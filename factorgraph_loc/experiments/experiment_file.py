@@ -181,7 +181,8 @@ class ReportSettings(FileModel):
 
 
 class Limits(FileModel):
-    """Limits of one run: ``memory`` [10^6 bytes] of its process, by default its share of the machine's; ``time`` [s]."""
+    """Limits of one run: ``memory`` [10^6 bytes] of its process, and ``time`` [s]. By default ``memory`` is 90 % of the machine's
+    memory, divided by the number of processes."""
 
     memory: Annotated[float, Field(gt=0.0)] | None = None
     time: Annotated[float, Field(gt=0.0)] = 3600.0

@@ -171,9 +171,10 @@ def corrected(
 ) -> Steps[Corrected]:
     """Progressive correction (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4).
 
-    The log-likelihood (N,) of a measurement at ``t`` is applied in shares, each as large as leaves ``enough`` effective
-    particles, with resampling after each; after the last one only below the effective size ``below``, relative to N.
-    ``left``: the share to apply. Without ``to_end`` it stops before the last share. RunFailedError if no particle is possible.
+    The log-likelihood (N,) of a measurement at ``t`` is applied in shares. Each is the largest that keeps ``enough`` effective
+    particles. They are resampled after each share, after the last one only if fewer than ``below`` times N are effective.
+    ``left``: the part of the log-likelihood to apply. Without ``to_end`` the last share is not applied. RunFailedError if no
+    particle is possible.
     """
     evidence = 0.0
     while left > 0.0:

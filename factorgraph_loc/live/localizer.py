@@ -208,7 +208,9 @@ class Localizer:
             if isinstance(error, RunFailedError):
                 self._failure = error
             else:
-                self._failure = RunFailedError(f"{self._name}: lost by {type(error).__name__}; call initialize() again")
+                self._failure = RunFailedError(
+                    f"{self._name}: unusable after {type(error).__name__}; call initialize() again"
+                )
             raise
         if self._newest >= self._tidied + TIDY_INTERVAL:
             self._tidy(estimator)

@@ -122,7 +122,7 @@ def _along_reference(
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
     """Learnt tags by index; facings (T,); the search result of each tag; and the poses (K, 3) of the antenna observations."""
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference, expected one, or that the poses come from odometry")
+        raise InputError(f"{log.name}: has no reference, expected a reference or poses from odometry")
     if not log.reference.has_heading:
         raise InputError(f"{log.name}: its reference has no headings, expected poses from odometry")
     at = log.reference.at(observations.t, max_gap=MAX_GAP)

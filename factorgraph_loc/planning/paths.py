@@ -73,9 +73,9 @@ def straight(turn: float, length: float) -> Path:
 
 
 def primitives(length: float) -> list[Path]:
-    """Arcs and straight paths of ``length`` [m]: for each of :data:`DIRECTIONS`, after a turn in place, straight, gently curved,
-    and straight of half the length; sharper curves ahead. Raises InputError if the length is not positive.
-    """
+    """Paths that begin with a turn in place, one set for each of :data:`DIRECTIONS` directions. A set has a straight path and two
+    gentle arcs of ``length`` [m], and a straight path of half the length. Ahead there are also two sharper arcs. Raises
+    InputError if the length is not positive."""
     if not (math.isfinite(length) and length > 0.0):
         raise InputError(f"horizon is {length:g} m, expected a length above 0")
     out = []

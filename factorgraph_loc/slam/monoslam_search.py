@@ -18,7 +18,7 @@ FEWEST = 3  # matches that must agree
 
 
 def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
-    """Which of the ``residual`` (K, 2) [px], measured minus predicted, are inliers; all if fewer than :data:`FEWEST`."""
+    """Which of K matches are inliers; all if K is below :data:`FEWEST`. ``residual`` (K, 2) [px]: measured minus predicted."""
     count = len(residual)
     right = np.ones(count, dtype=bool)
     if count < FEWEST:

@@ -86,8 +86,8 @@ class OdometryChain:
         return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
-        """A row with the motion from the previous row until ``t``, in the robot frame at the previous row. A row with an equal
-        timestamp continues the previous one."""
+        """Add the motion from the previous row until ``t``, in the robot frame at the previous row. If there is already a motion
+        until ``t``, this one is appended to it. False if the rows of that time are forgotten."""
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
             last -= 1

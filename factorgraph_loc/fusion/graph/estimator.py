@@ -139,7 +139,7 @@ class Smoother(Timeline):
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
     def forget(self, until: float) -> None:
-        """Forget the trajectory until this time that has left the window. Without a set ``lag`` all is kept."""
+        """Forget the trajectory until this time, except for the part inside the window. Without a ``lag`` all is kept."""
         if isinstance(self._backend, Incremental):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 

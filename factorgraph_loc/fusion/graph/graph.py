@@ -180,7 +180,8 @@ class Mapper:
         return ()
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        """All points that ever were in the graph. ``values`` and ``covariances``: of the points and of the poses of keyframes."""
+        """The points that were ever in the graph and are not forgotten; None without any. ``values`` and ``covariances``, by key:
+        those of the points and of the poses of keyframes."""
         return None
 
 

@@ -153,7 +153,7 @@ class Builder:
         return [self._graph.node(self._graph.newest, term, self._gatherer.name) for term in terms]
 
     def clear(self) -> None:
-        """A new track begins: nothing waits."""
+        """Discard the observations that wait, as a new track begins."""
         self._waiting = []
 
     def _gather_from(

@@ -307,7 +307,7 @@ class LinearFactors:
 
     @property
     def slots(self) -> frozenset[int]:
-        """Where they are in the solver."""
+        """The slots of these factors in the solver."""
         return frozenset(self._slots)
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:

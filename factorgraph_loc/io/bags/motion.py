@@ -211,5 +211,5 @@ def _wheel(bag: Bag, topic: str, path: str) -> TopicRows:
     known = bag.topic(topic)
     check_path(bag.store(topic), known, path, f"{bag.path}: topic {topic}: wheel")
     if LIST in path:
-        raise InputError(f"{source}: odometry.wheels has {quoted(path)}, expected the field of one number")
+        raise InputError(f"{source}: odometry.wheels has the list {quoted(path)}, expected a field with one number")
     return TopicRows(source, 1, (path,))

@@ -164,8 +164,8 @@ APART = 0.5  # least reported difference of the vertical parts of the optical ax
 
 
 def mounting_problems(log: Log) -> list[str]:
-    """A line if the images turn with the robot in another way than the mounting in the rig explains; none without a reference
-    with headings, without a camera in the rig, or with too few usable images."""
+    """One line if the rotation of the images contradicts the mounting of the camera in the rig, else none. The check needs a
+    camera in the rig, a reference with headings, and enough usable images; otherwise there is no line."""
     stream, camera = log.streams.get("camera"), log.rig.find(CameraSettings)
     if not isinstance(stream, ImageStream) or camera is None or log.reference is None or not log.reference.has_heading:
         return []

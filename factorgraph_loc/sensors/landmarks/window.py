@@ -146,9 +146,9 @@ class SightingWindow:
         return optima.states, np.asarray(np.linalg.inv(optima.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """A hypothesis (3,) after Gauss-Newton with correlated odometry errors, and its body-frame covariance (3, 3). The path is
-        marginalised: with its covariance C and whitened Jacobians J by it, residuals e have the covariance R = 1 + J C J', and
-        those along the most likely path are R^-1 e."""
+        """The pose (3,) of a hypothesis after Gauss-Newton with correlated odometry errors, and its body-frame covariance (3, 3).
+        The path since the sightings is marginalised. Whitened residuals e have the covariance R = 1 + J C J'. C is the covariance
+        of the path, and J is the whitened Jacobian by it. On the most likely path the residuals are R^-1 e."""
         covariances = self._covariance
         if self._start is not None:  # the first row, which has no robust loss
             covariances = np.concatenate((self._start.whitened(pose, self.now)[2][None], covariances))
