@@ -12,7 +12,7 @@ from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
-from factorgraph_loc.exports.trajectories import write_g2o, write_trajectory
+from factorgraph_loc.exports.trajectories import write_trajectory
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.files.temporary import require_free
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
@@ -25,7 +25,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import listed, quoted
 
 TrajectoryLike = Trajectory | PosePath | str | Path
-FORMATS = (".mcap", ".tum", ".kitti", ".g2o", ".ply")
+FORMATS = (".mcap", ".tum", ".kitti", ".ply")
 L = TypeVar("L", bound=LogLike)
 
 
@@ -58,7 +58,7 @@ def export(
     """Write runs for Foxglove and RViz, or the final trajectory of a run, the reference of a log or the points of its map for other
     programs; return the files.
 
-    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti, .g2o or .ply.
+    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti or .ply.
     """
     require_format(Path(out))
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
@@ -128,10 +128,6 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
         if log.world.points is None:
             raise InputError(f"{log.name}: its map has no points to write, expected one with points (--world)")
         write_ply(log.world.points, out)
-    elif out.suffix == ".g2o":
-        run = _only(runs, out)
-        sensors = run.folder.sensors or log.rig.sensors
-        write_g2o(log, run.final, sensors, out, run.landmarks)
     else:
         return write_trajectory(_trajectory(log, runs, out), out, log.t0_ns)
     return [out]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,6 +30,7 @@ from factorgraph_loc.model.scoring import KINDS, parse_seeds
 from factorgraph_loc.text import number
 
 if TYPE_CHECKING:
+    from factorgraph_loc.fitting.posterior import FittedConstant
     from factorgraph_loc.model.result import RunResult
 
 SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the others are in the files
@@ -97,11 +98,7 @@ def run(
     _print_further(scores, rpe=options.rpe)
     _print_consistency(scores)
     _print_learnt(result)
-    if outcome.learnt:
-        from factorgraph_loc.calibration.report import constants_table
-
-        show.line("learnt from the log; only the final trajectory uses these:")
-        show.table(*constants_table(outcome.learnt))
+    _print_rig(outcome.learnt)
     _print_events(result)
     _print_effort(scores)
     show.line()
@@ -171,6 +168,14 @@ def compare(
         )
     if comparison.failures:
         raise typer.Exit(1)
+
+
+def _print_rig(learnt: Sequence[FittedConstant]) -> None:
+    if learnt:
+        from factorgraph_loc.calibration.report import constants_table
+
+        show.line("learnt from the log; only the final trajectory uses these:")
+        show.table(*constants_table(learnt))
 
 
 def _print_accuracy(scores: Mapping[str, Any]) -> None:

@@ -69,7 +69,7 @@ def export(
             "--out",
             "-o",
             metavar="FILE",
-            help="The file to write; its suffix selects the format: .mcap (Foxglove, RViz), .tum, .kitti, .g2o or .ply (maps).",
+            help="The file to write; its suffix selects the format: .mcap (Foxglove, RViz), .tum, .kitti or .ply (maps).",
         ),
     ],
     *,

@@ -1,3 +1,3 @@
-"""Results for other programs: viewers (Rerun, Foxglove, RViz), trajectories (TUM, KITTI) and pose graphs (g2o)."""
+"""Results for other programs: viewers (Rerun, Foxglove, RViz) and trajectories (TUM, KITTI)."""
 
 __all__ = ["rerun_scene", "rerun_viewer", "ros", "runs", "trajectories"]

@@ -3,7 +3,6 @@
 import json
 import sys
 
-import gtsam
 import numpy as np
 import polars as pl
 import pytest
@@ -52,12 +51,6 @@ def test_the_reference_of_a_log(fgloc, short_log, tmp_path):
     assert np.allclose(read_tum(tmp_path / "truth.tum", log.t0_ns).poses[:, :2], log.reference.poses[:, :2], atol=1e-8)
 
 
-def test_a_pose_graph(fgloc, short_log, ekf, tmp_path):
-    assert fgloc("export", ekf, short_log, "-o", tmp_path / "ekf.g2o").exit_code == 0
-    factors, values = gtsam.readG2o(str(tmp_path / "ekf.g2o"), False)
-    assert factors.size() == values.size() - 1 == len(read_tum(ekf / "final.tum").t) - 1
-
-
 def test_all_runs_for_foxglove_and_rviz(fgloc, short_log, comparison, tmp_path):
     assert fgloc("export", comparison, short_log, "-o", tmp_path / "short.mcap").exit_code == 0
     assert (tmp_path / "short.mcap").read_bytes()[:5] == b"\x89MCAP"
@@ -67,7 +60,7 @@ def test_bad_input(refused, short_log, comparison, ekf, tmp_path):
     assert "has the suffix '.csv', expected one of" in refused("export", ekf, short_log, "-o", "a.csv")
     several = refused("export", comparison, short_log, "-o", tmp_path / "a.tum")
     assert "there are 2 (dead_reckoning, ekf)" in several
-    assert "there is none" in refused("export", short_log, "-o", tmp_path / "a.g2o")
+    assert "there is none" in refused("export", short_log, "-o", tmp_path / "a.kitti")
     bare = tmp_path / "bare"
     bare.mkdir()
     for file in short_log.iterdir():
