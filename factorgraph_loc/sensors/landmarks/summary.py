@@ -8,9 +8,8 @@ are also compared with the predictions from the reference at various time shifts
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -36,7 +35,6 @@ from factorgraph_loc.sensors.interfaces import (
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream
 from factors import se2
 from factors.landmarks import model as bearing_range
-from factors.landmarks.factor import BearingRangeFactor
 from factors.se2 import Array
 
 MIN_SIGHTINGS = 10  # minimum for a statement about a landmark
@@ -269,28 +267,3 @@ def require_mappable(log: Log) -> None:
         raise InputError(
             f"{log.name}: no sighting has a {lacking}; from a {what} alone a landmark cannot be located, so it cannot be mapped"
         )
-
-
-class LocatedLandmark(NamedTuple):
-    """A ``landmark`` seen at ``t`` [s of the log] at ``point`` (2,) [m] with ``covariance`` (2, 2) [m^2], in the robot frame."""
-
-    t: float
-    landmark: str
-    point: Array
-    covariance: Array
-
-
-def located_landmarks(log: Log, sensors: Collection[str], names: Collection[str]) -> list[LocatedLandmark]:
-    """The landmarks in ``names`` with range and bearing in one measurement; empty if the log's sightings are not among
-    ``sensors``, or its rig lacks the sensor."""
-    stream, settings = log.streams.get("bearing_range"), log.rig.find(BearingRangeSettings)
-    if "bearing_range" not in sensors or not isinstance(stream, BearingRangeStream) or settings is None:
-        return []
-    model = settings.model()
-    whole = np.flatnonzero(np.isfinite(stream.range) & np.isfinite(stream.bearing))
-    rows = [i for i in whole.tolist() if stream.landmark[i] in names]
-    t = (stream.t[rows] + log.rig.time_offset("bearing_range")).tolist()
-    measured = zip(stream.range[rows], stream.bearing[rows], strict=True)
-    factors = [BearingRangeFactor(model, np.zeros((1, 2)), np.array([r]), np.array([b])) for r, b in measured]
-    points = [(point, covariance) for point, _, covariance in (factor.locate([np.zeros(3)]) for factor in factors)]
-    return [LocatedLandmark(t[k], stream.landmark[i], *points[k]) for k, i in enumerate(rows)]

@@ -4,12 +4,11 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from factorgraph_loc import BearingRange, BearingRangeStream, Log, Rig, World
+from factorgraph_loc import BearingRange, Rig, World
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding
 from factorgraph_loc.sensors.landmarks.sensor import bind
-from factorgraph_loc.sensors.landmarks.summary import located_landmarks
 from factorgraph_loc.sensors.motion import Motion
 
 
@@ -36,15 +35,3 @@ def test_a_track_that_others_confirm_is_no_longer_in_doubt():
     assert sensor.suspicious_since is not None
     sensor.accept()
     assert sensor.suspicious_since is None
-
-
-def test_a_landmark_seen_once_has_a_place_and_a_covariance():
-    """In polar coordinates both are known: the distance errs along the ray, the bearing across it."""
-    seen = BearingRangeStream(np.array((1.0, 2.0)), ["a", "b"], np.array((4.0, np.nan)), np.array((0.5, 0.2)))
-    rig = Rig(bearing_range={"range_sigma": 0.1, "bearing_sigma": 0.02, "x": 0.3})
-    log = Log("one", rig, World(), {"bearing_range": seen}, None)
-    (found,) = located_landmarks(log, ("bearing_range",), ("a", "b"))
-    ray = np.array(((np.cos(0.5), -np.sin(0.5)), (np.sin(0.5), np.cos(0.5))))
-    np.testing.assert_allclose(found.point, 4.0 * ray[:, 0] + (0.3, 0.0))
-    np.testing.assert_allclose(found.covariance, ray @ np.diag((0.1, 4.0 * 0.02)) ** 2 @ ray.T, rtol=1e-4)
-    assert (found.t, found.landmark) == (1.0, "a")
