@@ -110,10 +110,12 @@ def test_usual_names_of_fields(paths, expected):
 def test_ranges_of_radios_by_the_names_of_fields(proposal, tmp_path):
     def fill(made):
         kind = "uwb/msg/Range"
-        made.store.register(get_types_from_msg("std_msgs/Header header\nuint16 anchor_id\nfloat32 distance\n", kind))
+        made.store.register(
+            get_types_from_msg("std_msgs/Header header\nuint16 anchor_id\nuint16 tag_id\nfloat32 distance\n", kind)
+        )
         for i in range(3):
             made.odometry("/odom", T0 + i * 10**8, (0.1 * i, 0.0, 0.0))
-            made.write("/uwb", T0, kind, header=made.header(T0 + i * 10**8), anchor_id=7, distance=2.0 + i)
+            made.write("/uwb", T0, kind, header=made.header(T0 + i * 10**8), anchor_id=7, tag_id=1, distance=2.0 + i)
 
     found, manifest, text = proposal(fill)
     fields = {"landmark": "anchor_id", "range": "distance"}

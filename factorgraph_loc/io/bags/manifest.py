@@ -227,7 +227,8 @@ def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, l
 
 def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     """The topic with a field for the EPC, and most other fields of a read."""
-    candidates = [(topic, fields) for topic, paths in custom if "epc" in (fields := read_fields(paths))]
+    reads = [(topic, read_fields(paths)) for topic, paths in custom if not range_fields(paths)]
+    candidates = [(topic, fields) for topic, fields in reads if "epc" in fields]
     if not candidates:
         return
     topic, fields = max(candidates, key=lambda entry: len(entry[1]))
