@@ -16,12 +16,11 @@ from factorgraph_loc.io.bags.manifest import manifest_of_bag
 from factorgraph_loc.io.folder_manifest import manifest_of_folder
 from factorgraph_loc.io.native.native import require_new, write_native
 from factorgraph_loc.io.proposals import Proposal
-from factorgraph_loc.io.readers import Dataset, LogLike, RigLike, WorldLike, describe, load_all, read_log
+from factorgraph_loc.io.readers import Dataset, LogLike, RigLike, WorldLike, describe, read_log
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import RunConfig
 from factorgraph_loc.sensors.registry import moving
-from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
-from factorgraph_loc.simulation import SimulationSettings, named_settings, recorded_looks, with_images
+from factorgraph_loc.simulation import SimulationSettings, named_settings, with_images
 from factorgraph_loc.simulation import simulate as make_log
 
 
@@ -81,7 +80,6 @@ def simulate(
     seed: int = 0,
     *,
     changes: Mapping[str, Any] | None = None,
-    recorded: RecordedLooks | LogLike | Sequence[LogLike] | None = None,
     images: bool = False,
     out: str | Path | None = None,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
@@ -89,17 +87,14 @@ def simulate(
     """Simulate a log with known ground truth. The same seed gives the same bytes.
 
     ``what``: a preset, a TOML file, or settings. ``changes``: nested tables, such as ``{"drive": {"duration": 60.0}}``.
-    ``recorded``: logs whose RFID reads are resampled, or the reads extracted from them. ``out``: a new folder for the log in the
-    native format; required with ``images``, which are rendered into it.
+    ``out``: a new folder for the log in the native format; required with ``images``, which are rendered into it.
     """
     if isinstance(what, SimulationSettings) and changes:
         raise InputError("changes apply to a preset or a file, but settings are given")
     settings = what if isinstance(what, SimulationSettings) else named_settings(str(what), changes)
     if images and out is None:
         raise InputError("images need out, a folder to write the log to")
-    if recorded is not None and not isinstance(recorded, RecordedLooks):
-        recorded = recorded_looks(load_all(recorded))
-    log = make_log(settings, seed, recorded)
+    log = make_log(settings, seed)
     if out is None:
         return log
     folder = Path(out)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from factorgraph_loc.cli import completion, show
-from factorgraph_loc.cli.options import DataRoot, Json, LogOptions, nested_changes, takes_options
+from factorgraph_loc.cli.options import Json, nested_changes, takes_options
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.scoring import parse_seeds
 from factorgraph_loc.plugins import PRESETS
@@ -66,16 +66,7 @@ def simulate(
     ] = None,
     *,
     options: ChangeOptions,
-    recorded: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LOG",
-            help="Resample the reads from this recording, with its antennas (semi-real).",
-            autocompletion=completion.logs,
-        ),
-    ] = None,
     images: Annotated[bool, typer.Option("--images", help="Also render camera images.")] = False,
-    data_root: DataRoot = None,
     json: Json = False,
 ) -> None:
     """Simulate logs with known ground truth: a world, a drive, and the measurements of odometry, RFID antennas and camera.
@@ -85,20 +76,17 @@ def simulate(
     chosen = [seed] if seeds is None else list(parse_seeds(seeds))
     from factorgraph_loc.api import logs
     from factorgraph_loc.files.models import file_name
-    from factorgraph_loc.simulation import named_settings, recorded_looks
+    from factorgraph_loc.simulation import named_settings
 
     changes = options.changes()
     if "images" in changes and not images:
         raise InputError("--image-rate and --set images.KEY configure images, expected --images with them")
     settings = named_settings(what, changes)
-    observations = None
-    if recorded is not None:
-        observations = recorded_looks(LogOptions(data_root=data_root).load([recorded]))
     written = []
     for number in chosen:
         folder = out if seeds is None else out / file_name(f"{settings.name}-{number}")
         with show.progress(folder.name, counted=True) as report:
-            log = logs.simulate(settings, number, recorded=observations, images=images, out=folder, progress=report)
+            log = logs.simulate(settings, number, images=images, out=folder, progress=report)
         for warning in log.warnings:
             show.note(f"warning: {log.name}: {warning}")
         if not json:

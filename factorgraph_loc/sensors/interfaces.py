@@ -142,7 +142,7 @@ class Ride:
     """A drive through a world: the ``truth`` from t = 0, the ``rig`` given to estimators, and the true ``world``.
 
     ``settings``: of the simulation, with the sections of the sensors. ``rng``, ``rng_of_world``: random generators by name, from
-    the seeds of the log and of the world. ``recorded``: recorded reads to resample, or None.
+    the seeds of the log and of the world.
     """
 
     settings: Any
@@ -151,7 +151,6 @@ class Ride:
     truth: Trajectory
     rng: Callable[[str], np.random.Generator]
     rng_of_world: Callable[[str], np.random.Generator]
-    recorded: Any = None
 
     def times(self, rate: float) -> Array:
         """Times (N,) of a sensor with ``rate`` [Hz], starting after one period."""
@@ -160,13 +159,12 @@ class Ride:
 
 @dataclass(frozen=True)
 class Simulated:
-    """The streams of a sensor's channels. ``layers``: of the surveyed world, if it differs from the true one; ``metadata`` and
-    ``warnings`` of the log."""
+    """The streams of a sensor's channels. ``layers``: of the surveyed world, if it differs from the true one; ``metadata`` of
+    the log."""
 
     streams: Mapping[str, Stream] = field(default_factory=dict)
     layers: Mapping[str, Any] = field(default_factory=dict)
     metadata: Mapping[str, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
 
 
 class LiveSensor(Protocol):

@@ -1,6 +1,5 @@
 """Simulated logs: worlds, drives through them, and sensor measurements."""
 
-from factorgraph_loc.sensors.rfid.recorded import recorded_looks
 from factorgraph_loc.simulation.filming import Film, film, with_images
 from factorgraph_loc.simulation.settings import PRESETS, SimulationSettings, named_settings, preset, read_settings
 from factorgraph_loc.simulation.simulate import simulate
@@ -13,7 +12,6 @@ __all__ = [
     "named_settings",
     "preset",
     "read_settings",
-    "recorded_looks",
     "settings",
     "simulate",
     "with_images",

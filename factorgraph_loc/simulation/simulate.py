@@ -20,7 +20,6 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.interfaces import Ride, Simulated
 from factorgraph_loc.sensors.registry import functions
-from factorgraph_loc.sensors.rfid.recorded import RecordedLooks
 from factorgraph_loc.simulation.settings import DriveSettings, SimulationSettings
 from factorgraph_loc.simulation.worlds import make_world
 from factorgraph_loc.version import __version__
@@ -102,20 +101,18 @@ def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
     return Trajectory(np.arange(count + 1) / settings.rate, np.array(poses))
 
 
-def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | None = None) -> Log:
+def simulate(settings: SimulationSettings, seed: int) -> Log:
     """Simulate a log; the same ``settings`` and ``seed`` give the same log to the last bit.
 
     Streams: odometry, rfid, bearing_range if the world has landmarks, sightings if it has points, and those of sensors from
     other packages. The reference is the true trajectory. The stated start is the true pose plus an error drawn from its
-    covariance (:data:`START_SIGMAS`). World, drive and sensors use independent random generators. With ``recorded``, the robot
-    has the antennas of these recordings, and reads are drawn from these (:mod:`.recorded`). Raises InputError if there is no space
-    for the tags or for the robot.
+    covariance (:data:`START_SIGMAS`). World, drive and sensors use independent random generators. Raises InputError if there is no
+    space for the tags or for the robot.
     """
     of_world = seed if settings.world_seed is None else settings.world_seed
-    rig = settings.rig if recorded is None else recorded.carried_by(settings.rig)
     world = make_world(settings.world, generator(of_world, "world"))
     truth = drive(world, settings.drive, generator(seed, "drive"))
-    ride = Ride(settings, rig, world, truth, partial(generator, seed), partial(generator, of_world), recorded)
+    ride = Ride(settings, settings.rig, world, truth, partial(generator, seed), partial(generator, of_world))
     made: list[Simulated] = [function(ride) for _, function in functions("simulate")]
     streams = {name: stream for simulated in made for name, stream in simulated.streams.items()}
     start = truth.poses[0] + START_SIGMAS * generator(seed, "start").standard_normal(3)
@@ -125,12 +122,11 @@ def simulate(settings: SimulationSettings, seed: int, recorded: RecordedLooks | 
         metadata["world_seed"] = str(settings.world_seed)
     return Log(
         name=f"{settings.name}-{seed}",
-        rig=with_sensors(rig, streams),
+        rig=with_sensors(settings.rig, streams),
         world=world.model_copy(update={name: layer for simulated in made for name, layer in simulated.layers.items()}),
         streams=streams,
         reference=truth,
         start=StartPose(0.0, start, START_SIGMAS.copy()),
-        warnings=tuple(warning for simulated in made for warning in simulated.warnings),
         metadata=metadata | {key: value for simulated in made for key, value in simulated.metadata.items()},
     )
 

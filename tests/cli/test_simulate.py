@@ -32,14 +32,6 @@ def test_a_file_of_settings_takes_the_place_of_a_preset(fgloc, tmp_path):
     assert log.span()[1] == 5.0
 
 
-def test_reads_may_come_from_another_log(fgloc, tmp_path):
-    assert fgloc("simulate", "office", "-o", tmp_path / "donor", "--duration", 60).exit_code == 0
-    done = fgloc("simulate", "sparse", "-o", tmp_path / "log", "--duration", 20, "--recorded", tmp_path / "donor")
-    assert done.exit_code == 0, done.stderr
-    (log,) = load(str(tmp_path / "log"))
-    assert "recorded" in log.metadata["reads"]
-
-
 def test_images_are_written_with_the_log(fgloc, tmp_path):
     small = ("--set", "world.width=9", "--set", "world.depth=8")
     options = ("--images", "--image-rate", 2, "--duration", 1, "--world-seed", 5, *small)
@@ -57,7 +49,6 @@ def test_images_are_written_with_the_log(fgloc, tmp_path):
     [
         (("office", "--image-rate", 5), "expected --images with them"),
         (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
-        (("office", "--recorded", "nowhere"), "nowhere: is neither a file"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line(refused, tmp_path, arguments, message):

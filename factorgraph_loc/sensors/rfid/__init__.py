@@ -8,7 +8,6 @@ __all__ = [
     "calibration",
     "known_tags",
     "map",
-    "recorded",
     "settings",
     "stream",
     "tables",

@@ -248,18 +248,13 @@ def phases(
     return np.asarray(np.mod(phase, 2.0 * np.pi))
 
 
-SPARSE = 20  # every n-th pose is used to check the donors
-MOST_UNMATCHED = 0.1  # maximum share of rounds in range without a similar recorded one
-
-
 def simulate(ride: Ride) -> Simulated:
     """The reads of a simulated drive, with all faults."""
-    settings, rfid, recorded, rng = ride.settings, ride.rig.of(RfidSettings), ride.recorded, ride.rng("reads")
+    settings, rfid, rng = ride.settings, ride.rig.of(RfidSettings), ride.rng("reads")
     tags = tag_map(ride.world, ride.rig.of(SurveySettings))
     times = ride.times(settings.rounds_per_second)
     poses = ride.truth.at(times)
-    # recorded outcomes are probabilities of zero and one
-    p = read_probabilities(rfid, tags.tags, poses) if recorded is None else recorded.outcomes(tags.tags, poses, rng)
+    p = read_probabilities(rfid, tags.tags, poses)
     names, epcs = list(rfid.all_antennas()), list(tags.names)
     dead = draw_dead(settings.faults, len(epcs), rng)
     hits = draw_reads(rfid, p, times, settings.faults, dead, rng)
@@ -271,17 +266,12 @@ def simulate(ride: Ride) -> Simulated:
         signals["frequency"] = np.full(hits.shape, settings.phase.frequency)
     stream = rfid_stream(names, epcs, times, hits, settings.faults, signals)
     surveyed, misplaced = _surveyed(ride.world.tags, settings.faults, ride.rng_of_world("survey"))
-    metadata, warnings = {}, []
-    if recorded is not None:
-        metadata["reads"] = "resampled from recorded rounds at similar range, bearing, height and facing"
-        share = recorded.unmatched(tags.tags, ride.truth.poses[::SPARSE])
-        if share > MOST_UNMATCHED:
-            warnings.append(f"rfid: {share:.0%} of the rounds in range have no similar recorded one")
+    metadata = {}
     if len(dead):
         metadata["dead"] = ", ".join(epcs[i] for i in sorted(dead.tolist()))
     if misplaced:
         metadata["misplaced"] = ", ".join(misplaced)
-    return Simulated({"rfid": stream}, {"tags": surveyed}, metadata, tuple(warnings))
+    return Simulated({"rfid": stream}, {"tags": surveyed}, metadata)
 
 
 def looks(settings: Any) -> dict[str, float]:
