@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.sensors.rfid.known_tags import tag_map
+from factorgraph_loc.sensors.rfid.known_tags import tag_map, whole_scans
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factorgraph_loc.text import listed
@@ -49,7 +49,7 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
 
     Raises InputError if the log has no reads, or none by an antenna of its rig.
     """
-    scans = [m for m in log.measurements(("rfid",)) if isinstance(m, RfidScan)]
+    scans = whole_scans(log)
     read_tags = {epc for scan in scans for epc in scan.tags}
     if not read_tags:
         raise InputError(f"{log.name}: has no reads of tags (rfid), so that there is nothing to map")

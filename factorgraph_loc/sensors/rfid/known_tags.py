@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
@@ -84,6 +85,11 @@ def extent(world: World, tags: TagArray) -> Array:
     if not len(points):
         return np.zeros((2, 2))
     return np.array((points.min(axis=0) - margin, points.max(axis=0) + margin))
+
+
+def whole_scans(log: Log) -> list[RfidScan]:
+    """All RFID scans in order of arrival; empty without a reader."""
+    return [m for m in log.measurements(("rfid",)) if isinstance(m, RfidScan)]
 
 
 @dataclass(frozen=True, eq=False)
