@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,16 +19,10 @@ class DeadReckoningSettings(FilterSettings):
     """Settings of dead reckoning, which has none of its own."""
 
 
-@dataclass(frozen=True)
-class _PoseState:
+class _PoseRecord(NamedTuple):
+    t: float
     pose: Array
     covariance: Array  # body frame
-
-
-@dataclass(frozen=True)
-class _PoseRecord:
-    t: float
-    state: _PoseState
 
 
 class DeadReckoning(Filter):
@@ -36,7 +30,7 @@ class DeadReckoning(Filter):
 
     modalities = frozenset[str]()
     smoothed = False
-    _state: _PoseState
+    _state: tuple[Array, Array]  # pose (3,), and its body-frame covariance (3, 3)
 
     def trajectory(self) -> Trajectory:
         """The same as the causal estimates: there is nothing to smooth."""
@@ -44,22 +38,23 @@ class DeadReckoning(Filter):
         return at_ticks(
             self._ticks,
             np.array([r.t for r in records]),
-            np.array([r.state.pose for r in records]),
-            np.array([r.state.covariance for r in records]),
+            np.array([r.pose for r in records]),
+            np.array([r.covariance for r in records]),
         )
 
-    def _start(self, prior: PosePrior) -> _PoseState:
-        return _PoseState(np.array(prior.pose, dtype=float), se2.world_to_body(prior.pose, prior.covariance))
+    def _start(self, prior: PosePrior) -> tuple[Array, Array]:
+        return np.array(prior.pose, dtype=float), se2.world_to_body(prior.pose, prior.covariance)
 
     def _predict(self, t: float) -> None:
-        s, increment = self._state, self._travelled(t)
-        self._state = _PoseState(se2.compose(s.pose, increment.delta), propagate(s.covariance, increment))
+        pose, covariance = self._state
+        self._odometry, increment = self._motion.travelled(self._odometry, t)
+        self._state = se2.compose(pose, increment.delta), propagate(covariance, increment)
 
     def _see(self, m: Measurement) -> None:
         raise AssertionError("dead reckoning has no sensor but odometry")
 
     def _estimate(self) -> PoseEstimate:
-        return world_estimate(self._t, self._state.pose, self._state.covariance)
+        return world_estimate(self._t, *self._state)
 
     def _record(self) -> _PoseRecord:
-        return _PoseRecord(self._t, self._state)
+        return _PoseRecord(self._t, *self._state)

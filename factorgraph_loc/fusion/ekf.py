@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, learnt_from
 from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracked, Tracking, is_doubted, laplace_evidence
-from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
+from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
@@ -172,18 +172,8 @@ class Ekf(Filter):
         """The constants and landmarks that are estimated."""
         if self._state is None:
             return Learnt()
-        values = {}
-        blocks, s = self._state.layout.values(self._state.rest), self._state
-        for name, constants in self._blocks:
-            if constants.names:
-                part = s.layout.columns[name]
-                sigmas = np.sqrt(np.diag(s.covariance[part, part]))
-                prefix = "" if name == MOTION else f"{name}."
-                for label, value, sigma in zip(constants.names, blocks.pop(name), sigmas, strict=True):
-                    values[prefix + label] = float(value), float(sigma)
-        columns = s.layout.columns
-        landmarks = ((name, at, s.covariance[columns[name], columns[name]]) for name, at in blocks.items())
-        return Learnt(values, learnt_landmarks(landmarks))
+        values, view = self._state.layout.values(self._state.rest), _View(self)
+        return learnt_from(dict(self._blocks), ((name, mean, view.spread(name)) for name, mean in values.items()))
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""

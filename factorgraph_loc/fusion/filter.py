@@ -21,7 +21,7 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
-from factors.motion import ChainState, Increment
+from factors.motion import ChainState
 from factors.se2 import Array
 
 
@@ -58,7 +58,6 @@ class Filter(Timeline):
         motion = Motion(setup.rig, setup.sensors, diagnostics, self_calibration=calibrates)
         super().__init__(motion, diagnostics, settings.max_delay)
         self._smooth = settings.smooth
-        self._rng: np.random.Generator | None = None  # of a filter whose predictions draw
         self._state: Any = None
         # the last requested prediction and its initial state: the next tick can continue from it
         self._ahead: tuple[Any, Filter] | None = None
@@ -143,7 +142,6 @@ class Filter(Timeline):
         self._ahead = None
         ahead = object.__new__(type(self))  # as copy.copy does, in a third of the time
         vars(ahead).update(vars(self))
-        ahead._rng = None if self._rng is None else twin(self._rng)
         ahead._anchor()
         ahead._move(t)
         self._ahead = self._state, ahead
@@ -160,23 +158,10 @@ class Filter(Timeline):
             return
         known, self._ahead = self._ahead, None
         if known is not None and known[0] is self._state and known[1]._t == t:
-            self._catch_up(known[1])
+            vars(self).update(vars(known[1]))
             return
         self._predict(t)
         self._t = t
-
-    def _travelled(self, t: float) -> Increment:
-        """Advance the odometry to ``t`` and return the motion since its last state."""
-        self._odometry, increment = self._motion.travelled(self._odometry, t)
-        return increment
-
-    def _catch_up(self, ahead: Filter) -> None:
-        """Take over a prediction; the generator stays, as others draw by it too."""
-        rng = self._rng
-        vars(self).update(vars(ahead))
-        self._rng = rng
-        if rng is not None and ahead._rng is not None:
-            rng.bit_generator.state = ahead._rng.bit_generator.state
 
     def _begin(self, m: Measurement) -> None:
         """Start without a prior, at the first measurement that gives a pose, or as the search finds it."""

@@ -1,4 +1,4 @@
-"""Where named blocks stand in the error state of a filter."""
+"""Where named blocks stand in the error state of a filter, and what a run learns about them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
+from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.model.belief import Learnt, LearntPoint
+from factorgraph_loc.model.settings import Estimated
 from factors.se2 import Array
 
 MOTION = "motion"  # the block of the constants of odometry
@@ -39,3 +44,21 @@ class Layout:
     def values(self, rest: Array) -> dict[str, Array]:
         """The blocks of a state by name. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}
+
+
+def learnt_from(
+    constants: Mapping[str, Estimated], blocks: Iterable[tuple[str, Array, Array]], points: PointMap | None = None
+) -> Learnt:
+    """The ``constants`` by sensor and the landmarks ``SENSOR/NAME`` among ``blocks``, each a name, mean and covariance.
+
+    Blocks of points in space are left out; ``points``: those that are not in the map."""
+    values: dict[str, tuple[float, float]] = {}
+    landmarks: dict[str, LearntPoint] = {}
+    for name, mean, covariance in blocks:
+        if name in constants:
+            prefix = "" if name == MOTION else f"{name}."
+            rows = zip(constants[name].names, mean, np.sqrt(np.diag(covariance)), strict=True)
+            values |= {prefix + label: (float(value), float(sigma)) for label, value, sigma in rows}
+        elif len(mean) == 2:
+            landmarks[name.partition("/")[2]] = LearntPoint(mean, covariance)
+    return Learnt(values, landmarks, points)

@@ -36,11 +36,11 @@ from factorgraph_loc.fusion.cloud import (
     vector_moments,
 )
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, twin
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, learnt_from
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.fusion.tracking import LOST, Change, Tracked, Tracking, is_known
-from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status, learnt_landmarks
+from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
@@ -111,17 +111,9 @@ class ParticleFilter(Filter):
         """The constants that are estimated."""
         if self._state is None:
             return Learnt()
-        cloud, values, landmarks = self._state, {}, []
-        labels = {name: constants.names for name, constants in self._blocks}
-        for name, part in cloud.parts.items():
-            mean, covariance = vector_moments(cloud.constants[:, part], cloud.weights)
-            if name not in labels:
-                landmarks.append((name, mean, covariance))
-                continue
-            prefix = "" if name == MOTION else f"{name}."
-            for label, value, sigma in zip(labels[name], mean, np.sqrt(np.diag(covariance)), strict=True):
-                values[prefix + label] = float(value), float(sigma)
-        return Learnt(values, learnt_landmarks(landmarks))
+        cloud = self._state
+        moments = {n: vector_moments(cloud.constants[:, part], cloud.weights) for n, part in cloud.parts.items()}
+        return learnt_from(dict(self._blocks), ((name, *parts) for name, parts in moments.items()))
 
     def trajectory(self) -> Trajectory:
         """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""
@@ -213,7 +205,7 @@ class ParticleFilter(Filter):
             self._state = replace(self._state, odometry=self._odometry)
 
     def _predict(self, t: float) -> None:
-        self._travelled(t)
+        self._odometry, _ = self._motion.travelled(self._odometry, t)
 
     def _moved_on(self, rng: np.random.Generator) -> Cloud:
         """The particles where the robot is now."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -87,13 +87,6 @@ class LearntPoint:
 
     position: Array
     covariance: Array
-
-
-def learnt_landmarks(blocks: Iterable[tuple[str, Array, Array]]) -> dict[str, LearntPoint]:
-    """The landmarks among ``blocks``, each ``SENSOR/NAME`` with its mean and covariance, by name; points in space are none."""
-    return {
-        name.partition("/")[2]: LearntPoint(mean, covariance) for name, mean, covariance in blocks if len(mean) == 2
-    }
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ JPEG = (
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 )
 MOMENT = 0.02  # s before and after, over which the robot's velocity is averaged
-PERIODS = (8.0, 13.0, 29.0)  # s, periods of the brightness variation
+PERIODS, AMPLITUDE = (8.0, 13.0, 29.0), 0.1  # s, of waves of the brightness; relative amplitude of each
 FEW = 40  # images for which starting processes does not pay
 
 
@@ -81,7 +81,7 @@ class Film:
     def _gain(self, t: float) -> float:
         phases = generator(self.seed, "exposure").uniform(0.0, 2.0 * np.pi, len(PERIODS))
         wave = sum(math.sin(2.0 * math.pi * t / period + phase) for period, phase in zip(PERIODS, phases, strict=True))
-        return math.exp(self.renderer.settings.gain_drift * wave)
+        return math.exp(AMPLITUDE * wave)
 
 
 def film(settings: SimulationSettings, seed: int) -> Film:

@@ -87,8 +87,6 @@ class ImageSettings(FileModel):
     """standard deviation of a dark pixel"""
     shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
     """additional variance of a pixel per unit of its value"""
-    gain_drift: Annotated[float, Field(ge=0.0, le=0.5)] = 0.1
-    """relative amplitude of each of three waves of the brightness, of 8 to 29 s"""
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.3
     """relative loss of brightness at the corners"""
 

@@ -170,7 +170,7 @@ class Monoslam(Filter):
         return self._standing(camera, eye, SlamState(nowhere, np.zeros(len(sigmas)), starting(sigmas)))
 
     def _predict(self, t: float) -> None:
-        increment = self._travelled(t)
+        self._odometry, increment = self._motion.travelled(self._odometry, t)
         s, robot, dt = self._settings, self._state.robot, increment.duration
         delta, by_constants = self._motion.changed(increment, self._state.constants)
         step = measured(robot, delta, increment.covariance, by_constants, dt)

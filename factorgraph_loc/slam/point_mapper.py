@@ -31,11 +31,8 @@ class PointMapper(Mapper):
     fewest, horizon, estimates = FEWEST, HORIZON, True
     rejected = "camera: not where it was seen"
 
-    def __init__(
-        self, camera: CameraSensor, model: CameraModel, diagnostics: Diagnostics, settings: GraphSettings
-    ) -> None:
+    def __init__(self, camera: CameraSensor, model: CameraModel, diagnostics: Diagnostics) -> None:
         self._camera, self.sensor = camera, camera.name
-        self._interval = KEYFRAME_INTERVAL if settings.keyframe_interval is None else settings.keyframe_interval
         self._unknown = UnknownPoints(model, diagnostics, camera.constants)
         self.knows_scale = len(camera.points.map) > 0
         self._things = MovingThings(model)
@@ -43,7 +40,7 @@ class PointMapper(Mapper):
         self._tracks: set[Hashable] = set()  # of the last keyframe, without those on things that move
 
     def is_due(self, m: Pixels) -> bool:
-        return m.t - self._taken >= self._interval or self._has_lost_features(m)
+        return m.t - self._taken >= KEYFRAME_INTERVAL or self._has_lost_features(m)
 
     def _has_lost_features(self, m: Pixels) -> bool:
         """Whether an image has little in common with that of the last keyframe."""
@@ -95,4 +92,4 @@ def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: Grap
     camera = next((sensor for sensor in sensors.values() if isinstance(sensor, CameraSensor)), None)
     if camera is None or settings.landmarks == "known":
         return Mapper()
-    return PointMapper(camera, camera.points.model, diagnostics, settings)
+    return PointMapper(camera, camera.points.model, diagnostics)

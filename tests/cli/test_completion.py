@@ -55,7 +55,11 @@ def test_a_shell_completes_words(line, expected):
     ("complete", "word", "expected"),
     [
         ("logs", "mrclam6-robot", ["mrclam6-robot1", "mrclam6-robot3", "mrclam6-robot5"]),
-        ("setting", "smoother.re", ["smoother.relinearize_threshold=", "smoother.relinearize_skip="]),
+        (
+            "setting",
+            "particle_filter.smoothing",
+            ["particle_filter.smoothing_trajectories=", "particle_filter.smoothing_interval="],
+        ),
         ("sensors", "odometry,rfid,r", ["odometry,rfid,rssi"]),
         ("reader", "m", ["mapped", "mrclam"]),
         ("simulation_setting", "world.ta", ["world.tags=", "world.tag_height="]),

@@ -17,6 +17,7 @@ from factors.graph import Factor, PriorFactor, Values, VectorPriorFactor, gather
 from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5
+WIDEST = 8.0  # how many times wider than its own scale a robust loss begins where the problem is solved from a guess
 NARROWED = 0.5  # width of a loss after a step, relative to the width before
 
 
@@ -65,14 +66,14 @@ def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, S
     return problem, min(best, problem.solve(values), key=lambda s: s.cost)
 
 
-def solve_whole(graph: Graph, start: Values, widest: float) -> tuple[Array, Array]:
+def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, Array]:
     """Solve a graph with all its measurements, without sightings that cannot be of their points.
 
     Returned are poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes; the constants are written into the graph.
-    ``widest``: how many times as wide the robust losses begin. RunFailedError where the measurements do not determine a variable.
+    ``is_guess``: whether the robust losses begin wider. RunFailedError where the measurements do not determine a variable.
     """
     graph.drop_astray(graph.keyframes.values(), start)
-    problem, best = best_optimum(graph, start, widest)
+    problem, best = best_optimum(graph, start, WIDEST if is_guess else 1.0)
     if graph.drop_astray(graph.keyframes.values(), best.values):
         problem = whole_problem(graph)
         best = problem.solve(best.values)
@@ -93,8 +94,8 @@ def solve_whole(graph: Graph, start: Values, widest: float) -> tuple[Array, Arra
 class AtTheEnd:
     """A backend that keeps a guess, as an EKF would, and solves the problem at the end."""
 
-    def __init__(self, graph: Graph, widest: float) -> None:
-        self._graph, self._widest = graph, widest
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
         self._guesses: Values = {}  # of all variables but poses
 
     def begin(self, newest: Keyframe) -> None:
@@ -127,4 +128,4 @@ class AtTheEnd:
     def final(self, graph: Graph) -> tuple[Array, Array]:
         """The optimum over the whole run."""
         poses = {k.key: k.causal[0] for k in graph.keyframes.values() if k.causal is not None}
-        return solve_whole(graph, graph.constant_priors()[0] | self._guesses | poses, self._widest)
+        return solve_whole(graph, graph.constant_priors()[0] | self._guesses | poses, is_guess=True)

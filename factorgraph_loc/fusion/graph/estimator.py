@@ -24,11 +24,11 @@ from factorgraph_loc.fusion.graph.graph import NOTHING_KNOWN, STATE, Graph, Keyf
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
 from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSettings
-from factorgraph_loc.fusion.layout import MOTION
+from factorgraph_loc.fusion.layout import MOTION, learnt_from
 from factorgraph_loc.fusion.search import DURATION
 from factorgraph_loc.fusion.timeline import Taken, Timeline
 from factorgraph_loc.fusion.tracking import FOUND, JUMPED, Refuted, Tracked, Tracking, is_known
-from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status, learnt_landmarks
+from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
@@ -38,7 +38,6 @@ from factorgraph_loc.sensors.base import Binding, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
-from factors.graph import is_landmark
 from factors.motion import ChainState, Increment, poses_between
 from factors.se2 import Array
 
@@ -46,7 +45,6 @@ __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
 
 
 REPLAYED, TICK = 300, 2  # work of one slice of a replay, and of a tick; see `Sensor.work`
-WIDEST = 8.0  # how many times wider than its own scale a robust loss begins where the problem is solved from a guess
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ class Smoother(Timeline):
 
     estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
 
-    def __init__(self, setup: Setup, settings: SmootherSettings, widest: float = WIDEST) -> None:
+    def __init__(self, setup: Setup, settings: SmootherSettings) -> None:
         self._settings = settings
         diagnostics = Diagnostics()
         calibration: Calibration = "all" if settings.self_calibration else "none"
@@ -79,9 +77,9 @@ class Smoother(Timeline):
         self.supports_unknown_start = settings.landmarks == "known"
         self._backend: Backend
         if settings.final_only and not mapper.estimates:
-            self._backend = AtTheEnd(self._graph, widest)
+            self._backend = AtTheEnd(self._graph)
         else:
-            self._backend = Incremental(self._graph, settings, widest if settings.final_only else 1.0)
+            self._backend = Incremental(self._graph, settings)
         self._builder = Builder(self._graph, self._backend, self._search, settings)
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # at the last measurement
         self._behind: deque[Measurement] = deque()  # measurements that are still to be replayed
@@ -240,27 +238,17 @@ class Batch(Smoother):
     causal = False
 
     def __init__(self, setup: Setup, settings: BatchSettings) -> None:
-        common = settings.model_dump(exclude={"widest_loss"})
-        super().__init__(setup, SmootherSettings(**common, final_only=True), settings.widest_loss)
+        super().__init__(setup, SmootherSettings(**settings.model_dump(), final_only=True))
 
 
 def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
     """The constants and landmarks that are estimated; points at final ``poses`` of all keyframes, with their body-frame
     ``covariances``."""
-    values: dict[str, tuple[float, float]] = {}
-    blocks = [(name, graph.values[key], graph.covariances[key]) for name, key in graph.keys.items() if is_landmark(key)]
-    landmarks = learnt_landmarks(blocks)
-    for name, key in graph.keys.items():
-        if is_landmark(key):
-            continue
-        prefix = "" if name == MOTION else f"{name}."
-        sigmas = np.sqrt(np.diag(graph.covariances[key]))
-        for label, value, sigma in zip(graph.constants[name].names, graph.values[key], sigmas, strict=True):
-            values[prefix + label] = (float(value), float(sigma))
+    blocks = [(name, graph.values[key], graph.covariances[key]) for name, key in graph.keys.items()]
     numbered = graph.keyframes.values()
     means, bodies = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
     means, bodies = graph.departed[0] | graph.values | means, graph.departed[1] | graph.covariances | bodies
-    return Learnt(values, landmarks, graph.mapper.learnt(means, bodies))
+    return learnt_from(graph.constants, blocks, graph.mapper.learnt(means, bodies))
 
 
 def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:

@@ -25,16 +25,17 @@ from factors.se2 import Array
 
 ITERATIONS_AFTER_FAILURE = 10
 LAG = 10.0  # s: default length of the window for causal estimates
-# m, rad: a window with points linearises a variable again after this change. Its oldest points are soon linearised permanently.
-NEAR_POINTS = 0.02
+# m, rad, or the unit of a constant: a variable is linearised again after this change; in a window with points after a smaller one,
+# as its oldest points are soon linearised permanently. Updates between checks of that.
+MOVED, NEAR_POINTS, CHECKED_EVERY = 0.05, 0.02, 10
 ROUNDING = 1e-6  # s: rounding error of differences of times
 
 
 class Incremental:
-    """The backend of the smoother; see the module. ``widest``: how many times as wide robust losses begin at the end."""
+    """The backend of the smoother; see the module."""
 
-    def __init__(self, graph: Graph, settings: SmootherSettings, widest: float = 1.0) -> None:
-        self._graph, self._settings, self._widest = graph, settings, widest
+    def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
+        self._graph, self._settings = graph, settings
         self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
         self._maps = graph.mapper.estimates
         self._margin = WITH_POINTS if self._maps else MARGIN
@@ -76,7 +77,7 @@ class Incremental:
         With a set lag a pose has its estimate at the time when it left the window. Poses in the window have the current estimate,
         poses that wait for the solver the predicted one."""
         if self._settings.smooth and self._is_whole:
-            return solve_whole(graph, self._newest_values(graph), self._widest)
+            return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)
         estimates = [keyframe.causal for keyframe in graph.keyframes.values()]
         if self._settings.smooth:
             waiting = self._waiting.values
@@ -307,12 +308,11 @@ class Incremental:
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization(factorization)
         # far from where a point was first taken to be its factors mean nothing
-        parameters.relinearizeSkip = 1 if self._maps else self._settings.relinearize_skip
-        threshold = self._settings.relinearize_threshold
+        parameters.relinearizeSkip = 1 if self._maps else CHECKED_EVERY
         if self._lag is None:
-            return FullHistory(parameters, threshold, self._failed.append)
+            return FullHistory(parameters, MOVED, self._failed.append)
         parameters.findUnusedFactorSlots = True
-        threshold = min(threshold, NEAR_POINTS) if self._maps else threshold
+        threshold = NEAR_POINTS if self._maps else MOVED
         # with points poses leave one at a time, so that a rebuilt window soon linearises at its former points
         return Window(parameters, threshold, self._failed.append, self._lag + self._margin if self._maps else math.inf)
 

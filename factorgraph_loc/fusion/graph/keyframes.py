@@ -1,10 +1,9 @@
 """The keyframe rule: where poses of the graph are, and which of them each measurement belongs to.
 
-A keyframe is added at a measurement that comes at least an interval after the last keyframe. The interval is that of the setting
-``keyframe_interval``; by default it is the sensor's ``keyframe_every``, or longer where landmarks are estimated. A sensor that
-gathers always has its own. A mapper of points may need a keyframe earlier (``is_due``), and at a tick one is added after
-``keyframe_max_interval``. Other measurements, late ones included, become factors on the keyframe before them, displaced by the
-odometry since.
+A keyframe is added at a measurement that comes at least an interval after the last keyframe. The interval is the sensor's
+``keyframe_every``, or longer where landmarks are estimated. A sensor that gathers always has its own. A mapper of points may need
+a keyframe earlier (``is_due``), and at a tick one is added after :data:`LONGEST_INTERVAL`. Other measurements, late ones included,
+become factors on the keyframe before them, displaced by the odometry since.
 
 Sensors that gather, as RFID readers do, come many times a second, each time with little information. Their observations on one
 keyframe become few factors, which enter the graph with the next keyframe. Until then the newest pose is updated by them alone, as
@@ -34,6 +33,7 @@ from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1
 MAPPING_KEYFRAME_INTERVAL = 0.5  # s, where landmarks are estimated too
+LONGEST_INTERVAL = 1.0  # s between poses of the graph while measurements come
 
 Backend = AtTheEnd | Incremental  # keeps the graph solved, or its guess
 
@@ -100,7 +100,7 @@ class Builder:
         """A tick, with the ``odometry`` there."""
         graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
-        if t - graph.newest.t >= self._settings.keyframe_max_interval:
+        if t - graph.newest.t >= LONGEST_INTERVAL:
             self._add_keyframe(odometry, None)
         graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
@@ -130,11 +130,8 @@ class Builder:
     def _needs_keyframe(self, m: Measurement, sensor: Sensor) -> bool:
         """Whether a measurement is to have a keyframe at its time."""
         since, interval = m.t - self._graph.newest.t, sensor.keyframe_every
-        if not sensor.gathers:
-            if self._settings.keyframe_interval is not None:
-                interval = self._settings.keyframe_interval
-            elif self._settings.landmarks != "known":
-                interval = MAPPING_KEYFRAME_INTERVAL
+        if not sensor.gathers and self._settings.landmarks != "known":
+            interval = MAPPING_KEYFRAME_INTERVAL
         mapper = self._graph.mapper
         return since >= interval or (since > 0.0 and m.source == mapper.sensor and mapper.is_due(m))
 

@@ -12,10 +12,6 @@ from factorgraph_loc.model.setup import MapUse
 class GraphSettings(FileModel):
     """Settings of every graph estimator."""
 
-    keyframe_interval: Annotated[float, Field(ge=0.0, le=10.0), InUnit("s")] | None = None
-    """shortest time between poses of the graph; by default 0.09 s, or 0.5 s where landmarks are estimated"""
-    keyframe_max_interval: Annotated[float, Field(ge=0.01, le=60.0), InUnit("s")] = 1.0
-    """longest time between poses of the graph while measurements come"""
     max_delay: Annotated[float, Field(ge=0.0, le=4.0), InUnit("s")] = 0.5
     """how late a measurement may come; later ones are counted and dropped"""
     self_calibration: bool = True
@@ -42,10 +38,6 @@ class SmootherSettings(GraphSettings):
     """length of the window, behind which poses are final, or all: the full history is kept solved. By default causal estimates
     come from a window of 10 s and the final trajectory from the whole problem; with loops, or where landmarks or
     points are estimated, all"""
-    relinearize_threshold: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
-    """change of a variable [m, rad, or the unit of a constant] above which its factors are linearised again"""
-    relinearize_skip: Annotated[int, Field(ge=1, le=100)] = 10
-    """updates between checks of that"""
     smooth: bool = True
     """whether the final trajectory uses all measurements, else it repeats the causal one"""
     final_only: bool = False
@@ -61,6 +53,3 @@ class SmootherSettings(GraphSettings):
 
 class BatchSettings(GraphSettings):
     """Settings of the batch estimator."""
-
-    widest_loss: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
-    """how many times wider than its own scale the robust loss begins; 1 for a plain robust start"""
