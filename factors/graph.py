@@ -99,7 +99,7 @@ def index_of(key: int) -> int:
 
 
 class Factor(Protocol):
-    """A factor that :func:`jacobian_factor` accepts."""
+    """A factor that :func:`jacobian_factors` accepts."""
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, weighted residual (m,) and a Jacobian (m, d) for each variable."""
@@ -124,18 +124,6 @@ class Stack(Protocol):
         """The loss of all."""
 
 
-class Alike(Factor, Protocol):
-    """A kind of factor that is linearised by one call for many factors."""
-
-    @property
-    def alike(self) -> Hashable:
-        """Equal for factors that are linearised together."""
-
-    @staticmethod
-    def linearize_all(factors: Sequence[Any], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
-        """Residuals (N, m) of N factors, and a Jacobian (N, m, d) for each of their variables."""
-
-
 @runtime_checkable
 class Stackable(Factor, Protocol):
     """A factor on one pose or on two consecutive ones, and perhaps on one vector. Many such factors become a stack."""
@@ -154,18 +142,15 @@ def pose_array(pose: gtsam.Pose2) -> Array:
     return np.array((pose.x(), pose.y(), pose.theta()))
 
 
-def jacobian_factor(factor: Factor, keys: Sequence[int], values: Sequence[Array]) -> gtsam.GaussianFactor:
-    """``factor`` linearised at ``values``."""
-    return gaussian_factor(keys, *factor.linearize(values))
-
-
 def jacobian_factors(
     factors: Sequence[tuple[Factor, Sequence[int]] | tuple[Factor, Sequence[int], int]],
     values: Mapping[int, Array],
     on_failure: Callable[[str], None] | None = None,
 ) -> list[gtsam.GaussianFactor]:
-    """Factors, each with the keys of its variables, linearised at ``values``; those that are alike together.
+    """Factors, each with the keys of its variables, linearised at ``values``.
 
+    Factors whose ``alike`` is equal are linearised together, by ``linearize_all`` of their class, to residuals (N, m) and a
+    Jacobian (N, m, d) for each of their variables.
     ``on_failure``: called with the reason where a residual or Jacobian is not finite or has a wrong shape, which then is zero.
     Each factor comes with the number of its residuals then. Factors that are alike are not checked.
     """

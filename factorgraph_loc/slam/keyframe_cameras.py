@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph import GraphView, Guess, Keyframe
+from factorgraph_loc.fusion.graph.graph import Graph, Guess, Keyframe
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.slam.local_bundle import bundled
 from factorgraph_loc.slam.new_points import KeyframeCamera, PointSighting
@@ -38,10 +38,10 @@ class KeyframeCameras:
         self.twists: dict[int, Array] = {}
         self.anchored: dict[int, bool] = {}
 
-    def add(self, keyframe: Keyframe, graph: GraphView) -> None:
+    def add(self, keyframe: Keyframe, graph: Graph) -> None:
         """Add a keyframe whose odometry is still kept."""
         if self._offset is not None:
-            self.twists[keyframe.index] = graph.twist(keyframe.t)
+            self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 
     def anchor(self, keyframe: Keyframe, points: int) -> None:
         """Store how many ``points`` of the graph a keyframe sees."""
@@ -52,31 +52,32 @@ class KeyframeCameras:
         self.twists = {number: twist for number, twist in self.twists.items() if number >= first}
         self.anchored = {number: anchored for number, anchored in self.anchored.items() if number >= first}
 
-    def at_image(self, keyframe: int, guess: Guess, graph: GraphView) -> Guess:
+    def at_image(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
         """The pose of a keyframe when its image was taken, and its covariance with that of the offset."""
         return self._moved(keyframe, guess, graph, 1.0)
 
-    def at_stamp(self, keyframe: int, guess: Guess, graph: GraphView) -> Guess:
+    def at_stamp(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
         """The inverse of :meth:`at_image`."""
         return self._moved(keyframe, guess, graph, -1.0)
 
-    def pose(self, keyframe: int, graph: GraphView) -> Array:
+    def pose(self, keyframe: int, graph: Graph) -> Array:
         """The current pose (3,) of a keyframe of the graph when its image was taken."""
         pose = graph.current(graph.keyframes[keyframe].key)
         return self._moved(keyframe, (pose, np.zeros((3, 3))), graph, 1.0)[0]
 
-    def _moved(self, keyframe: int, guess: Guess, graph: GraphView, sign: float) -> Guess:
-        if self._offset is None or graph.constants is None or keyframe not in self.twists:
+    def _moved(self, keyframe: int, guess: Guess, graph: Graph, sign: float) -> Guess:
+        constants = graph.mapped_constants
+        if self._offset is None or constants is None or keyframe not in self.twists:
             return guess
         twist = self.twists[keyframe]
-        variance = graph.covariances[graph.shared[0]][self._offset, self._offset]
-        later = se2.exp(sign * float(graph.constants[self._offset]) * twist)
+        variance = graph.covariances[constants][self._offset, self._offset]
+        later = se2.exp(sign * float(graph.values[constants][self._offset]) * twist)
         carried = se2.adjoint(se2.inverse(later))
         covariance = carried @ guess[1] @ carried.T + sign * variance * np.outer(twist, twist)
         return se2.compose(guess[0], later), covariance
 
     def cameras(
-        self, newest: Keyframe, pose: Array, names: Iterable[Hashable], waiting: Waiting, graph: GraphView
+        self, newest: Keyframe, pose: Array, names: Iterable[Hashable], waiting: Waiting, graph: Graph
     ) -> dict[int, KeyframeCamera]:
         """The camera poses, by number, of the keyframes that see the ``waiting`` points ``names``.
 
@@ -91,7 +92,7 @@ class KeyframeCameras:
         return cameras
 
     def bundled(
-        self, newest: Keyframe, pose: Array, waiting: Waiting, tilt: float, graph: GraphView
+        self, newest: Keyframe, pose: Array, waiting: Waiting, tilt: float, graph: Graph
     ) -> tuple[dict[int, KeyframeCamera], Array] | None:
         """The camera poses of the last keyframes by number, adjusted with the points ``waiting`` there, and the adjusted ``pose``
         (3,) of the ``newest`` one. None if that is anchored, or if the points do not determine it.
@@ -108,10 +109,10 @@ class KeyframeCameras:
         adjusted = zip(last[-len(result) :], result, strict=True)
         return {i: KeyframeCamera.of(self._model, p, SLACK, leaning) for i, (p, leaning) in adjusted}, result[-1][0]
 
-    def _camera(self, pose: Array, keyframe: int, slacks: Mapping[int, float], graph: GraphView) -> KeyframeCamera:
+    def _camera(self, pose: Array, keyframe: int, slacks: Mapping[int, float], graph: Graph) -> KeyframeCamera:
         return KeyframeCamera.of(self._model, pose, slacks[keyframe], graph.values[tilt_key(keyframe)])
 
-    def _slacks(self, newest: Keyframe, graph: GraphView) -> dict[int, float]:
+    def _slacks(self, newest: Keyframe, graph: Graph) -> dict[int, float]:
         """The pixel error of the last keyframes relative to the newest."""
         slacks: dict[int, float] = {}
         to_anchor = since = 0.0  # variance of the rotation from the newest to the first anchored keyframe, and since

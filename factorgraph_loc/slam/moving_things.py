@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph import GraphView, Keyframe
+from factorgraph_loc.fusion.graph.graph import Graph, Keyframe
 from factorgraph_loc.sensors.camera.known_points import lifted
 from factorgraph_loc.vision.consensus import GATE, Truths
 from factors import positive
@@ -47,7 +47,7 @@ class MovingThings:
         """Whether a track is static. While something moves, such a track must have agreed with the odometry."""
         return name not in self._moving and (not self._doubts or name in self._steady)
 
-    def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: GraphView) -> None:
+    def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
         """Learn from the tracks ``names``, seen at ``pixels`` (K, 2) from a keyframe."""
         new_pixels = dict(zip(names, pixels, strict=True))
         self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
-from factorgraph_loc.fusion.graph.graph import Addition, GraphView, Guess, Keyframe, Mapper, Node
+from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Mapper, Node
 from factorgraph_loc.fusion.graph.settings import GraphSettings
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -49,7 +49,7 @@ class PointMapper(Mapper):
         tracks = set(m.frame.tracks.tolist()) - self._things.moving()
         return len(tracks & self._tracks) < LEAST_COMMON * len(tracks)
 
-    def take(self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition) -> Guess:
+    def take(self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
         points = self._camera.points
         if m.frame is None:
             names: list[Hashable] = list(m.names)

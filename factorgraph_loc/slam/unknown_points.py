@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph import Addition, GraphView, Guess, Keyframe, Node, jumps
+from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Node, jumps
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
@@ -67,7 +67,7 @@ class _NewImage:
 
     m: Pixels
     keyframe: Keyframe
-    graph: GraphView
+    graph: Graph
     addition: Addition
     model: CameraModel
 
@@ -105,7 +105,7 @@ class UnknownPoints:
         rows: Sequence[int],
         keyframe: Keyframe,
         guess: Guess,
-        graph: GraphView,
+        graph: Graph,
         addition: Addition,
         movers: MovingThings,
     ) -> Guess:
@@ -115,8 +115,9 @@ class UnknownPoints:
         The covariance is not reduced: the points are as uncertain as the poses that observed them.
         """
         model = self.model
-        if graph.constants is not None:
-            model = recalibrated(model, self.estimated.full(graph.constants, len(reprojection.PARAMETERS)))
+        constants = graph.mapped_constants
+        if constants is not None:
+            model = recalibrated(model, self.estimated.full(graph.values[constants], len(reprojection.PARAMETERS)))
         image = _NewImage(m, keyframe, graph, addition, model)
         self._cameras.add(keyframe, graph)
         guess = self._cameras.at_image(keyframe.index, guess, graph)
@@ -193,7 +194,7 @@ class UnknownPoints:
                 self._hang(image, graph.keyframes[sighting.keyframe], key, sighting)
         return pose
 
-    def _named(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: GraphView) -> list[Hashable]:
+    def _named(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
         """The name of each row: of a feature, the number of its track, or of the track that its point was added with."""
         if m.frame is None:
             return [m.names[i] for i in rows]
@@ -338,7 +339,7 @@ class UnknownPoints:
             replace(model, tilt=sigma),
             (positions[recent], pixels[recent], covariances[recent], noise[recent]),
         )
-        guess = unless_slipped(level, keyframe, guess, graph.slip, observed)
+        guess = unless_slipped(level, keyframe, guess, graph.motion.slip, observed)
         since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
         near = guess if since is None else (guess[0], since)  # of a pose among the points that were seen since
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
@@ -390,7 +391,8 @@ class UnknownPoints:
 
     def _hang(self, image: _NewImage, keyframe: Keyframe, key: int, sighting: PointSighting) -> None:
         """Add the factor of a ``sighting`` of a point from a keyframe."""
-        keys = (keyframe.key, *image.graph.shared, tilt_key(keyframe.index), key)
+        constants = image.graph.mapped_constants
+        keys = (keyframe.key, *(() if constants is None else (constants,)), tilt_key(keyframe.index), key)
         twist = self._cameras.twists.get(keyframe.index)
         factor = PointFactor(self.model, self._lens, sighting.pixel, self.estimated.indices, twist)
         image.addition.hang(keyframe, Node(keys, factor, 2))

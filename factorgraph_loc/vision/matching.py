@@ -40,14 +40,13 @@ def match(
     second: Descriptors,
     *,
     ratio: float = RATIO,
-    mutual: bool = True,
     allowed: Truths | None = None,
 ) -> Matches:
     """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if it passes the ratio test. Ties are no matches.
 
-    The distance must be below ``ratio`` times that to the second nearest, if there is one. ``mutual``: both must be nearest to
-    each other. ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or non-finite descriptors, and for a
-    ratio that is not positive.
+    The distance must be below ``ratio`` times that to the second nearest, if there is one, and both must be nearest to each other.
+    ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or non-finite descriptors, and for a ratio that is
+    not positive.
     """
     if not ratio > 0.0:
         raise InputError(f"matching: ratio is {ratio}, expected more than 0")
@@ -60,9 +59,8 @@ def match(
         return Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))
     forward = nearest_neighbours(distances)
     keep = np.isfinite(forward.best) & forward.is_unique & (forward.best < ratio * forward.second)
-    if mutual:
-        back = nearest_neighbours(distances.T)
-        keep &= (back.index[forward.index] == np.arange(len(keep))) & back.is_unique[forward.index]
+    back = nearest_neighbours(distances.T)
+    keep &= (back.index[forward.index] == np.arange(len(keep))) & back.is_unique[forward.index]
     chosen = np.flatnonzero(keep)
     return Matches(np.stack([chosen, forward.index[chosen]], axis=1), forward.best[chosen])
 

@@ -18,7 +18,10 @@ POSE = np.array((2.0, -1.0, 0.7))
 ROOT = np.array(((0.1, 0.0, 0.0), (0.02, 0.2, 0.0), (0.0, -0.03, 0.06)))
 STEP = 1e-6
 GRAPH = SimpleNamespace(
-    constants=np.array((0.02, OFFSET)), covariances={7: np.diag((0.01, SIGMA)) ** 2}, shared=(7,), twist=lambda _: TWIST
+    mapped_constants=7,
+    values={7: np.array((0.02, OFFSET))},
+    covariances={7: np.diag((0.01, SIGMA)) ** 2},
+    motion=SimpleNamespace(twist=lambda _: TWIST),
 )
 
 

@@ -27,7 +27,8 @@ def placed(moved, last, step=STEP):
         Keyframe(i, t, ChainState(t, *np.zeros(7)), Increment(np.zeros(3), step, t - 4.0))
         for i, t in ((0, 4.0), (1, 10.0))
     ]
-    graph = SimpleNamespace(current=FEW.__getitem__, keyframes=keyframes, slip=lambda _: (np.zeros((3, 3)), np.inf))
+    motion = SimpleNamespace(slip=lambda _: (np.zeros((3, 3)), np.inf))
+    graph = SimpleNamespace(current=FEW.__getitem__, keyframes=keyframes, motion=motion)
     pixels, _ = predict(MODEL, se2.exp(np.asarray(moved)), FEW)
     none = np.zeros(len(FEW), dtype=bool)
     named = SimpleNamespace(names=tuple("abcd"))

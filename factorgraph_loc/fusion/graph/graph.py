@@ -115,25 +115,6 @@ def jumps(guess: Guess, pose: Array) -> bool:
     return not positive.squared(se2.log(se2.between(guess[0], pose)), guess[1]) < JUMPED
 
 
-@dataclass(frozen=True)
-class GraphView:
-    """The graph as its mapper reads it. ``keyframes``: by number; ``values``, ``covariances``: estimates of all variables but
-    poses, where the mapper adds its own; ``current``: the estimate of a variable by key; ``is_open``: whether a keyframe is open;
-    ``between``: the motion between two keyframes; ``slip``: the effect of slipping wheels on an increment; ``twist``: the robot's
-    velocity (3,) at a time; ``shared``: keys of the sensor's constants; ``constants`` (P,): their values."""
-
-    keyframes: Mapping[int, Keyframe]
-    values: Values
-    covariances: Values
-    current: Callable[[int], Array]
-    is_open: Callable[[int], bool]
-    between: Callable[[Keyframe, Keyframe], Increment]
-    slip: Callable[[Increment], tuple[Array, float]]
-    twist: Callable[[float], Array]
-    shared: tuple[int, ...] = ()
-    constants: Array | None = None
-
-
 class Mapper:
     """Makes variables of points that a sensor sees and no map has. This base class maps nothing.
 
@@ -154,7 +135,7 @@ class Mapper:
         """Whether a measurement needs a keyframe of its own."""
         return False
 
-    def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: GraphView, addition: Addition) -> Guess:
+    def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
         """Add the information of a measurement from the newest keyframe to an ``addition``. Returns the corrected guess of its
         pose."""
         return guess
@@ -189,10 +170,13 @@ class Graph:
     """Keyframes by number, and the other variables by key: ``values`` with covariances ``spreads``.
 
     ``newest``: the last keyframe, whose current estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3). ``keys``: of
-    blocks by name. ``departed``: estimates and covariances of points that have left the graph. ``t``: the newest time.
+    blocks by name. ``departed``: estimates and covariances of points that have left the graph. ``t``: the newest time. Of its
+    backend, ``current(key)``: the newest estimate of a variable; ``is_open(number)``: whether a keyframe may still get factors.
     """
 
     newest: Keyframe
+    current: Callable[[int], Array]
+    is_open: Callable[[int], bool]
 
     def __init__(self, motion: Motion, sensors: Mapping[str, Sensor], mapper: Mapper, diagnostics: Diagnostics) -> None:
         self.motion, self.sensors, self.mapper, self.diagnostics = motion, sensors, mapper, diagnostics
@@ -282,6 +266,15 @@ class Graph:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
         start = newest.odometry if self.is_anchored else self.motion.state(newest.t)
         return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
+
+    def between(self, first: Keyframe, last: Keyframe) -> Increment:
+        """The motion between two keyframes, under the constants of the odometry."""
+        return self.recalibrated(self.motion.relative(first.odometry, last.odometry))
+
+    @property
+    def mapped_constants(self) -> int | None:
+        """The key of the estimated constants of the sensor whose points are mapped, None without any."""
+        return self.keys.get(self.mapper.sensor)
 
     def recalibrated(self, increment: Increment) -> Increment:
         """An increment under the constants of the odometry."""

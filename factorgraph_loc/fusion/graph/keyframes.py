@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.fusion.graph.batch import AtTheEnd
-from factorgraph_loc.fusion.graph.graph import Addition, Graph, GraphView, Guess, Keyframe, Node, TickAt
+from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Node, TickAt
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.settings import GraphSettings
 from factorgraph_loc.fusion.layout import MOTION
@@ -93,6 +93,7 @@ class Builder:
 
     def __init__(self, graph: Graph, backend: Backend, search: Tracking, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
+        graph.current, graph.is_open = backend.current, backend.is_open
         self._waiting: list[Observation] = []  # of a sensor that gathers, on the newest keyframe
         self._gatherer: Sensor | None = None  # that sensor
 
@@ -114,7 +115,7 @@ class Builder:
                 return True
         newest = graph.newest
         keyframe = newest if m.t >= newest.t else graph.keyframe_before(m.t)
-        if keyframe is not newest and not self._backend.is_open(keyframe.index):
+        if keyframe is not newest and not graph.is_open(keyframe.index):
             return False
         offset = graph.since(keyframe, m.t) if m.t > keyframe.t else None
         guess = (graph.pose, graph.covariance) if keyframe is newest else None
@@ -238,7 +239,7 @@ class Builder:
             return None
         guess = view.pose, view.covariance
         if m.source == graph.mapper.sensor and keyframe is graph.newest and m.t == keyframe.t:
-            guess = graph.mapper.take(m, keyframe, guess, self._graph_view(sensor), addition)
+            guess = graph.mapper.take(m, keyframe, guess, graph, addition)
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
@@ -246,21 +247,8 @@ class Builder:
         earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
-        if self._backend.is_open(earlier.index):
+        if self._graph.is_open(earlier.index):
             addition.nodes.append(node)
-
-    def _graph_view(self, sensor: Sensor) -> GraphView:
-        graph, backend = self._graph, self._backend
-
-        def between(first: Keyframe, last: Keyframe) -> Increment:
-            return graph.recalibrated(graph.motion.relative(first.odometry, last.odometry))
-
-        estimates = graph.values, graph.covariances, backend.current, backend.is_open
-        key = graph.keys.get(sensor.name)
-        shared = () if key is None else (key,)
-        constants = None if key is None else graph.values[key]
-        motion = between, graph.motion.slip, graph.motion.twist
-        return GraphView(graph.keyframes, *estimates, *motion, shared, constants)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
         """Add a landmark to the graph, with the sightings that determine it or with its prior."""
@@ -271,5 +259,5 @@ class Builder:
             addition.hang(view.keyframe, Node((key,), VectorPriorFactor(new.mean, new.noise), len(new.mean), native))
         for t, observation in new.sightings:
             keyframe = self._graph.keyframe_before(t)
-            if keyframe.t <= t and self._backend.is_open(keyframe.index):
+            if keyframe.t <= t and self._graph.is_open(keyframe.index):
                 addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.name) for term in observation.terms))
