@@ -92,13 +92,12 @@ def descended(
     moved: Callable[[State, float], tuple[State, float] | None],
     state: State,
     max_iterations: int = MAX_ITERATIONS,
-    converged: float = CONVERGED_GAIN,
 ) -> tuple[State, float, int]:
     """The local minimum of a cost, the cost there, and the number of steps.
 
     ``moved``: the state after a step whose damping is a share of the curvature, and the largest component of the step; None where
     the step is not determined. The problem is solved when a step is below :data:`CONVERGED_STEP`, or lowers the cost by less than
-    the share ``converged``.
+    the share :data:`CONVERGED_GAIN`.
     """
     damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
     while iteration < max_iterations and damping < MAX_DAMPING:
@@ -110,6 +109,6 @@ def descended(
             continue
         gained = cost - new_cost
         (state, step), cost, damping = new, new_cost, damping / 10.0
-        if step <= CONVERGED_STEP or gained <= converged * cost:
+        if step <= CONVERGED_STEP or gained <= CONVERGED_GAIN * cost:
             break
     return state, cost, iteration

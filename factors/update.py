@@ -70,7 +70,9 @@ def update_state(
     try:
         solve = [_informed(np.asarray(np.linalg.inv(prior))) for prior in priors]
         correction = _iterated(solve[0], solve[-1], linearize, *iterated)
-        _require_sound(correction.delta, correction.covariance)
+        np.linalg.cholesky(correction.covariance)  # LinAlgError if it is invalid because of rounding
+        if not np.all(np.isfinite(correction.delta)):
+            raise np.linalg.LinAlgError("an update is not finite")
     except np.linalg.LinAlgError:
         solve = [_rooted(positive.root(prior)) for prior in priors]
         correction = _iterated(solve[0], solve[-1], linearize, *iterated)
@@ -141,13 +143,6 @@ def _rooted(root: Array) -> _Solver:
         return half @ ((jacobian @ half[:size]).T @ wanted), half @ half.T
 
     return solve
-
-
-def _require_sound(delta: Array, covariance: Array) -> None:
-    """LinAlgError if the update is invalid because of rounding."""
-    np.linalg.cholesky(covariance)
-    if not np.all(np.isfinite(delta)):
-        raise np.linalg.LinAlgError("an update is not finite")
 
 
 @compiled(error_model="numpy")

@@ -75,7 +75,9 @@ class BackwardSimulation:
         """Mean (3,) and covariance (3, 3) in the world's frame of the trajectories at a record between two kept ones."""
         k = int(np.searchsorted(self._t, record.t, side="right")) - 1
         if any(self._t[k] < end <= record.t for _, end in self._changes):
-            return self._carried_back(self._drawn[k + 1], self._increment(record, self._kept[k + 1]))
+            # from the later cloud and the motion in between alone
+            later, step = self._drawn[k + 1], self._increment(record, self._kept[k + 1])
+            return _moments(se2.compose(later.poses, se2.inverse(step.delta)), step.covariance)
         since = self._increment(self._kept[k], record)
         poses, _ = self._moved(self._drawn[k], since)
         extra = np.zeros((3, 3))
@@ -85,11 +87,6 @@ class BackwardSimulation:
             poses = se2.compose(poses, se2.exp(share * self._missed[k]))
             extra = share * (1.0 - share) * whole.covariance
         return _moments(poses, extra)
-
-    @staticmethod
-    def _carried_back(later: Cloud, increment: Increment) -> tuple[Array, Array]:
-        """The same at a record before the cloud ``later``, from this cloud and the ``increment`` in between alone."""
-        return _moments(se2.compose(later.poses, se2.inverse(increment.delta)), increment.covariance)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
         """The ancestors of the states ``later``, and the noise (M, 3) of the motion in between."""

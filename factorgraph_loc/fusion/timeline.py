@@ -73,16 +73,13 @@ class Timeline(ABC):
         """
         if self._begun < math.inf:
             estimate = self._estimate_at(t)
-            return replace(estimate, doubts_model=True) if self._doubts_model() else estimate
+            doubts = any(sensor.doubts_model for sensor in self._sensors.values())
+            return replace(estimate, doubts_model=True) if doubts else estimate
         at = self._t if t is None else max(t, self._t)
         modes = [] if self._seeking is None else self._seeking.modes(at)
         if not modes:
             return PoseEstimate(at, np.full(3, np.nan), np.full((3, 3), np.nan), "unlocalized")
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
-
-    def _doubts_model(self) -> bool:
-        """Whether measurements contradict the model of their sensor."""
-        return any(sensor.doubts_model for sensor in self._sensors.values())
 
     def belief(self, t: float | None = None) -> Belief:
         """The belief behind :meth:`estimate`; before the start all hypotheses of the search, and its particles."""

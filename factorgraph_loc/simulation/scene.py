@@ -61,11 +61,12 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
     texel = max(TEXEL, math.sqrt(area / MOST_TEXELS))
     sizes = [(max(round(z / texel), 8), max(round(x / texel), 8)) for z, x in zip(tops - bottoms, lengths, strict=True)]
     across = round(plan.depth / texel), round(plan.width / texel)
+    are_outer = ~plan.indoors((faces[:, :2] + faces[:, 2:]) / 2.0)  # the outline itself is not indoors
 
     def drawn() -> Iterator[Canvas]:
         for i, size in enumerate(sizes):
             if i < w:
-                canvas = textures.wall(rng, *size, texel, windows=_is_outer(plan, faces[i]))
+                canvas = textures.wall(rng, *size, texel, windows=bool(are_outer[i]))
             elif i < w + b:
                 canvas = textures.furniture(rng, *size)
             else:
@@ -80,12 +81,6 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
 
     texels, layout = _stored([*sizes, across, across], drawn())
     return TexturedScene(faces, bottoms, tops, plan.width, plan.depth, ROOM_HEIGHT, texels, layout, texel)
-
-
-def _is_outer(plan: Plan, face: Array) -> bool:
-    """Whether a face is on the outline of the plan."""
-    x1, y1, x2, y2 = face.tolist()
-    return (x1 == x2 and x1 in {0.0, plan.width}) or (y1 == y2 and y1 in {0.0, plan.depth})
 
 
 def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:

@@ -49,9 +49,10 @@ class Plan:
 
     def faces(self) -> tuple[Array, Array]:
         """The sides of walls and of boxes as segments (F, 4) with the free side on the left. Inner walls have two."""
-        walls = [face for wall in self.walls for face in both_sides(wall) if self._is_inside(face)]
+        walls = np.array([face for wall in self.walls for face in both_sides(wall)]).reshape(-1, 4)
+        before = _places(walls, np.full(len(walls), 0.5))[:, :2]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
-        return np.array(walls).reshape(-1, 4), np.array(boxes).reshape(-1, 4)
+        return walls[self.indoors(before)], np.array(boxes).reshape(-1, 4)
 
     def open(self, points: Array) -> NDArray[np.bool_]:
         """Whether points (N, 2) are inside the building and outside of all boxes."""
@@ -65,13 +66,6 @@ class Plan:
         """Whether points (N, 2) are inside the building."""
         x, y = points.T
         return np.asarray((x > 0.0) & (x < self.width) & (y > 0.0) & (y < self.depth))
-
-    def _is_inside(self, face: Segment) -> bool:
-        """Whether the left side of a face is inside the building."""
-        x1, y1, x2, y2 = face
-        length = math.hypot(x2 - x1, y2 - y1)
-        x, y = (x1 + x2) / 2.0 - 0.05 * (y2 - y1) / length, (y1 + y2) / 2.0 + 0.05 * (x2 - x1) / length
-        return 0.0 < x < self.width and 0.0 < y < self.depth
 
 
 def both_sides(segment: Segment) -> tuple[Segment, Segment]:

@@ -69,13 +69,12 @@ def cache_folder() -> Path:
 
 
 class FeatureCache:
-    """Contents by key, one file each, below ``folder``; :meth:`trim` limits their size to ``limit`` bytes.
+    """Contents by key, one file each, below ``folder``; :meth:`trim` limits their size to :data:`LIMIT`.
 
     ``fault``: why nothing can be written, if so."""
 
-    def __init__(self, folder: Path, limit: int = LIMIT) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder / "features"
-        self._limit = limit
         self.fault = ""
 
     def read(self, key: str) -> bytes | None:
@@ -115,7 +114,7 @@ class FeatureCache:
             except OSError:  # removed by another process
                 continue
             files.append((status.st_mtime_ns, status.st_size, path))
-        excess = sum(size for _, size, _ in files) - self._limit
+        excess = sum(size for _, size, _ in files) - LIMIT
         for _, size, path in sorted(files):
             if excess <= 0:
                 return

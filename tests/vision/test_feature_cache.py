@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from factorgraph_loc.vision import feature_cache
 from factorgraph_loc.vision.feature_cache import FeatureCache, cache_folder, decode, encode
 from factorgraph_loc.vision.keypoints import Keypoints
 
@@ -55,8 +56,9 @@ def test_a_folder_that_cannot_be_written_keeps_nothing(tmp_path):
     cache.trim()
 
 
-def test_what_was_not_used_for_longest_goes_first(tmp_path):
-    cache = FeatureCache(tmp_path, limit=3100)
+def test_what_was_not_used_for_longest_goes_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(feature_cache, "LIMIT", 3100)
+    cache = FeatureCache(tmp_path)
     keys = ["a1", "a2", "b1", "b2", "c1"]
     for i, key in enumerate(keys):
         cache.write(key, bytes(1000))

@@ -52,11 +52,6 @@ class Node:
     native: gtsam.NonlinearFactor | None = None
     sensor: str = ""
 
-    @property
-    def has_pose(self) -> bool:
-        """Whether it is on a pose."""
-        return any(is_pose(key) for key in self.keys)
-
 
 Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
 

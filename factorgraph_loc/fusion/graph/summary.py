@@ -86,4 +86,4 @@ def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> 
     which contains priors of all variables but poses, and factors on poses that have left."""
     if any(key not in present for key in node.keys):
         return False
-    return node.has_pose or node.keys[0] not in known
+    return any(map(is_pose, node.keys)) or node.keys[0] not in known

@@ -76,12 +76,7 @@ class Poses:
 
     def path(self, warnings: list[str]) -> PosePath:
         """The poses, the last one of equal timestamps; InputError names the invalid message."""
-        source, rows, t_ns, values = self._rows.source, self._rows.rows, self._rows.t_ns, self._rows.values
-        if self._are_points:
-            values = np.column_stack((values, np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))))
-        rotations = checked_rotations(source, rows, values)
-        path = PosePath(source, values[:, :3], rotations, t_ns, not self._are_points)
-        return path.rows(checks.in_order(source, rows, t_ns, warnings))
+        return path_of(self._rows.source, self._rows, warnings, has_rotations=not self._are_points)
 
 
 class Start:
@@ -122,6 +117,17 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
     quaternion."""
     checks.require_finite(source, rows, SEVEN, table)
     return rotations_of(source, rows, table[:, 3:])
+
+
+def path_of(source: str, rows: TopicRows, warnings: list[str], *, has_rotations: bool = True) -> PosePath:
+    """The poses of rows of positions and quaternions, or of positions alone; the last one of equal timestamps. InputError names the
+    invalid message."""
+    values = rows.values
+    if not has_rotations:
+        values = np.column_stack((values, np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))))
+    rotations = checked_rotations(source, rows.rows, values)
+    path = PosePath(source, values[:, :3], rotations, rows.t_ns, has_rotations)
+    return path.rows(checks.in_order(source, rows.rows, rows.t_ns, warnings))
 
 
 class StaticFrames:
@@ -228,18 +234,14 @@ class FrameReference:
         return chain
 
     def _edge(self, name: str, warnings: list[str]) -> PosePath:
-        edge = self._edges[name]
-        source = f"{self._source} {self._parents[name]} to {name}"
-        rotations = checked_rotations(source, edge.rows, edge.values)
-        keep = checks.in_order(source, edge.rows, edge.t_ns, warnings)
-        return PosePath(source, edge.values[keep, :3], rotations[keep], edge.t_ns[keep])
+        return path_of(f"{self._source} {self._parents[name]} to {name}", self._edges[name], warnings)
 
 
 def static_frames(listeners: Listeners, base: str) -> StaticFrames:
     """Register a collector for the static transforms of the bag, if it has any, and return it."""
     bag, frames = listeners.bag, StaticFrames(base)
     if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
-        listeners.add(STATIC, frames, listeners.stamper(STATIC, None), timed=False)
+        listeners.add(STATIC, frames)
     return frames
 
 

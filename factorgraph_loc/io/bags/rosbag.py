@@ -121,7 +121,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     info = None
     if options.camera and options.camera.info:
         info = Info(bag, options.camera.info)
-        listeners.add(options.camera.info, info, listeners.stamper(options.camera.info, None), timed=False)
+        listeners.add(options.camera.info, info)
     of_reference = options.reference
     poses = poses_of_topic(listeners, of_reference, frames) if of_reference else None
     start = listeners.listen(options.start, Start(bag, options.start)) if options.start else None

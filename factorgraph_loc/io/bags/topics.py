@@ -206,16 +206,16 @@ class Listeners:
     def __init__(self, bag: Bag, clock: Clock) -> None:
         self.bag, self.clock = bag, clock
         self.stampers: list[Stamper] = []
-        self._of: dict[str, list[tuple[Stamper, Gatherer]]] = {}
+        self._of: dict[str, list[tuple[Stamper | None, Gatherer]]] = {}
 
     def stamper(self, topic: str, clock: Clock | None) -> Stamper:
         """The timestamps of a topic, by its own clock or that of the bag."""
         return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
 
-    def add(self, topic: str, gatherer: Gatherer, stamper: Stamper, *, timed: bool = True) -> None:
-        """Register a collector. ``timed``: whether timestamps of the topic are meaningful."""
+    def add(self, topic: str, gatherer: Gatherer, stamper: Stamper | None = None) -> None:
+        """Register a collector; without a ``stamper`` its messages have the time of receipt."""
         self._of.setdefault(topic, []).append((stamper, gatherer))
-        if timed:
+        if stamper is not None:
             self.stampers.append(stamper)
 
     def listen(self, options: TopicSettings, gatherer: G) -> G:
@@ -233,7 +233,7 @@ class Listeners:
         for item in self.bag.messages(list(self._of)):
             for stamper, gatherer in self._of[item.topic]:
                 try:
-                    gatherer.add(item, stamper.stamp(item))
+                    gatherer.add(item, item.received if stamper is None else stamper.stamp(item))
                 except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
                     kind = self.bag.topics[item.topic].type
                     where = f"{self.bag.path} {item.topic}:{item.row}"
