@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.model.belief import Mode
-from factorgraph_loc.sensors.base import EarlierPose
 from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
@@ -302,50 +300,3 @@ def _inflated(covariance: Array, lost: float) -> Array:
 
 def _normalised_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
     return pose_moments(poses, weights / weights.sum())
-
-
-class CloudView:
-    """The state of a particle filter as sensors read it, at the time of the filter."""
-
-    offset = None
-    newest = True
-
-    def __init__(self, owner: Any) -> None:
-        self._filter = owner
-        self.t = owner._t
-
-    @property
-    def localized(self) -> bool:
-        return bool(self._filter._state.localized)
-
-    @property
-    def pose(self) -> Array:
-        return np.asarray(self._filter._moments()[0], dtype=float)
-
-    @property
-    def covariance(self) -> Array:
-        return se2.world_to_body(*self._filter._moments())
-
-    def value(self, name: str) -> Array | None:
-        cloud, part = self._filter._state, self._filter._state.parts.get(name)
-        return None if part is None else np.asarray(cloud.weights @ cloud.constants[:, part])
-
-    def spread(self, name: str) -> Array:
-        cloud, part = self._filter._state, self._filter._state.parts[name]
-        return vector_moments(cloud.constants[:, part], cloud.weights)[1]
-
-    def joint(self) -> tuple[Array, Mapping[str, slice]]:
-        return self.covariance, {}
-
-    def poses_at(self, times: Array) -> Array:
-        constants = self.value(MOTION)
-        owner = self._filter
-        values = np.zeros(0) if constants is None else constants
-        return np.asarray(owner._motion.poses_at(owner._odometry, times, values))
-
-    def earlier(self, t: float) -> EarlierPose | None:
-        return None
-
-    def values(self, names: Sequence[str]) -> dict[str, Array]:
-        """The means of blocks that travel with the particles."""
-        return {name: value for name in names if (value := self.value(name)) is not None}

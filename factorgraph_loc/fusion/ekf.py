@@ -15,15 +15,15 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
+from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks, world_estimate
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, learnt_from
-from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracked, Tracking, is_doubted, laplace_evidence
+from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import Binding, EarlierPose, Link, NewVariable, Observation, bound_sensors
+from factorgraph_loc.sensors.base import Binding, Link, NewVariable, Observation, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
 from factors.motion import Increment
@@ -91,39 +91,27 @@ class _Record(NamedTuple):
     updated: _State
 
 
-class _View:
-    """The state of the filter as sensors read it, at the time of the filter."""
-
-    offset = None
-    newest = True
+class _View(FilterView):
     localized = True
-
-    def __init__(self, ekf: Ekf) -> None:
-        self._ekf, self.t = ekf, ekf._t
+    _filter: Ekf
 
     @property
     def pose(self) -> Array:
-        return self._ekf._state.pose
+        return self._filter._state.pose
 
     @property
     def covariance(self) -> Array:
-        return self._ekf._state.covariance[:POSE, :POSE]
+        return self._filter._state.covariance[:POSE, :POSE]
 
     def value(self, name: str) -> Array | None:
-        return self._ekf._state.layout.values(self._ekf._state.rest).get(name)
+        return self._filter._state.layout.values(self._filter._state.rest).get(name)
 
     def spread(self, name: str) -> Array:
-        part = self._ekf._state.layout.columns[name]
-        return self._ekf._state.covariance[part, part]
+        part = self._filter._state.layout.columns[name]
+        return self._filter._state.covariance[part, part]
 
     def joint(self) -> tuple[Array, Mapping[str, slice]]:
-        return self._ekf._state.covariance, self._ekf._state.layout.columns
-
-    def poses_at(self, times: Array) -> Array:
-        return self._ekf._poses_at(times)
-
-    def earlier(self, t: float) -> EarlierPose | None:
-        return None
+        return self._filter._state.covariance, self._filter._state.layout.columns
 
 
 class Ekf(Filter):
@@ -245,19 +233,11 @@ class Ekf(Filter):
     def _doubt(self, m: Measurement) -> None:
         """Go on at another place where the search rejects the track."""
         view = _View(self)
-        refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
+        refuted = self._search.refuted(m, view.track, view.pose_back)
         best = self._search.best if refuted is not None else None
         if refuted is not None and best is not None:
             self.diagnostics.event(m.t, "lost", JUMPED, why=refuted.why, since=refuted.since)
             self._jump(self._search.brought(best, self._odometry), refuted)
-
-    def _pose_back(self, t: float, pose: Array) -> Array:
-        """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
-        return se2.compose(pose, self._poses_at(np.array([t]))[0])
-
-    def _poses_at(self, times: Array) -> Array:
-        constants = self._state.layout.values(self._state.rest).get(MOTION, np.zeros(0))
-        return self._motion.poses_at(self._odometry, times, constants)
 
     def _seek(self, m: Measurement) -> _State | None:
         if not self.supports_unknown_start:

@@ -13,12 +13,15 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
+from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.timeline import Taken, Timeline
+from factorgraph_loc.fusion.tracking import Tracked
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.sensors.base import EarlierPose
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
 from factors.motion import ChainState
@@ -42,6 +45,41 @@ class _Checkpoint(NamedTuple):
     odometry: ChainState
     records: int
     ticks: int
+
+
+class FilterView:
+    """The state of a filter as sensors read it, at the time of the filter."""
+
+    offset = None
+    newest = True
+
+    def __init__(self, owner: Any) -> None:
+        self._filter, self.t = owner, owner._t
+
+    @property
+    @abstractmethod
+    def pose(self) -> Array: ...
+    @property
+    @abstractmethod
+    def covariance(self) -> Array: ...
+    @abstractmethod
+    def value(self, name: str) -> Array | None: ...
+
+    def poses_at(self, times: Array) -> Array:
+        constants = self.value(MOTION)
+        values = np.zeros(0) if constants is None else constants
+        return np.asarray(self._filter._motion.poses_at(self._filter._odometry, times, values))
+
+    def earlier(self, t: float) -> EarlierPose | None:
+        return None
+
+    def track(self) -> Tracked:
+        """The newest pose of the track."""
+        return Tracked(self._filter._odometry, self.pose, self.covariance)
+
+    def pose_back(self, t: float, pose: Array) -> Array:
+        """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
+        return se2.compose(pose, self.poses_at(np.array([t]))[0])
 
 
 class Filter(Timeline):

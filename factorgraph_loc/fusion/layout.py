@@ -11,6 +11,7 @@ import numpy as np
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import Learnt, LearntPoint
 from factorgraph_loc.model.settings import Estimated
+from factorgraph_loc.sensors.base import Observation, View
 from factors.se2 import Array
 
 MOTION = "motion"  # the block of the constants of odometry
@@ -44,6 +45,12 @@ class Layout:
     def values(self, rest: Array) -> dict[str, Array]:
         """The blocks of a state by name. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}
+
+
+def on_pose(observation: Observation, view: View) -> Observation:
+    """An observation of the pose alone, with its blocks where they are estimated to be."""
+    values = {name: np.asarray(view.value(name)) for name in observation.blocks}
+    return observation.on_pose(values, {name: view.spread(name) for name in observation.blocks})
 
 
 def learnt_from(

@@ -16,6 +16,7 @@ At an unknown start, and after the track is rejected, particles are drawn from t
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Annotated
@@ -27,7 +28,6 @@ from factorgraph_loc.files.models import InUnit
 from factorgraph_loc.fusion import kld
 from factorgraph_loc.fusion.cloud import (
     Cloud,
-    CloudView,
     Corrected,
     corrected,
     finished,
@@ -35,11 +35,11 @@ from factorgraph_loc.fusion.cloud import (
     systematic,
     vector_moments,
 )
-from factorgraph_loc.fusion.filter import Filter, FilterSettings, twin
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, learnt_from
+from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, twin
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, learnt_from, on_pose
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.timeline import Taken
-from factorgraph_loc.fusion.tracking import LOST, Change, Tracked, Tracking, is_known
+from factorgraph_loc.fusion.tracking import LOST, Change, Tracking, is_known
 from factorgraph_loc.model.belief import Belief, Learnt, Mode, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
@@ -72,6 +72,34 @@ class ParticleFilterSettings(FilterSettings):
     self_calibration: bool = True
     """whether constants with an uncertainty in the rig travel with each particle; not the time offset of landmarks, and not
     constants of a camera, which widen its noise"""
+
+
+class _View(FilterView):
+    _filter: ParticleFilter
+
+    @property
+    def localized(self) -> bool:
+        return self._filter._state.localized
+
+    @property
+    def pose(self) -> Array:
+        return self._filter._moments()[0]
+
+    @property
+    def covariance(self) -> Array:
+        return se2.world_to_body(*self._filter._moments())
+
+    def value(self, name: str) -> Array | None:
+        cloud = self._filter._state
+        part = cloud.parts.get(name)
+        return None if part is None else np.asarray(cloud.weights @ cloud.constants[:, part])
+
+    def spread(self, name: str) -> Array:
+        cloud = self._filter._state
+        return vector_moments(cloud.constants[:, cloud.parts[name]], cloud.weights)[1]
+
+    def joint(self) -> tuple[Array, Mapping[str, slice]]:
+        return self.covariance, {}
 
 
 class ParticleFilter(Filter):
@@ -253,24 +281,23 @@ class ParticleFilter(Filter):
             if self._search.look(m, self._odometry):
                 self._state = self._sampled_cloud(self._t) or self._state
             return
-        sensor, view = self._sensors[m.source], CloudView(self)
+        sensor, view = self._sensors[m.source], _View(self)
         for observation in sensor.observe(m, view):
             if isinstance(observation, NewVariable) and not observation.sightings:
                 new = observation
                 self._state = self._state.with_block(new.name, new.mean, new.noise, self._drawn_by)
             if isinstance(observation, Link | NewVariable):
                 continue
-            on_pose = observation
+            alone = observation
             if observation.is_judged:
-                covariances = {name: view.spread(name) for name in observation.blocks}
-                on_pose = observation.on_pose(view.values(observation.blocks), covariances)
-                correction = on_pose.correct(view.pose, view.covariance, {}, {}, 1)
-                if not sensor.judge(on_pose, correction, view):
+                alone = on_pose(observation, view)
+                correction = alone.correct(view.pose, view.covariance, {}, {}, 1)
+                if not sensor.judge(alone, correction, view):
                     continue
-                self._search.slips.add(on_pose.at_its_time, self._odometry, view, correction)
-                self._search.expect(sensor, on_pose, self._odometry, view)
+                self._search.slips.add(alone.at_its_time, self._odometry, view, correction)
+                self._search.expect(sensor, alone, self._odometry, view)
             evidence = self._weigh(observation)
-            self._search.keep(sensor, on_pose, self._odometry, partial(float, evidence))
+            self._search.keep(sensor, alone, self._odometry, partial(float, evidence))
         self._doubt(m)
 
     def _pass(self, tick: Tick) -> None:
@@ -285,8 +312,8 @@ class ParticleFilter(Filter):
 
     def _doubt(self, m: Measurement) -> None:
         """Check whether the observations reject the particles. If they do, draw particles at the pose of the search."""
-        view = CloudView(self)
-        refuted = self._search.refuted(m, lambda: Tracked(self._odometry, view.pose, view.covariance), self._pose_back)
+        view = _View(self)
+        refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:
             # for the final trajectory: the track was wrong since then
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
@@ -298,10 +325,6 @@ class ParticleFilter(Filter):
     def _go_back(self, taken: Taken) -> None:
         super()._go_back(taken)
         self._changes = [(rejected, change) for rejected, change in self._changes if rejected <= self._t]
-
-    def _pose_back(self, t: float, pose: Array) -> Array:
-        """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
-        return se2.compose(pose, CloudView(self).poses_at(np.array([t]))[0])
 
     def _weigh(self, observation: Observation) -> float:
         """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`); returns the log of the mean of

@@ -22,7 +22,7 @@ from factorgraph_loc.fusion.graph.batch import AtTheEnd
 from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Node, TickAt
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.settings import GraphSettings
-from factorgraph_loc.fusion.layout import MOTION
+from factorgraph_loc.fusion.layout import MOTION, on_pose
 from factorgraph_loc.fusion.tracking import Tracking, laplace_evidence
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
@@ -78,14 +78,6 @@ class _KeyframeView:
         if keyframe is self.keyframe or not self.is_kept(keyframe.index):
             return None
         return EarlierPose(keyframe.t, graph.part_of_step(keyframe, t) if t > keyframe.t else None)
-
-    def on_pose(self, observation: Observation) -> Observation:
-        """An observation of the pose alone, with its blocks where they are estimated to be."""
-        values, covariances = {}, {}
-        for name in observation.blocks:
-            key = self.graph.keys[name]
-            values[name], covariances[name] = self.graph.values[key], self.graph.covariances[key]
-        return observation.on_pose(values, covariances)
 
 
 class Builder:
@@ -184,9 +176,9 @@ class Builder:
                 if addition is not None:
                     self._add_block(observation, sensor, view, addition)
                 continue
-            on_pose = view.on_pose(observation)
-            correction = on_pose.correct(view.pose, view.covariance, {}, {}, on_pose.iterations or ITERATIONS_OF_GUESS)
-            if observation.is_judged and not sensor.judge(on_pose, correction, view):
+            alone = on_pose(observation, view)
+            correction = alone.correct(view.pose, view.covariance, {}, {}, alone.iterations or ITERATIONS_OF_GUESS)
+            if observation.is_judged and not sensor.judge(alone, correction, view):
                 continue
             applied = True
             if addition is None:
@@ -196,10 +188,10 @@ class Builder:
                     addition.hang(view.keyframe, self._graph.node(view.keyframe, term, sensor.name))
             if view.newest:
                 if observation.is_judged:
-                    self._search.slips.add(on_pose.at_its_time, odometry, view, correction)
-                self._search.expect(sensor, on_pose, odometry, view)
-                evidence = partial(laplace_evidence, on_pose, view.pose, view.covariance, correction)
-                self._search.keep(sensor, on_pose, odometry, evidence)
+                    self._search.slips.add(alone.at_its_time, odometry, view, correction)
+                self._search.expect(sensor, alone, odometry, view)
+                evidence = partial(laplace_evidence, alone, view.pose, view.covariance, correction)
+                self._search.keep(sensor, alone, odometry, evidence)
                 view.pose = se2.moved(view.pose, correction.delta)
                 view.covariance = correction.covariance[:3, :3]
         return applied
