@@ -16,7 +16,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from factorgraph_loc.errors import InputError, message_of
@@ -31,18 +31,14 @@ _swept: set[Path] = set()  # folders that this process has cleaned up
 _own: set[Path] = set()  # paths created by this process and not yet removed
 
 
-@contextmanager
-def temporary_file(path: Path) -> Iterator[Path]:
+def temporary_file(path: Path) -> AbstractContextManager[Path]:
     """An empty file next to ``path``, with its suffix; removed at the end of the block unless it was renamed."""
-    with _created(path, path.stem, path.suffix, folder=False) as made:
-        yield made
+    return _created(path, path.stem, path.suffix, folder=False)
 
 
-@contextmanager
-def temporary_folder(path: Path) -> Iterator[Path]:
+def temporary_folder(path: Path) -> AbstractContextManager[Path]:
     """A new private folder next to ``path``; removed with its content at the end of the block."""
-    with _created(path, path.name, "", folder=True) as made:
-        yield made
+    return _created(path, path.name, "", folder=True)
 
 
 def of_system(name: str) -> Path:

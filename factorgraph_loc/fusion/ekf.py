@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks, world_estimate
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, learnt_from
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, constants_of, learnt_from
 from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -125,7 +125,7 @@ class Ekf(Filter):
         calibration: Calibration = "all" if settings.self_calibration else "none"
         use = settings.landmarks
         self._sensors = bound_sensors(Binding(setup, self._motion, self.diagnostics, use=use, calibration=calibration))
-        self._blocks = [(MOTION, self._motion.constants), *((n, s.constants) for n, s in self._sensors.items())]
+        self._constants = constants_of(self._motion, self._sensors)
         finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
         slow = {name for name, sensor in finders.items() if sensor.finder and not sensor.finder.at_once}
         # a start is known from one measurement; a lost pose is searched by the same sensors, and by those that weigh poses
@@ -161,7 +161,7 @@ class Ekf(Filter):
         if self._state is None:
             return Learnt()
         values, view = self._state.layout.values(self._state.rest), _View(self)
-        return learnt_from(dict(self._blocks), ((name, mean, view.spread(name)) for name, mean in values.items()))
+        return learnt_from(self._constants, ((name, mean, view.spread(name)) for name, mean in values.items()))
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
@@ -184,11 +184,10 @@ class Ekf(Filter):
         return state.plus(*positive.smoothed(state.covariance, step.transition, step.noise, change, later.covariance))
 
     def _start(self, prior: PosePrior) -> _State:
-        sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
+        sigmas = np.concatenate([constants.sigmas for constants in self._constants.values()])
         covariance = np.diag(np.concatenate((np.zeros(POSE), sigmas**2)))
         covariance[:POSE, :POSE] = se2.world_to_body(prior.pose, prior.covariance)
-        layout = Layout.of((name, len(constants.names)) for name, constants in self._blocks)
-        return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance, layout)
+        return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance, Layout.of(self._constants))
 
     def _predict(self, t: float) -> None:
         s = self._state

@@ -11,7 +11,8 @@ import numpy as np
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import Learnt, LearntPoint
 from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.sensors.base import Observation, View
+from factorgraph_loc.sensors.base import Observation, Sensor, View
+from factorgraph_loc.sensors.motion import Motion
 from factors.se2 import Array
 
 MOTION = "motion"  # the block of the constants of odometry
@@ -25,9 +26,9 @@ class Layout:
     sizes: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
-    def of(blocks: Iterable[tuple[str, int]]) -> Layout:
-        """Blocks of these sizes; those of size 0 are left out."""
-        return Layout({name: size for name, size in blocks if size})
+    def of(constants: Mapping[str, Estimated]) -> Layout:
+        """The blocks of estimated constants, by name."""
+        return Layout({name: len(block.names) for name, block in constants.items() if block.names})
 
     @cached_property
     def columns(self) -> Mapping[str, slice]:
@@ -45,6 +46,11 @@ class Layout:
     def values(self, rest: Array) -> dict[str, Array]:
         """The blocks of a state by name. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}
+
+
+def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Estimated]:
+    """The estimated constants of the odometry and of the sensors, by block."""
+    return {MOTION: motion.constants} | {name: sensor.constants for name, sensor in sensors.items()}
 
 
 def on_pose(observation: Observation, view: View) -> Observation:

@@ -36,7 +36,7 @@ from factorgraph_loc.fusion.cloud import (
     vector_moments,
 )
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, twin
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, learnt_from, on_pose
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, constants_of, learnt_from, on_pose
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.fusion.tracking import LOST, Change, Tracking, is_known
@@ -117,8 +117,8 @@ class ParticleFilter(Filter):
         (self._smoothing_rng,) = setup.rng.spawn(1)
         calibration: Calibration = "particles" if settings.self_calibration else "none"
         self._sensors = bound_sensors(Binding(setup, self._motion, self.diagnostics, calibration=calibration))
-        self._blocks = [(MOTION, self._motion.constants), *((n, s.constants) for n, s in self._sensors.items())]
-        columns = Layout.of((name, len(constants.names)) for name, constants in self._blocks).columns
+        self._constants = constants_of(self._motion, self._sensors)
+        columns = Layout.of(self._constants).columns
         # where they lie in the constants of the particles
         self._parts = {name: slice(part.start - POSE, part.stop - POSE) for name, part in columns.items()}
         self._search = Tracking(self._sensors, self._motion, setup.rng, self.diagnostics)
@@ -141,7 +141,7 @@ class ParticleFilter(Filter):
             return Learnt()
         cloud = self._state
         moments = {n: vector_moments(cloud.constants[:, part], cloud.weights) for n, part in cloud.parts.items()}
-        return learnt_from(dict(self._blocks), ((name, *parts) for name, parts in moments.items()))
+        return learnt_from(self._constants, ((name, *parts) for name, parts in moments.items()))
 
     def trajectory(self) -> Trajectory:
         """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""
@@ -223,7 +223,7 @@ class ParticleFilter(Filter):
         if previous is not None:
             rows = self._drawn_by.permutation(systematic(previous.weights, self._drawn_by, count))
             return replace(previous, poses=poses, constants=previous.constants[rows], log_weights=log_weights)
-        sigmas = np.concatenate([constants.sigmas for _, constants in self._blocks])
+        sigmas = np.concatenate([constants.sigmas for constants in self._constants.values()])
         constants = self._drawn_by.standard_normal((count, len(sigmas))) * sigmas
         return Cloud(poses, constants, log_weights, parts=self._parts, odometry=self._odometry)
 

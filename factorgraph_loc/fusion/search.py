@@ -69,15 +69,14 @@ class Search:
 
     def remember(self) -> None:
         """Keep the odometry for a later search."""
-        self._motion.keep(2.0 * DURATION)
-        self._horizon = 2.0 * DURATION
+        self._motion.horizon = self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:
         """Search the heading at a known position; None ends that."""
         self.start = start
         for finder in self._finders.values():
             finder.start = start
-        self._motion.keep(self._horizon if start is None else START_KEPT)
+        self._motion.horizon = self._horizon if start is None else START_KEPT
         if start is not None and self._weighs:
             self._population = self._new_population(start)
 

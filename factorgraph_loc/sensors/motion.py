@@ -89,10 +89,6 @@ class Motion(OdometryChain):
         super().__init__(model, use_gyro=use_gyro, horizon=HORIZON, estimated=self.constants.indices)
         self._diagnostics = diagnostics
 
-    def keep(self, horizon: float) -> None:
-        """Keep the odometry of the last ``horizon`` seconds."""
-        self.horizon = horizon
-
     def add(self, m: Measurement) -> None:
         """Add a row, or :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are counted as ignored, those
         older than the kept rows as late."""
@@ -145,7 +141,7 @@ class Motion(OdometryChain):
 def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
     """The motion between any two times of a log, from the odometry and gyro among ``sensors``."""
     motion = Motion(log.rig, tuple(sensors), Diagnostics())
-    motion.keep(math.inf)
+    motion.horizon = math.inf
     for m in log.measurements(sensors):
         if isinstance(m, VelocityOdometry | IncrementOdometry | YawRate):
             motion.add(m)

@@ -50,9 +50,9 @@ class Plan:
     def faces(self) -> tuple[Array, Array]:
         """The sides of walls and of boxes as segments (F, 4) with the free side on the left. Inner walls have two."""
         walls = np.array([face for wall in self.walls for face in both_sides(wall)]).reshape(-1, 4)
-        before = _places(walls, np.full(len(walls), 0.5))[:, :2]
+        middles = _places(walls, np.full(len(walls), 0.5))[:, :2]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
-        return walls[self.indoors(before)], np.array(boxes).reshape(-1, 4)
+        return walls[self.indoors(middles)], np.array(boxes).reshape(-1, 4)
 
     def open(self, points: Array) -> NDArray[np.bool_]:
         """Whether points (N, 2) are inside the building and outside of all boxes."""

@@ -105,15 +105,13 @@ class AtTheEnd:
         self._guesses = {key: value for key, value in self._guesses.items() if key in graph.values}
         newest.causal = graph.pose, graph.covariance
 
-    def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
-        """Take a new keyframe with the ``guess`` of its pose, and what came with it."""
-        self.attach(keyframe, addition, guess)
-
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Take what was added to a keyframe that is in the graph."""
+        """Take what was added to a keyframe, which may be new. ``guess``: of the pose of the newest one."""
         self._guesses |= addition.values
         if guess is not None:
             keyframe.causal = self._graph.pose, self._graph.covariance = guess
+
+    extend = attach
 
     def current(self, key: int) -> Array:
         """The newest estimate of a variable that is no pose."""

@@ -13,12 +13,11 @@ import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.graph.marginals import DAMPED, blamed
-from factorgraph_loc.fusion.layout import MOTION
+from factorgraph_loc.fusion.layout import MOTION, constants_of
 from factorgraph_loc.fusion.tracking import Change
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
@@ -175,8 +174,7 @@ class Graph:
 
     def __init__(self, motion: Motion, sensors: Mapping[str, Sensor], mapper: Mapper, diagnostics: Diagnostics) -> None:
         self.motion, self.sensors, self.mapper, self.diagnostics = motion, sensors, mapper, diagnostics
-        self.constants: dict[str, Estimated] = {MOTION: motion.constants}
-        self.constants |= {name: sensor.constants for name, sensor in sensors.items()}
+        self.constants = constants_of(motion, sensors)
         self.keys = {n: constants_key(i) for i, (n, c) in enumerate(self.constants.items()) if c.names}
         self.values, self.covariances = self.constant_priors()
         self.departed: tuple[Values, Values] = {}, {}

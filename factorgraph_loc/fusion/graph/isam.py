@@ -56,8 +56,7 @@ class Incremental:
             if sensor.follows_constants and name in graph.keys
         }
         self._failed: list[str] = []  # reasons of factors that could not be linearised
-        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
-        self._solver = self._new_solver("CHOLESKY" if self._maps else "QR")
+        self._solver = self._new_solver()
         self._waiting = Addition()
         self._solved = -math.inf  # the time of the newest keyframe in the solver
         self._oldest = 0  # the number of the oldest keyframe that has not left the window
@@ -107,7 +106,7 @@ class Incremental:
         summary = self._solver.summary(failed=False)
         summary = None if summary is None else summary.before_pose(newest.index)
         self._graph.forget_landmarks(frozenset() if summary is None else summary.keys)
-        self._start_again(newest, summary, "CHOLESKY" if self._maps else "QR")
+        self._start_again(newest, summary)
 
     def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
         """Take a new keyframe with the ``guess`` of its pose, and what came with it."""
@@ -165,7 +164,7 @@ class Incremental:
             why = self._graph.reason(error)
             self._graph.diagnostics.event(newest.t, "solver_rebuilt", "solver rebuilt: {why}", why=why)
             newest.causal = guess
-            self._start_again(newest, self._solver.summary(failed=True), "QR", failed=True)
+            self._start_again(newest, self._solver.summary(failed=True), failed=True)
         while self._failed:
             self._graph.diagnostics.reject(f"factor: {self._failed.pop()}")
 
@@ -249,16 +248,14 @@ class Incremental:
             self._graph.departed[0][key], self._graph.departed[1][key] = estimate
             del self._graph.values[key], self._graph.covariances[key]
 
-    def _start_again(
-        self, newest: Keyframe, summary: MarginalSummary | None, factorization: str, *, failed: bool = False
-    ) -> None:
+    def _start_again(self, newest: Keyframe, summary: MarginalSummary | None, *, failed: bool = False) -> None:
         """A new solver with what is in the graph; ``failed``: whether the one before did. RunFailedError where it fails.
 
         A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
         begins with the priors.
         """
         graph, first = self._graph, 0 if summary is None else summary.oldest
-        self._solver, self._waiting, self._solved = self._new_solver(factorization), Addition(), newest.t
+        self._solver, self._waiting, self._solved = self._new_solver(failed=failed), Addition(), newest.t
         keyframes = [k for k in graph.keyframes.values() if k.index >= first]
         guesses = {k.key: k.causal[0] for k in keyframes if k.causal is not None} | graph.values
         known: Collection[int] = () if summary is None else summary.keys
@@ -304,9 +301,10 @@ class Incremental:
         native = gtsam.BetweenFactorPose2(previous, keyframe.key, gtsam.Pose2(*step.delta), noise)
         return Node((previous, keyframe.key), native=native)
 
-    def _new_solver(self, factorization: str) -> FullHistory | Window:
+    def _new_solver(self, *, failed: bool = False) -> FullHistory | Window:
         parameters = gtsam.ISAM2Params()
-        parameters.setFactorization(factorization)
+        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
+        parameters.setFactorization("CHOLESKY" if self._maps and not failed else "QR")
         # far from where a point was first taken to be its factors mean nothing
         parameters.relinearizeSkip = 1 if self._maps else CHECKED_EVERY
         if self._lag is None:
