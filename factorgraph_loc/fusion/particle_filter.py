@@ -74,7 +74,7 @@ class ParticleFilterSettings(FilterSettings):
     constants of a camera, which widen its noise"""
 
 
-class _View(FilterView):
+class _CloudView(FilterView):
     _filter: ParticleFilter
 
     @property
@@ -281,7 +281,7 @@ class ParticleFilter(Filter):
             if self._search.look(m, self._odometry):
                 self._state = self._sampled_cloud(self._t) or self._state
             return
-        sensor, view = self._sensors[m.source], _View(self)
+        sensor, view = self._sensors[m.source], _CloudView(self)
         for observation in sensor.observe(m, view):
             if isinstance(observation, NewVariable) and not observation.sightings:
                 new = observation
@@ -312,7 +312,7 @@ class ParticleFilter(Filter):
 
     def _doubt(self, m: Measurement) -> None:
         """Check whether the observations reject the particles. If they do, draw particles at the pose of the search."""
-        view = _View(self)
+        view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:
             # for the final trajectory: the track was wrong since then

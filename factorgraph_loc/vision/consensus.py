@@ -7,13 +7,12 @@ one point.) The prediction of a robot on a floor has a covariance of rank 5, and
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from factors import gaussian, positive
+from factors import chi_squared, gaussian, positive
 from factors.camera import kernels as reprojection_kernels
 from factors.camera import model as reprojection
 from factors.camera.kernels import Lens
@@ -53,7 +52,7 @@ def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels
         joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *arrays)
     except np.linalg.LinAlgError:  # an extreme covariance: each point is tested separately
         return False
-    return bool(joint < _largest(2 * len(points)))
+    return bool(joint < chi_squared.quantile(JOINT, 2 * len(points)))
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
@@ -116,11 +115,6 @@ def _best_of_samples(
             break
     assert best is not None
     return best[1:]
-
-
-@cache
-def _largest(dof: int) -> float:
-    return float(scipy.special.chdtri(dof, 1.0 - JOINT))
 
 
 @compiled(error_model="numpy")
