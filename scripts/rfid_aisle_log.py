@@ -18,7 +18,7 @@ from factorgraph_loc.sensors.odometry import simulation as simulated_odometry
 from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
 from factorgraph_loc.sensors.rfid.map import TagsFile, read_tags
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ends_of, make_rfid_stream, rounds_from_gaps
+from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, ends_of, rounds_from_gaps
 from factors import se2
 
 ANTENNAS = ("first", "second", "third")
@@ -78,13 +78,12 @@ def read_reads(folder: Path, t0_ns: int, end: float) -> tuple[RfidStream, tuple[
     whole = (t_ns[first] >= t0_ns) & ((end_ns - t0_ns) / 1e9 <= end)
     keep = whole[number]
     left_out = f"{folder}: {np.count_nonzero(~keep)} of {len(keep)} reads are outside of the reference and skipped"
-    stream = make_rfid_stream(
+    reads = ReadsByRound(
         t_ns[keep],
         (np.cumsum(whole) - 1)[number[keep]],
         table[keep, EPC].tolist(),
         (rssi[keep], np.radians(phase[keep]), carrier[keep] * 1e6),
         end_ns[whole],
         [antenna[i] for i in first[whole].tolist()],
-        t0_ns,
     )
-    return stream, () if np.all(keep) else (left_out,)
+    return reads.stream(t0_ns), () if np.all(keep) else (left_out,)

@@ -198,7 +198,7 @@ class Localizer:
             estimator.diagnostics.ignore(f"{m.sensor} is not among the sensors")
             return
         if offset:
-            m = _moved(m, offset)
+            m = replace(m, t=m.t + offset)  # type: ignore[type-var]
         self._check_stamp(m)
         self._newest = max(self._newest, m.t)
         self._last = None
@@ -271,12 +271,6 @@ class Localizer:
 def _copied(e: PoseEstimate, t: float) -> PoseEstimate:
     """The estimate with the time ``t``, and arrays of its own."""
     return replace(e, t=t, pose=np.array(e.pose), covariance=np.array(e.covariance))
-
-
-def _moved(m: Measurement, offset: float) -> Measurement:
-    """The measurement with its time offset applied."""
-    moved: Measurement = replace(m, t=m.t + offset)  # type: ignore[type-var]
-    return moved
 
 
 # bounds of standard deviations in m and rad: a wider one means an unknown pose, a narrower one is implausible

@@ -172,7 +172,9 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
     passed = path.passed(sensors.metres_per_radian)
-    by_pose = expected_information(poses[1:], np.diff(passed), sensors)
+    by_pose: Array = np.zeros((len(poses) - 1, 3, 3))
+    for forecast in sensors.forecasts:
+        by_pose += forecast.information(poses[1:], np.diff(passed))
     columns = (path.metres.tolist(), path.poses.tolist(), path.turned.tolist())
     states = [
         ChainState(d / SPEED, x, y, heading, d, turn, 0.0) for d, (x, y, heading), turn in zip(*columns, strict=True)
@@ -194,13 +196,3 @@ def fisher_gain(
     fine = np.diag(FINEST**2)
     entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine, dims) for path in paths]
     return np.asarray(gaussian_entropy(covariance + fine, dims) - np.array(entropies, dtype=float))
-
-
-def expected_information(poses: Array, lengths: Array, sensors: Sensors) -> Array:
-    """Fisher information (N, 3, 3) on a body-frame perturbation of poses (N, 3), from all sensors, while driving
-    ``lengths`` (N,) [m] around each pose, or turning for the same time.
-    """
-    out = np.zeros((len(poses), 3, 3))
-    for forecast in sensors.forecasts:
-        out += forecast.information(poses, lengths)
-    return out

@@ -87,12 +87,7 @@ class TagStates:
         self._doubtful: Integers | None = None  # not known
         # time, tags, and the log-likelihoods of their states
         self._evidence: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
-        self._last_read = -math.inf
-
-    @property
-    def last_read(self) -> float:
-        """Time of the last read [s], ``-inf`` if there was none."""
-        return self._last_read
+        self.last_read = -math.inf  # time [s]
 
     @property
     def doubtful(self) -> Integers:
@@ -124,7 +119,7 @@ class TagStates:
             if _hear(self._weights, self.odds, tags):
                 self._doubtful = None
             self._raise_prior()
-            self._last_read = max(self._last_read, t)
+            self.last_read = max(self.last_read, t)
 
     def expect(self, tags: Integers, evidence: Array) -> Array:
         """The log-likelihood (U,) of a scan's reads and misses of U ``tags`` that are not as surveyed. ``evidence`` (U, S): the

@@ -12,7 +12,6 @@ from factorgraph_loc.planning.information import (
     FINEST,
     expected_covariance,
     expected_gain,
-    expected_information,
     fisher_gain,
     gaussian_entropy,
 )
@@ -60,9 +59,9 @@ def test_one_look_at_a_landmark_is_one_update_of_a_kalman_filter():
 
 def test_no_landmark_is_seen_through_a_wall():
     world = World(landmarks={"L": Landmark(x=4.0, y=2.0)}, walls=((2.5, -5.0, 2.5, 9.0),))
-    sensors = Sensors(NOISE, (LandmarkForecast(world, RIG.bearing_range.model()),))
-    assert not expected_information(np.array(((1.0, 2.0, 0.0),)), np.ones(1), sensors).any()
-    assert expected_information(np.array(((3.0, 2.0, 0.0),)), np.ones(1), sensors).any()
+    forecast = LandmarkForecast(world, RIG.bearing_range.model())
+    assert not forecast.information(np.array(((1.0, 2.0, 0.0),)), np.ones(1)).any()
+    assert forecast.information(np.array(((3.0, 2.0, 0.0),)), np.ones(1)).any()
 
 
 def tagged(*places):

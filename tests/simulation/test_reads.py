@@ -12,6 +12,7 @@ from factorgraph_loc import RfidScan, Rig
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.simulation import FaultSettings, draw_dead, draw_reads, read_probabilities
 from factorgraph_loc.simulation import preset
+from factors.rfid.detection import RfidLikelihood
 from factors.rfid.model import BeamModel
 
 TIMES = np.arange(1, 2001) * 0.5
@@ -136,7 +137,8 @@ def test_a_rigs_survey_tells_where_the_tags_are(make):
     shifted = Rig.model_validate(rig | {"survey": {"x": 3.0}})
     log = make(rig={"survey": {"x": 3.0}})
     tags = tag_map(log.world, shifted.survey)
-    p = read_probabilities(shifted.rfid, tags.tags, log.reference.at(np.arange(1, 121) * 0.5))
+    likelihood = RfidLikelihood(shifted.rfid.model(), tags.tags)
+    p = read_probabilities(likelihood, log.reference.at(np.arange(1, 121) * 0.5))
     likely = p.sum(axis=(0, 1))
     _, epcs = reads_of(log)
     counts = np.array([(epcs == name).sum() for name in tags.names])

@@ -108,11 +108,10 @@ class FaultSettings(FileModel):
 Hits = NDArray[np.bool_]
 
 
-def read_probabilities(rfid: RfidSettings, tags: TagArray, poses: Array) -> Array:
+def read_probabilities(likelihood: RfidLikelihood, poses: Array) -> Array:
     """Probability (N, A, T), floor included, that a round of each antenna at poses (N, 3) reads each tag."""
-    model = rfid.model()
-    likelihood = RfidLikelihood(model, tags)
-    return np.stack([likelihood.probabilities(poses, a) for a in range(len(model.antennas))], axis=1)
+    antennas = range(len(likelihood.model.antennas))
+    return np.stack([likelihood.probabilities(poses, a) for a in antennas], axis=1)
 
 
 def draw_dead(faults: FaultSettings, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -165,24 +164,21 @@ def rfid_stream(
     empty = listened & ~hits.any(axis=2)
     # an additional column for rounds without reads
     n, a, tag = np.nonzero(np.concatenate((hits & listened[:, :, None], empty[:, :, None]), axis=2))
-    t = _jumped(times, faults.clock_jump)[n]
+    if (jump := faults.clock_jump) is not None:
+        times = times + np.where(times >= jump.time, jump.jump, 0.0)
     labels = [*epcs, ""]
     read = tag < len(epcs)
     columns: dict[str, Any] = {name: np.full(len(n), np.nan) for name in ("rssi", "phase", "frequency")}
     for name, values in signals.items():
         columns[name][read] = values[n[read], a[read], tag[read]]
     return RfidStream(
-        t=t,
+        t=times[n],
         round=a.astype(np.int64),
         antenna=[names[i] for i in a.tolist()],
         epc=[labels[i] for i in tag.tolist()],
         age=np.zeros(len(n)),
         **columns,
     )
-
-
-def _jumped(times: Array, jump: ClockJump | None) -> Array:
-    return times if jump is None else times + np.where(times >= jump.time, jump.jump, 0.0)
 
 
 def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.Generator) -> Hits:
@@ -254,7 +250,7 @@ def simulate(ride: Ride) -> Simulated:
     tags = tag_map(ride.world, ride.rig.of(SurveySettings))
     times = ride.times(settings.rounds_per_second)
     poses = ride.truth.at(times)
-    p = read_probabilities(rfid, tags.tags, poses)
+    p = read_probabilities(RfidLikelihood(rfid.model(), tags.tags), poses)
     names, epcs = list(rfid.all_antennas()), list(tags.names)
     dead = draw_dead(settings.faults, len(epcs), rng)
     hits = draw_reads(rfid, p, times, settings.faults, dead, rng)
@@ -311,7 +307,7 @@ class SimulatedReader:
 
     def measure(self, t: float, pose: Array) -> RfidScan:
         """A round that ends at ``t``."""
-        chance = np.stack([self._likelihood.probabilities(pose[None], a)[0] for a in range(len(self._antennas))])
+        chance = read_probabilities(self._likelihood, pose[None])[0]
         antenna, tag = np.nonzero(self._rng.random(chance.shape) < chance)
         unknown = np.full(len(tag), np.nan)
         names = tuple(self._map.names[i] for i in tag.tolist())

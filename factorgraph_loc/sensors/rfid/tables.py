@@ -64,47 +64,16 @@ def ends_of(t_ns: Integers, number: Integers, gap: float) -> Integers:
     return np.asarray(np.minimum(t_ns[last] + round(gap * 1e9), following), dtype=np.int64)
 
 
-def make_rfid_stream(
-    t_ns: Integers,
-    number: Integers,
-    epc: Sequence[str],
-    columns: tuple[Array, Array, Array],
-    end_ns: Integers,
-    inventory_antenna: Sequence[str],
-    t0_ns: int,
-) -> RfidStream:
-    """The stream of N reads in rounds ``number`` (N,) of R, in the order of the rounds.
-
-    ``columns``: RSSI, phase and frequency, each (N,). ``end_ns`` (R,) and ``inventory_antenna`` (R): the rounds in order of
-    arrival. Reads of a round keep their order; a round without reads becomes a row without an EPC.
-    """
-    silent = np.setdiff1d(np.arange(len(end_ns)), number)
-    rounds = np.concatenate((number, silent))
-    order = np.argsort(rounds, kind="stable")
-    rounds = rounds[order]
-    ages = np.concatenate(((end_ns[number] - t_ns) / 1e9, np.zeros(len(silent))))
-    nothing = np.full(len(silent), np.nan)
-    rssi, phase, frequency = (np.concatenate((column, nothing))[order] for column in columns)
-    names = [*epc, *[""] * len(silent)]
-    return RfidStream(
-        t=np.asarray((end_ns[rounds] - t0_ns) / 1e9),
-        round=rounds,
-        antenna=[inventory_antenna[i] for i in rounds.tolist()],
-        epc=[names[i] for i in order.tolist()],
-        age=ages[order],
-        rssi=rssi,
-        phase=phase,
-        frequency=frequency,
-    )
-
-
 SIGNALS = ("rssi", "phase", "frequency")  # optional columns of reads
 ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 
 
 @dataclass(frozen=True)
 class ReadsByRound:
-    """N reads in R rounds: see :func:`~factorgraph_loc.sensors.rfid.tables.make_rfid_stream`."""
+    """N reads in rounds ``number`` (N,) of R.
+
+    ``columns``: RSSI, phase and frequency, each (N,). ``end_ns`` (R,) and ``antenna`` (R): the rounds in order of arrival.
+    """
 
     t_ns: Integers
     number: Integers
@@ -114,7 +83,28 @@ class ReadsByRound:
     antenna: list[str]
 
     def stream(self, t0_ns: int) -> RfidStream:
-        return make_rfid_stream(self.t_ns, self.number, self.epc, self.columns, self.end_ns, self.antenna, t0_ns)
+        """The stream of the reads, in the order of the rounds.
+
+        Reads of a round keep their order; a round without reads becomes a row without an EPC.
+        """
+        silent = np.setdiff1d(np.arange(len(self.end_ns)), self.number)
+        rounds = np.concatenate((self.number, silent))
+        order = np.argsort(rounds, kind="stable")
+        rounds = rounds[order]
+        ages = np.concatenate(((self.end_ns[self.number] - self.t_ns) / 1e9, np.zeros(len(silent))))
+        nothing = np.full(len(silent), np.nan)
+        rssi, phase, frequency = (np.concatenate((column, nothing))[order] for column in self.columns)
+        names = [*self.epc, *[""] * len(silent)]
+        return RfidStream(
+            t=np.asarray((self.end_ns[rounds] - t0_ns) / 1e9),
+            round=rounds,
+            antenna=[self.antenna[i] for i in rounds.tolist()],
+            epc=[names[i] for i in order.tolist()],
+            age=ages[order],
+            rssi=rssi,
+            phase=phase,
+            frequency=frequency,
+        )
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
