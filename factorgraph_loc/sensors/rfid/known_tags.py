@@ -115,13 +115,11 @@ class KnownTags:
         self._antennas = {} if settings is None else {name: i for i, name in enumerate(settings.all_antennas())}
         self._rounds: dict[tuple[str, ...], tuple[list[int], Integers, Integers]] = {}
         self.map: TagMap = tag_map(setup.world, setup.rig.survey)
-        self.likelihood, self.trust = None, 1.0
+        self.likelihood, self.trust, shares = None, 1.0, (0.0, 0.0, 0.0)
         if settings is not None:
             model, self.trust = settings.model(), trust(self.map.sigmas, settings.pass_sigma)
             self._tempering = model.tempering
             self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
-        shares = (0.0, 0.0, 0.0)
-        if settings is not None:
             shares = settings.dead_tags, settings.weak_tags, settings.moved_tags
         self.states = TagStates(len(self.map.names), *shares)
         self._excluded: set[int | None] = set()  # antennas that are dead

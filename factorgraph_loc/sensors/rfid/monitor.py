@@ -234,7 +234,7 @@ class ConsistencyMonitor:
         self._last = t
         self._groups.sums[:2] *= forgotten
         self._groups.sums[2] *= forgotten**2
-        _add(self._groups.sums, measured.antennas, measured.rounds, reads.hits, reads.p, reads.distance, counts)
+        self._groups.add(measured.antennas, measured.rounds, reads, counts)
         by_distance, by_antenna = self._chance(slice(0, BANDS), together), self._chance(slice(BANDS, None), together)
         chance = min(by_distance, by_antenna)
         self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
