@@ -64,7 +64,7 @@ class ExperimentOptions:
 
 
 @app.command()
-def new(file: File, overwrite: Overwrite = False) -> None:
+def new(file: File, overwrite: Overwrite = False, json: Json = False) -> None:
     """Write a first experiment file, with comments.
 
     Example: fgloc experiment new lags.toml
@@ -72,7 +72,10 @@ def new(file: File, overwrite: Overwrite = False) -> None:
     from factorgraph_loc.experiments.experiment_file import write_new
 
     write_new(file, overwrite=overwrite)
-    show.line(f"wrote {file}; `fgloc experiment run {file}` runs it")
+    if json:
+        show.document({"file": str(file)})
+    else:
+        show.line(f"wrote {file}; `fgloc experiment run {file}` runs it")
 
 
 @app.command()
