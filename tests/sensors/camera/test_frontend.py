@@ -2,7 +2,6 @@
 
 import ast
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from picture import SMALL
 from factorgraph_loc import FeatureStream, ImageStream, InputError, Log, Rig, World
 from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.frontend import with_features
-from factorgraph_loc.vision.feature_cache import FeatureCache
+from factorgraph_loc.vision import feature_cache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
 from factorgraph_loc.vision.settings import FrontendSettings
 
@@ -151,7 +150,7 @@ def test_the_cache_does_not_grow_without_end(log, cache, monkeypatch):
     frames(log)
     kept = {path for path in cache.rglob("*") if path.is_file()}
     size = sum(path.stat().st_size for path in kept)
-    monkeypatch.setattr(frontend, "FeatureCache", partial(FeatureCache, limit=size))
+    monkeypatch.setattr(feature_cache, "LIMIT", size)
     frames(log, FrontendSettings(feature="orb", count=90))
     assert any(not path.exists() for path in kept)
     assert sum(path.stat().st_size for path in cache.rglob("*") if path.is_file()) < 1.1 * size
