@@ -1,7 +1,7 @@
 """``fgloc estimators``, ``sensors``, ``readers``, ``presets``, ``policies`` and ``rigs`` as functions: what there is to choose
 from."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -117,17 +117,18 @@ def new_rig(
     odometry: first.Drive = "differential",
     imu: bool = False,
     landmarks: float | None = None,
-    antennas: int = 0,
+    antennas: int | Sequence[str] = 0,
     camera: tuple[int, int] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Rig:
     """A first rig of a robot with some sensors, written with comments to ``out`` if it is given.
 
-    ``landmarks``: standard deviation of ranges to landmarks [m]; ``antennas``: number of RFID antennas; ``camera``: width and
-    height of its images [px]. InputError if a value is out of bounds, or the file exists.
+    ``landmarks``: standard deviation of ranges to landmarks [m]; ``antennas``: number or names of RFID antennas; ``camera``: width
+    and height of its images [px]. InputError if a value is out of bounds, or the file exists.
     """
-    rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, antennas, camera))
+    names = tuple(map(str, range(1, antennas + 1))) if isinstance(antennas, int) else tuple(antennas)
+    rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, names, camera))
     if out is not None:
         write_new_rig(rig, remarks, Path(out), overwrite=overwrite)
     return rig

@@ -18,7 +18,6 @@ from factorgraph_loc.text import quoted
 T = TypeVar("T")
 MOST_ANTENNAS = 64
 DRIVES: dict[str, Any] = {name: name for name in ("differential", "omnidirectional", "none")}
-COUNTS = {str(count): count for count in range(MOST_ANTENNAS + 1)}
 YES = {"yes": True, "no": False}
 app = typer.Typer(rich_markup_mode=None)
 
@@ -72,7 +71,9 @@ def new(
     landmarks: Annotated[
         str | None, typer.Option(metavar="METRES", help="Standard deviation of ranges to landmarks, or none.")
     ] = None,
-    antennas: Annotated[str | None, typer.Option(metavar="NUMBER", help="RFID antennas, around the body.")] = None,
+    antennas: Annotated[
+        str | None, typer.Option(metavar="NUMBER|A,B", help="RFID antennas around the body: how many, or their names.")
+    ] = None,
     camera: Annotated[str | None, typer.Option(metavar="WxH", help="Size of its images, 640x480, or none.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="The rig to write.")] = None,
     overwrite: Overwrite = False,
@@ -80,7 +81,7 @@ def new(
 ) -> None:
     """Write the rig of a robot with some sensors, with comments. At a terminal, options that are not given are asked for.
 
-    Example: fgloc rigs new --antennas 2 -o cart.rig.toml
+    Example: fgloc rigs new --antennas left,right -o cart.rig.toml
     """
     from factorgraph_loc.api.lookups import write_new_rig
     from factorgraph_loc.io.native.rig_file import RobotOptions, new_rig
@@ -90,7 +91,7 @@ def new(
         _value("--odometry", odometry, "differential", f"one of {', '.join(DRIVES)}", DRIVES.__getitem__, asks),
         _value("--imu", None if imu is None else "yes" if imu else "no", "no", "yes or no", YES.__getitem__, asks),
         _value("--landmarks", landmarks, "none", "the noise of a range in m, or none", _metres, asks),
-        _value("--antennas", antennas, "0", f"a whole number from 0 to {MOST_ANTENNAS}", COUNTS.__getitem__, asks),
+        _value("--antennas", antennas, "0", f"a number from 0 to {MOST_ANTENNAS}, or names", _antennas, asks),
         _value("--camera", camera, "none", "a size such as 640x480, or none", _size, asks),
     )
     given, name = None if out is None else str(out), "robot.rig.toml" if asks else ""
@@ -120,6 +121,13 @@ def _value(option: str, given: str | None, default: str, expected: str, parse: C
             if given is not None or not asks:
                 raise InputError(wrong) from error
             show.note(wrong)
+
+
+def _antennas(text: str) -> tuple[str, ...]:
+    names = tuple(map(str, range(1, int(text) + 1))) if text.isdecimal() else tuple(text.split(","))
+    if not all(names) or len(set(names)) < len(names) or len(names) > MOST_ANTENNAS:
+        raise ValueError
+    return names
 
 
 def _metres(text: str) -> float | None:

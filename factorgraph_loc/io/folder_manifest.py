@@ -1,6 +1,7 @@
 """A proposed manifest for a folder of tables: which file is which sensor, with columns, units and clock offsets."""
 
 import os
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from factorgraph_loc.files.models import read_text
 from factorgraph_loc.io.field_names import TRUTH
 from factorgraph_loc.io.guesses import Guess, guess, sample_of
 from factorgraph_loc.io.proposals import Proposal, proposal_of, toml_of
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import LISTED, listed, quoted
 from factors.se2 import Array
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".tum")
@@ -82,7 +83,10 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
         roles.remarks.append(f"not used: {listed(unused)}")
     if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
         antennas = dict.fromkeys(roles.tables["rfid"].sample.columns[roles.tables["rfid"].fields["antenna"]])
-        roles.remarks.append(f"the rig needs the antennas {listed(antennas)}, by these names in [rfid.antennas]")
+        names = shlex.quote(",".join(antennas)) if len(antennas) < LISTED else listed(antennas)
+        roles.remarks.append(
+            f"the rig needs antennas of these names, as `fgloc rigs new --antennas {names}` writes them"
+        )
     beside = [] if "world" in options or any(path.parent.glob("*.world.toml")) else _map_in_parent(path, roles)
     roles.remarks += beside
     return proposal_of("mapped", path, folder, options, roles.remarks, with_map=not beside and "world" not in options)

@@ -45,6 +45,12 @@ def test_a_new_rig_has_the_sensors_that_are_named(fgloc, tmp_path):
     assert read_rig(file).sensors == ("odometry",)
 
 
+def test_antennas_have_the_given_names(fgloc, refused, tmp_path):
+    assert fgloc("rigs", "new", "--antennas", "A,B", "-o", tmp_path / "a.toml").exit_code == 0
+    assert list(read_rig(tmp_path / "a.toml").rfid.antennas) == ["A", "B"]
+    assert "--antennas is 'A,A'" in refused("rigs", "new", "--antennas", "A,A", "-o", tmp_path / "b.toml")
+
+
 def test_eight_antennas_stand_as_on_the_robot_of_the_paper(fgloc, tmp_path):
     fgloc("rigs", "new", "--antennas", 8, "-o", tmp_path / "a.toml")
     made, published = read_rig(tmp_path / "a.toml").rfid.antennas, rackham()

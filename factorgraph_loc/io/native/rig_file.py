@@ -84,12 +84,12 @@ def _comment(setting: Setting | None) -> str:
 @dataclass(frozen=True)
 class RobotOptions:
     """The sensors of a robot. ``landmarks``: standard deviation of a range [m], None without such a sensor; ``antennas``: their
-    number; ``camera``: width and height of its images [px]."""
+    names; ``camera``: width and height of its images [px]."""
 
     odometry: Drive = "differential"
     imu: bool = False
     landmarks: float | None = None
-    antennas: int = 0
+    antennas: tuple[str, ...] = ()
     camera: tuple[int, int] | None = None
 
 
@@ -131,18 +131,18 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
     return parse_model(Rig, content, "the new rig"), remarks
 
 
-def _antennas(count: int) -> dict[str, dict[str, float]]:
-    """Antennas 1, 2, ... around the body, counter-clockwise from the front; two point to the left and to the right."""
-    first = math.pi / 2.0 if count == 2 else 0.0
-    directions = [se2.wrap_scalar(first + 2.0 * math.pi * i / count) for i in range(count)]
+def _antennas(names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Antennas around the body, counter-clockwise from the front; two point to the left and to the right."""
+    first = math.pi / 2.0 if len(names) == 2 else 0.0
+    directions = [se2.wrap_scalar(first + 2.0 * math.pi * i / len(names)) for i in range(len(names))]
     return {
-        str(i): {
+        name: {
             "x": round(RADIUS * math.cos(yaw), 4),
             "y": round(RADIUS * math.sin(yaw), 4),
             "z": HEIGHT,
             "yaw": yaw,
         }
-        for i, yaw in enumerate(directions, start=1)
+        for name, yaw in zip(names, directions, strict=True)
     }
 
 
