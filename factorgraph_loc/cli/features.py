@@ -32,7 +32,7 @@ def evaluate(
 ) -> None:
     """Compare features on images of planar scenes: repeatability, matching, time.
 
-    Example: fgloc features evaluate images/graffiti
+    Example: fgloc features evaluate images/graffiti -o out/graffiti
     """
     from factorgraph_loc.api import learning
     from factorgraph_loc.evaluation.features import scores as evaluation

@@ -98,7 +98,7 @@ def presets(name: Annotated[str | None, _name("settings", completion.preset)] = 
 def policies(json: Json = False) -> None:
     """List the policies of active robots, and the settings of `fgloc active`.
 
-    Example: fgloc policies information
+    Example: fgloc policies
     """
     from factorgraph_loc.api.lookups import known_policies
 

@@ -48,7 +48,7 @@ def show_(
 ) -> None:
     """Print a rig as TOML, each key with its meaning.
 
-    Example: fgloc rigs show plaza1
+    Example: fgloc rigs show plaza
     """
     from factorgraph_loc.api.lookups import sources_of_rigs
     from factorgraph_loc.files.models import nearest

@@ -68,7 +68,7 @@ def _draw(
     density = np.empty(count)
     rows = np.empty(len(later), np.int64)
     for j in range(len(later)):
-        # one loop per term, so that each runs on several particles at once
+        # one loop per term: the compiler can then process several particles per instruction
         for i in range(count):
             dx, dy = later[j, 0] - predicted[i, 0], later[j, 1] - predicted[i, 1]
             along, lateral = cosine[i] * dx + sine[i] * dy, cosine[i] * dy - sine[i] * dx

@@ -106,7 +106,7 @@ class _View(FilterView):
     def value(self, name: str) -> Array | None:
         return self._filter._state.layout.values(self._filter._state.rest).get(name)
 
-    def spread(self, name: str) -> Array:
+    def block_covariance(self, name: str) -> Array:
         part = self._filter._state.layout.columns[name]
         return self._filter._state.covariance[part, part]
 
@@ -161,7 +161,9 @@ class Ekf(Filter):
         if self._state is None:
             return Learnt()
         values, view = self._state.layout.values(self._state.rest), _View(self)
-        return learnt_from(self._constants, ((name, mean, view.spread(name)) for name, mean in values.items()))
+        return learnt_from(
+            self._constants, ((name, mean, view.block_covariance(name)) for name, mean in values.items())
+        )
 
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""

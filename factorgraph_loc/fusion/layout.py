@@ -56,7 +56,7 @@ def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Est
 def on_pose(observation: Observation, view: View) -> Observation:
     """An observation of the pose alone, with its blocks where they are estimated to be."""
     values = {name: np.asarray(view.value(name)) for name in observation.blocks}
-    return observation.on_pose(values, {name: view.spread(name) for name in observation.blocks})
+    return observation.on_pose(values, {name: view.block_covariance(name) for name in observation.blocks})
 
 
 def learnt_from(

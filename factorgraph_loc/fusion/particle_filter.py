@@ -94,7 +94,7 @@ class _CloudView(FilterView):
         part = cloud.parts.get(name)
         return None if part is None else np.asarray(cloud.weights @ cloud.constants[:, part])
 
-    def spread(self, name: str) -> Array:
+    def block_covariance(self, name: str) -> Array:
         cloud = self._filter._state
         return vector_moments(cloud.constants[:, cloud.parts[name]], cloud.weights)[1]
 

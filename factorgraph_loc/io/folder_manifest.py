@@ -12,10 +12,14 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import YAML
-from factorgraph_loc.files.models import read_text
+from factorgraph_loc.files.column_mapping import TableFolder
+from factorgraph_loc.files.models import parse_model, read_text
 from factorgraph_loc.io.field_names import TRUTH
 from factorgraph_loc.io.guesses import Guess, guess, sample_of
+from factorgraph_loc.io.motions import wheel_steps
 from factorgraph_loc.io.proposals import Proposal, proposal_of, toml_of
+from factorgraph_loc.io.readers.mapped import ReferenceFile, read_reference
+from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import LISTED, listed, quoted
 from factors.se2 import Array
 
@@ -32,9 +36,9 @@ FIELDS = {
     "landmarks": ("landmark", "x", "y"),
 }
 MAPS = ("tags", "landmarks")
-WIDTHS = (8, 16, 32)  # bits of counters
 WINDOW = 1.0  # s over which turns are compared
-TICK, TRACK = 0.001, 0.5  # m: examples of what no file says
+TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m: examples of what no file says
+LEAST_TURNED = 1.0  # rad: a reference that turns less does not show the distance between the wheels
 APART = 5.0  # s that clocks may begin apart
 
 
@@ -64,7 +68,7 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
         if role in MAPS:
             options.setdefault("world", {})[role] = _in_map(role, roles)
         else:
-            options[role] = _described(role, table, roles)
+            options[role] = _described(role, table, roles, path)
     if "odometry" not in options:
         roles.remarks.append(
             "no file looks like odometry, which every estimator needs: describe one in [options.odometry]"
@@ -72,6 +76,9 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
     if "rfid" in options and not roles.tables["rfid"].has("antenna"):
         options["rfid"]["antenna"] = "antenna"
         roles.remarks.append("the reads name no antenna: all are assigned to one, set in antenna")
+    reference = roles.tables.get("reference")
+    if reference is not None and not _has_headings(reference):
+        roles.remarks.append(f"{reference.name}: has no headings")
     _add_clocks(options, roles)
     for table in roles.tables.values():
         roles.remarks += [f"{table.name}: {reason}" for reason in table.reasons]
@@ -174,43 +181,45 @@ def _sides(table: Guess) -> tuple[str, ...]:
     return tuple(name for name in table.fields if name.startswith(("left", "right")))
 
 
-def _described(role: str, table: Guess, roles: _Roles) -> dict[str, Any]:
-    """The keys of a table of the manifest."""
+def _described(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
+    """The keys of a table of the manifest, for tables in the folder ``path``."""
     sides = _sides(table) if role == "odometry" else ()
-    names = ("t", *sides) if sides else FIELDS[role]
-    if role == "odometry" and table.has("v", "w"):
-        names = ("t", "v", "w")
-    settings = table.mapping(names)
     if sides:
-        _add_sizes(settings, table, sides, roles)
-    if role == "reference" and not table.has("heading") and not table.has(*QUATERNION):
+        settings = table.mapping(("t", *sides))
+        _add_sizes(settings, table, sides, roles, path)
+        return settings
+    settings = table.mapping(("t", "v", "w") if role == "odometry" and table.has("v", "w") else FIELDS[role])
+    if role == "reference" and not _has_headings(table):
         settings["has_heading"] = False
-        roles.remarks.append(f"{table.name}: has no headings")
     return settings
 
 
-def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], roles: _Roles) -> None:
+def _has_headings(table: Guess) -> bool:
+    return table.has("heading") or table.has(*QUATERNION)
+
+
+def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], roles: _Roles, path: Path) -> None:
     """The distance between the wheels, and the distance per unit of counters: from the reference, or examples."""
     settings["track"] = TRACK
     if sides[0] != "left":
         if sides[0] in ("left_angle", "left_rate"):
-            settings["radius"] = 0.1
+            settings["radius"] = RADIUS
         roles.remarks.append(
             f"{table.name}: measure the distance between the wheels, and their radius: track, radius [m]"
         )
         return
-    left, right = (_unwrapped(table.values(name)) for name in sides)
-    tick, track = TICK, None
-    if (reference := roles.tables.get("reference")) is not None:
-        travelled = float(np.nansum(np.abs(np.diff((left + right) / 2.0))))
-        length = _path_length(reference)
-        if travelled > 0.0 and length > 0.0:
-            tick = float(f"{length / travelled:.3g}")
-            roles.remarks.append(
-                f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])}, as the reference travels {length:.1f} m "
-                f"over {travelled:.0f} of them; replace it by the size of your wheels"
-            )
-        track = _track(table.times(), tick * (right - left), reference)
+    left, right = (wheel_steps(table.values(name), 1.0) for name in sides)
+    reference, tick, track = _reference(roles, path), TICK, None
+    travelled = float(np.nansum(np.abs(left + right))) / 2.0
+    if reference is not None and travelled > 0.0:
+        length = float(np.sum(np.hypot(*np.diff(_each_second(reference.t, reference.poses[:, :2]), axis=0).T)))
+        tick = float(f"{length / travelled:.3g}") or TICK
+        roles.remarks.append(
+            f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])}, as the reference travels {length:.1f} m "
+            f"over {travelled:.0f} of them; replace it by the size of your wheels"
+        )
+        if reference.has_heading:
+            track = _track(table.times(), tick * np.append(0.0, np.nancumsum(right - left)), reference)
     else:
         roles.remarks.append(f"{table.name}: replace {tick:g} by the metres per unit of {quoted(table.fields['left'])}")
     if track is None:
@@ -223,45 +232,27 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
     settings.setdefault("units", {}).update(left=tick, right=tick)
 
 
-def _unwrapped(counts: Array) -> Array:
-    """The values of a counter without its wraps. It has the fewest bits that hold its values."""
-    for bits in WIDTHS:
-        if np.nanmax(np.abs(counts), initial=0.0) < 2.0**bits and np.nanmax(
-            np.abs(np.diff(counts)), initial=0.0
-        ) > 2.0 ** (bits - 1):
-            return np.asarray(np.unwrap(counts, period=2.0**bits))
-    return counts
-
-
-def _path_length(reference: Guess) -> float:
-    """The length of the way of a reference [m], between poses that are a second apart."""
-    poses = _poses(reference)
-    steps = np.searchsorted(poses[:, 0], np.arange(poses[0, 0], poses[-1, 0], WINDOW))
-    return float(np.nansum(np.hypot(*np.diff(poses[steps, 1:3], axis=0).T)))
-
-
-def _poses(reference: Guess) -> Array:
-    """Times [s], positions [m] and headings [rad] of a table of poses (N, 4); headings are NaN without any."""
-    factor = {"mm": 1e-3, "cm": 1e-2}.get(str(reference.units.get("x", "m")), 1.0)
-    heading = np.full(len(reference.times()), np.nan)
-    if reference.has("heading"):
-        heading = reference.values("heading") * (np.pi / 180.0 if reference.units.get("heading") == "deg" else 1.0)
-    elif reference.has(*QUATERNION):
-        x, y, z, w = (reference.values(name) for name in QUATERNION)
-        heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
-    return np.column_stack((reference.times(), factor * reference.values("x"), factor * reference.values("y"), heading))
-
-
-def _track(t: Array, difference: Array, reference: Guess) -> float | None:
-    """The distance between the wheels [m] with which their difference (N,) [m] turns as much as the reference; None if unknown."""
-    poses = _poses(reference)
-    if np.isnan(poses[:, 3]).any():
+def _reference(roles: _Roles, path: Path) -> Trajectory | None:
+    """The reference of the folder ``path``, as its reader reads it; None without one that can be read."""
+    if (table := roles.tables.get("reference")) is None:
         return None
-    turns = []
-    for times, values in ((t, difference), (poses[:, 0], np.unwrap(poses[:, 3]))):
-        steps = np.searchsorted(times, np.arange(times[0], times[-1], WINDOW))
-        turns.append(float(np.sum(np.abs(np.diff(values[steps])))))
-    return float(f"{turns[0] / turns[1]:.3g}") if turns[1] > 1.0 else None
+    with suppress(InputError):
+        options = parse_model(ReferenceFile, _described("reference", table, roles, path), path)
+        return read_reference(TableFolder(path), options, 0)
+    return None
+
+
+def _each_second(t: Array, values: Array) -> Array:
+    """The first row of ``values`` (N, ...) in each :data:`WINDOW` of the times ``t`` (N,) [s]."""
+    return np.asarray(values[np.unique(np.floor((t - t[0]) / WINDOW), return_index=True)[1]])
+
+
+def _track(t: Array, difference: Array, reference: Trajectory) -> float | None:
+    """The distance between the wheels [m] with which their difference (N,) [m] turns as much as the reference; None if it hardly
+    turns."""
+    turned = np.sum(np.abs(np.diff(_each_second(reference.t, np.unwrap(reference.poses[:, 2])))))
+    driven = np.sum(np.abs(np.diff(_each_second(t, difference))))
+    return float(f"{driven / turned:.3g}") if turned > LEAST_TURNED and driven > 0.0 else None
 
 
 def _add_clocks(options: dict[str, Any], roles: _Roles) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.files.column_mapping import parsed, split_comments
+from factorgraph_loc.files.columns import LENGTH, RATE, SPEED, STAMPS
 from factorgraph_loc.files.models import read_text
 from factorgraph_loc.files.tables import iso_nanoseconds
 from factorgraph_loc.io.field_names import LANDMARK, RANGE, READ, plain, rank
@@ -45,10 +46,10 @@ OTHERS = {
 NAMES: dict[str, Sequence[str]] = {**{k: v for k, v in READ.items() if k != "stamp"}, **POSE, **MOTION, **OTHERS}
 # names of units at the end of a column's name, by kind of field
 SECONDS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "millis": "ms", "micros": "us", "nanos": "ns"}
-LENGTHS = {"m": "m", "cm": "cm", "mm": "mm", "ft": "ft", "in": "in"}
+LENGTHS = {unit: unit for unit in LENGTH}
 ANGLES = {"deg": "deg", "degrees": "deg", "rad": "rad"}
-SPEEDS = {"m/s": "m/s", "cm/s": "cm/s", "mm/s": "mm/s", "km/h": "km/h", "mps": "m/s", "kmh": "km/h"}
-RATES = {"rad/s": "rad/s", "deg/s": "deg/s", "dps": "deg/s", "rpm": "rpm"}
+SPEEDS = {unit: unit for unit in SPEED} | {"mps": "m/s", "kmh": "km/h"}
+RATES = {unit: unit for unit in RATE} | {"dps": "deg/s"}
 ENDS: dict[str, Mapping[str, str]] = {
     **dict.fromkeys(("t", "duration"), SECONDS),
     **dict.fromkeys(("x", "y", "z", "range"), LENGTHS),
@@ -112,7 +113,7 @@ class Guess:
         unit = self.units.get("t")
         if unit == "iso":
             return np.array([iso_nanoseconds(text) / 1e9 for text in self.sample.columns[self.fields["t"]]])
-        return self.values("t") * {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[str(unit)] if unit else np.empty(0)
+        return self.values("t") * (STAMPS[str(unit)] / STAMPS["s"]) if unit else np.empty(0)
 
     @property
     def is_tum(self) -> bool:
@@ -223,7 +224,12 @@ def _add_time(out: Guess) -> None:
             out.fields["t"], out.units["t"] = name, "iso"
             return
         values = sample.numbers(name)
-        if values is None or np.mean(np.diff(values) < 0.0) > 0.2 or np.nanmin(values) == np.nanmax(values):
+        if (
+            values is None
+            or not np.isfinite(values).all()
+            or np.mean(np.diff(values) < 0.0) > 0.2
+            or not np.ptp(values)
+        ):
             continue
         end = _split(name)[1] or plain(name)
         out.fields["t"] = name
@@ -235,7 +241,6 @@ def _add_time(out: Guess) -> None:
 
 def _unit_of_times(values: Array) -> str:
     """The unit of timestamps, by their size since 1970, or by the steps of a clock that begins with the log."""
-    values = values[np.isfinite(values)]
     first = float(np.abs(values[0]))
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
         if first > least:

@@ -68,7 +68,7 @@ def after_rest(moves: Array) -> Array:
 def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[str]) -> Array:
     """The motions (N - 1, 3) from the distances (N, 2) [m] of a pair of wheels at N timestamps [ns]; ``scales`` (2,): metres per
     encoder tick. Wrapping of encoders is handled; resets are treated as for poses."""
-    steps = np.stack([_unwound(distances[:, i], float(scales[i])) for i in range(2)], axis=-1)
+    steps = np.stack([wheel_steps(distances[:, i], float(scales[i])) for i in range(2)], axis=-1)
     durations = _durations(t_ns)
     speeds = np.abs(steps).max(axis=1, initial=0.0) / durations
     fastest = _largest_before(speeds, SPEED)
@@ -99,8 +99,11 @@ def odometry_stream(t_ns: Integers, values: Array, t0_ns: int) -> IncrementStrea
     return IncrementStream(t, *values.T) if values.shape[1] == 3 else VelocityStream(t, *np.ascontiguousarray(values.T))
 
 
-def _unwound(distances: Array, scale: float) -> Array:
-    """Steps (N - 1,) of one wheel, assuming less than half a counter range between rows."""
+def wheel_steps(distances: Array, scale: float) -> Array:
+    """Steps (N - 1,) between the distances (N,) of one wheel, with ``scale`` per tick; counters that wrap are continued.
+
+    Less than half of a counter's range is assumed between rows.
+    """
     steps: Array = np.diff(distances)
     ticks = distances / scale
     if not np.allclose(ticks, np.rint(ticks), atol=1e-3):

@@ -7,6 +7,8 @@ from typing import Any
 
 import tomli_w
 
+from factorgraph_loc.text import plain
+
 COMPANIONS = {
     "rig": 'no rig is given: set rig = "NAME.rig.toml" to a file next to this one; `fgloc rigs new` writes one',
     "world": 'no map is given: set world = "NAME.world.toml" to a file next to this one with tags and landmarks',
@@ -46,7 +48,7 @@ def proposal_of(
         elif companion != "world" or with_map:
             notes.append(advice)
     ordered = dict(sorted(options.items(), key=lambda item: isinstance(item[1], dict)))  # tables last
-    comments = "".join(f"# {line}\n" for line in notes)
+    comments = "".join(f"# {plain(line, None)}\n" for line in notes)
     text = f"{tomli_w.dumps(content)}{comments}\n{toml_of(ordered, 'options')}"
     return Proposal(content | {"options": ordered}, tuple(notes), text, root)
 

@@ -186,7 +186,7 @@ class View(Protocol):
     def value(self, name: str) -> Array | None:
         """The estimate (d,) of a block, or None if there is no such block."""
 
-    def spread(self, name: str) -> Array:
+    def block_covariance(self, name: str) -> Array:
         """The covariance (d, d) of an existing block."""
 
     def joint(self) -> tuple[Array, Columns]:

@@ -59,7 +59,7 @@ class TagReads:
     tags: Integers
 
     def moved(self, offset: Array) -> Self:
-        """The same reads relative to another pose, in whose frame the present one is ``offset`` (3,)."""
+        """The same reads relative to another pose. ``offset`` (3,): the present pose in the frame of that pose."""
         return replace(self, offsets=se2.compose(offset, self.offsets))
 
     def chosen(self, which: NDArray[np.bool_] | Integers) -> Self:

@@ -1,5 +1,6 @@
 """A proposed manifest for a folder of tables: a log that is read with it has the values in our units."""
 
+import tomllib
 from contextlib import suppress
 
 import numpy as np
@@ -138,3 +139,9 @@ def test_any_table_is_guessed_or_refused(tmp_path_factory, rows):
     write(day / "odometry.csv", ["t,x,y,left,right,antenna,epc,when,heading", *(",".join(row) for row in rows)])
     with suppress(InputError):
         assert manifest(day).content["reader"] == "mapped"
+
+
+def test_a_file_name_of_two_lines_adds_no_key(tmp_path):
+    write(tmp_path / "day" / "odometry.csv", ["t,v,w", *(f"{START + t:.3f},0.5,0.0" for t in T)])
+    write(tmp_path / "day" / "notes\ntitle = 'x'", ["drove twice round the hall"])
+    assert tomllib.loads(manifest(tmp_path / "day").text)["title"] == "The folder day"

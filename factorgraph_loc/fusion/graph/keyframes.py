@@ -60,7 +60,7 @@ class _KeyframeView:
     def value(self, name: str) -> Array | None:
         return self.graph.values[self.graph.keys[name]] if name in self.graph.keys else None
 
-    def spread(self, name: str) -> Array:
+    def block_covariance(self, name: str) -> Array:
         return self.graph.covariances[self.graph.keys[name]]
 
     def joint(self) -> tuple[Array, Mapping[str, slice]]:

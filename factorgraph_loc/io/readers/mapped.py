@@ -156,7 +156,7 @@ def read(path: Path | None, options: Options) -> Log:
         streams["rfid"] = rounds.stream(t0_ns)
     reference = None
     if (of_reference := options.reference) is not None:
-        reference = _reference(folder, of_reference, t0_ns)
+        reference = read_reference(folder, of_reference, t0_ns)
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
             warnings.append(
                 f"{of_reference.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
@@ -307,7 +307,7 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
     return t_ns, motions.after_rest(moves)
 
 
-def _reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
+def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
     """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
     path, warnings = folder.file(options.file), folder.warnings
     if options.is_in_format():

@@ -133,7 +133,7 @@ class CameraSensor(Sensor):
         for name in self._shared:
             value = view.value(name)
             values[name] = np.zeros(len(self._uncertain.names)) if value is None else value
-            spreads[name] = np.diag(self._uncertain.sigmas**2) if value is None else view.spread(name)
+            spreads[name] = np.diag(self._uncertain.sigmas**2) if value is None else view.block_covariance(name)
             predicted = replace(predicted, constants=values[name], spread=spreads[name])
         displaced, blocks = {}, {}
         for name, (points, survey) in self.points.inexact(m).items():
@@ -144,7 +144,7 @@ class CameraSensor(Sensor):
             if by is None:
                 by, spread = np.zeros(3), self._looks_now(name, m.t) * survey
             else:
-                spread = view.spread(block)
+                spread = view.block_covariance(block)
                 blocks.update(dict.fromkeys(points, block))
             displaced.update(dict.fromkeys(points, (by, len(points) * spread)))
         self._before.append((m.t, self.points.floor))

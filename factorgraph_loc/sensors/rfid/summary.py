@@ -133,9 +133,9 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
     if found.unknown:
         reads = sum(found.unknown.values())
         out.append(f"{reads} reads are of {len(found.unknown)} tags that the map lacks: {listed(found.unknown, SHOWN)}")
-    if other := in_other_case(found.unknown, found.unread):
+    if misspelt := in_other_case(found.unknown, found.unread):
         out.append(
-            f"tags are in the map with other capital letters: {listed(other, SHOWN)}: set epc_case for reads or map"
+            f"tags are in the map with other capital letters: {listed(misspelt, SHOWN)}: set epc_case for reads or map"
         )
     carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
@@ -325,23 +325,23 @@ def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> 
     ones = np.ones(len(looks.p), dtype=np.int64)
     reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
     groups.add(looks.antenna, ones, reads, ones[:, None] > 0)
-    together, chosen = _overdispersion(looks, (looks.distance // BAND).astype(np.int64)), groups.large()
+    ratio, chosen = _overdispersion(looks, (looks.distance // BAND).astype(np.int64)), groups.large()
     if not len(chosen):
         return None
     observed, predicted, variance = groups.sums[:, chosen]
     # what the estimators take successive rounds for is no reason to doubt the model either
-    sigma = np.sqrt(max(together, 1.0 / tempering) * variance)
+    sigma = np.sqrt(max(ratio, 1.0 / tempering) * variance)
     off = (np.abs(observed - predicted) > OFF * sigma) & (np.abs(observed / predicted - 1.0) > DIFFERENT)
     doubts = []
     if np.any(off):
         shares = groups.shares(chosen[off])
         doubts.append(f"{log}: reads over those that the detection models predict, by distance and antenna: {shares}")
-    if together * tempering > TOGETHER:
+    if ratio * tempering > TOGETHER:
         doubts.append(
-            f"{log}: reads and misses come in bursts, {together:.0f} rounds inform as much as one: set rfid.tempering = "
-            f"{1.0 / together:.2g} in the rig, which has {tempering:g}"
+            f"{log}: reads and misses come in bursts, {ratio:.0f} rounds inform as much as one: set rfid.tempering = "
+            f"{1.0 / ratio:.2g} in the rig, which has {tempering:g}"
         )
-    return Reliability("reads", groups.names(chosen), observed, predicted, sigma, together, tuple(doubts))
+    return Reliability("reads", groups.names(chosen), observed, predicted, sigma, ratio, tuple(doubts))
 
 
 def _overdispersion(looks: _Looks, band: Integers) -> float:
