@@ -69,6 +69,26 @@ def test_a_clock_that_is_off_is_told_with_what_mends_it(log, sensor, shift):
     assert line in inspect(off).problems
 
 
+def test_a_mounting_that_is_off_is_no_clock(log):
+    """A sensor .3 m ahead of its place in the rig, or high above the floor, is not stamped earlier or later."""
+    sightings = log.streams["bearing_range"]
+    places = np.array([PLACES[name] for name in sightings.landmark])
+    for forward, height in ((0.3, 0.0), (0.0, 2.3)):
+        ahead = replace(SETTINGS.model(), mounting=(forward, 0.0, 0.0))
+        ranges, bearings = bearing_range.predict(ahead, log.reference.at(sightings.t), places)
+        moved = replace(sightings, range=np.hypot(ranges, height), bearing=bearings)
+        assert motion_problems(replace(log, streams=log.streams | {"bearing_range": moved})) == []
+
+
+def test_at_constant_speed_no_clock_can_be_off(log):
+    rng = np.random.default_rng(2)
+    t = np.arange(0.0, 60.0, 0.05)
+    v = 0.5 + 0.01 * rng.standard_normal(len(t))
+    along = Trajectory(t + 1.0, driven(se2.exp(0.05 * np.column_stack((v, 0.0 * v, 0.0 * v))[:-1])), has_heading=False)
+    straight = replace(log, reference=along, streams={"odometry": VelocityStream(t, v, 0.0 * t)})
+    assert not any("stamped" in line for line in motion_problems(straight))
+
+
 @pytest.mark.parametrize("has_heading", [True, False])
 @pytest.mark.parametrize("shift", [-0.3, 1.0])
 def test_a_reference_by_another_clock_is_told(log, shift, has_heading):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -42,6 +42,7 @@ MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
 MIN_PASSES = 3
 PASS = 10.0  # s; errors within a pass are correlated, so passes are counted, not sightings
 MOST = 2000  # sightings that are compared at time shifts
+MOUNTING = (0.5, 0.0, 0.0, 0.0)  # m, m, m, rad: initial height, x, y and turn of a sensor whose mounting is estimated
 _REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
 
 
@@ -194,7 +195,7 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
 
 
 def _shifted(log: Log) -> list[str]:
-    """A warning if sightings of mapped landmarks fit the reference better at another time."""
+    """A warning if sightings of mapped landmarks fit the reference better at another time than with another mounting or height."""
     stream, reference = log.streams.get("bearing_range"), log.reference
     if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:
         return []
@@ -207,20 +208,34 @@ def _shifted(log: Log) -> list[str]:
     marks = [log.world.landmarks[stream.landmark[i]] for i in rows.tolist()]
     places = np.array([(mark.x, mark.y) for mark in marks])
     model, t = log.rig.of(BearingRangeSettings).model(), stream.t[rows] + log.rig.time_offset("bearing_range")
-    shifts = STEP * SHIFTS
-    costs = []
-    for shift in shifts.tolist():
-        ranges, bearings = bearing_range.predict(model, reference.at(t - shift, max_gap=3.0 * SLOWEST), places)
-        off = [np.abs(stream.range[rows] - ranges) / model.range_sigma]
-        if reference.has_heading:
-            off.append(np.abs(se2.wrap(stream.bearing[rows] - bearings)) / model.bearing_sigma)
-        usable = [kept for residuals in off if len(kept := residuals[np.isfinite(residuals)]) >= FEWEST // 2]
-        costs.append(sum(float(np.median(residuals)) for residuals in usable) if usable else np.inf)
-    best = int(np.argmin(costs))
-    if abs(shifts[best]) < LARGE or not costs[best] < BETTER * costs[len(SHIFTS) // 2]:
+
+    def errors(shift: float, height: float = 0.0, x: float = 0.0, y: float = 0.0, turn: float = 0.0) -> Array:
+        """Errors (N, 2) in standard deviations, NaN if unknown, after a shift [s] and changes of the mounting [m, rad]."""
+        mounted = replace(model, mounting=tuple(np.add(model.mounting, (x, y, turn)).tolist()))
+        ranges, bearings = bearing_range.predict(mounted, reference.at(t - shift, max_gap=3.0 * SLOWEST), places)
+        far = (np.hypot(ranges, height) - stream.range[rows]) / model.range_sigma
+        aside = se2.wrap(bearings - stream.bearing[rows]) / model.bearing_sigma
+        return np.column_stack((far, aside if reference.has_heading else np.full_like(far, np.nan)))
+
+    def cost_with_mounting(shift: float) -> float:
+        """The cost at a shift, with the mounting and height that fit best."""
+        start = np.array(MOUNTING if reference.has_heading else MOUNTING[:1])
+        fit = scipy.optimize.least_squares(
+            lambda mounting: np.nan_to_num(errors(shift, *mounting)).ravel(), start, loss="soft_l1"
+        )
+        return _cost(errors(shift, *fit.x.tolist()))
+
+    shifts = (STEP * SHIFTS).tolist()
+    best = min(shifts, key=lambda shift: _cost(errors(shift)))
+    if abs(best) < LARGE or not cost_with_mounting(best) < BETTER * cost_with_mounting(0.0):
         return []
-    shift = float(shifts[best])
-    return [interfaces.line("bearing_range", shift, "the reference", "bearing_range", -shift)]
+    return [interfaces.line("bearing_range", best, "the reference", "bearing_range", -best)]
+
+
+def _cost(errors: Array) -> float:
+    """The sum of the median absolute errors (N, 2) of ranges and bearings; infinite with too few of them."""
+    usable = [kept for column in errors.T if len(kept := column[np.isfinite(column)]) >= FEWEST // 2]
+    return sum(float(np.median(np.abs(kept))) for kept in usable) if usable else np.inf
 
 
 def check(use: Use) -> Use:

@@ -145,7 +145,8 @@ def _longest(t: Array) -> tuple[float, float]:
 def match(rates: Array, delayed: Array) -> RateMatch | None:
     """Delay of ``delayed`` (N,) relative to ``rates`` (N,), sampled every ``STEP``; None if they are uncorrelated.
 
-    The slope is negative if the signs differ. A shift that hardly improves the correlation is set to zero.
+    The slope is negative if the signs differ. The shift is zero if it hardly improves the correlation. At constant rates no shift
+    can be observed: it is zero too.
     """
     if np.count_nonzero(np.isfinite(rates) & np.isfinite(delayed)) < FEWEST:
         return None
@@ -154,7 +155,8 @@ def match(rates: Array, delayed: Array) -> RateMatch | None:
     if abs(fits[best, 0]) < ALIKE:
         return None
     left = 1.0 - fits[:, 0] ** 2
-    if abs(SHIFTS[best]) * STEP < LARGE or left[best] > BETTER * left[none]:
+    is_observable = np.nanstd(rates) > MOVES and np.nanstd(delayed) > MOVES
+    if not is_observable or abs(SHIFTS[best]) * STEP < LARGE or left[best] > BETTER * left[none]:
         best = none
     return RateMatch(float(SHIFTS[best] * STEP), float(fits[best, 1])) if abs(fits[best, 0]) >= ALIKE else None
 
