@@ -43,6 +43,18 @@ class Diagnostics:
     # all additions since :meth:`record` was called; None if it was not
     added: list[Addition] | None = field(default=None, init=False, repr=False, compare=False)
 
+    def __str__(self) -> str:
+        """A summary: the updates of each sensor with their mean NIS, ideally 1 per degree of freedom, counts, and events."""
+        lines = [
+            f"{sensor}: {len(rows)} updates, NIS {sum(nis for _, nis, _ in rows) / max(1, sum(n for *_, n in rows)):.2f} per "
+            "degree of freedom"
+            for sensor, rows in self.nis.items()
+        ]
+        counts = {"ignored": self.ignored, "rejected": self.rejected, "late": self.late}
+        lines += [f"{what}: {count} {reason}" for what, reasons in counts.items() for reason, count in reasons.items()]
+        lines += [f"{event.t:.1f} s: {event}" for event in self.events]
+        return "\n".join([*lines, *(f"{kind}: {', '.join(names)}" for kind, names in self.doubted.items())])
+
     def ignore(self, reason: str, count: int = 1) -> None:
         self.ignored[reason] = self.ignored.get(reason, 0) + count
         if self.added is not None:

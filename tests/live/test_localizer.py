@@ -186,6 +186,7 @@ def test_what_is_late_is_put_in_or_counted(log):
     assert not np.array_equal(after.pose, before.pose)
     localizer.push(BearingRange(1.3, (name,), distance, bearing))
     assert localizer.diagnostics().late == {"bearing_range": 1}
+    assert "late: 1 bearing_range" in str(localizer.diagnostics()).splitlines()
     assert np.array_equal(localizer.estimate().pose, after.pose)
 
 
