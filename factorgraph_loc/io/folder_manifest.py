@@ -177,8 +177,8 @@ def _role(table: Guess) -> str | None:
 
 
 def _sides(table: Guess) -> tuple[str, ...]:
-    """The fields of a left and a right wheel, if the table has them."""
-    return tuple(name for name in table.fields if name.startswith(("left", "right")))
+    """The fields of two or four wheels, if the table has them."""
+    return tuple(name for name in table.fields if name.removeprefix("rear_").startswith(("left", "right")))
 
 
 def _described(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
@@ -208,7 +208,8 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
             f"{table.name}: measure the distance between the wheels, and their radius: track, radius [m]"
         )
         return
-    left, right = (wheel_steps(table.values(name), 1.0) for name in sides)
+    steps = {name: wheel_steps(table.values(name), 1.0) for name in sides}
+    left, right = (np.mean([steps[name] for name in sides if side in name], axis=0) for side in ("left", "right"))
     reference, tick, track = _reference(roles, path), TICK, None
     travelled = float(np.nansum(np.abs(left + right))) / 2.0
     if reference is not None and travelled > 0.0:
@@ -229,7 +230,7 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
         roles.remarks.append(
             f"{table.name}: track = {track:g} m, as the reference turns; replace it by what you measure"
         )
-    settings.setdefault("units", {}).update(left=tick, right=tick)
+    settings.setdefault("units", {}).update(dict.fromkeys(sides, tick))
 
 
 def _reference(roles: _Roles, path: Path) -> Trajectory | None:

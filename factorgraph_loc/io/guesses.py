@@ -67,6 +67,7 @@ LARGER = {
     "rssi": (("dBm", 200.0), ("cdBm", 2e4)),
 }
 OURS = ("rad", "dBm")
+REAR = {"rear", "back", "rl", "rr", "bl", "br"}  # words in names of rear wheels, if there are front ones
 EPC = re.compile(r"(0x)?[0-9A-Fa-f]{8,}$")
 
 
@@ -262,16 +263,26 @@ def _add_tum(out: Guess) -> None:
 
 
 def _add_wheels(out: Guess) -> None:
-    """The columns of a left and a right wheel: their speeds, rates, angles or distances, or counters, which are whole numbers."""
+    """The columns of two or four wheels: their speeds, rates, angles or distances, or counters, which are whole numbers."""
     words = {name: [word.lower() for word in WORDS.findall(name)] for name in out.sample.columns}
     sides = {
-        side: [name for name, parts in words.items() if {side, side[0]} & set(parts)] for side in ("left", "right")
+        side: [
+            name
+            for name, parts in words.items()
+            if {side, side[0], f"f{side[0]}", f"r{side[0]}", f"b{side[0]}"} & set(parts)
+        ]
+        for side in ("left", "right")
     }
     if not sides["left"] or len(sides["left"]) != len(sides["right"]):
         return
-    if len(sides["left"]) > 1:
-        out.reasons.append(f"of several wheels on a side, those of {quoted(sides['left'][0])} are used")
-    left, right = (sides[side][0] for side in ("left", "right"))
+    rear = {side: [name for name in names if REAR & set(words[name])] for side, names in sides.items()}
+    front = {side: [name for name in names if name not in rear[side]] or names for side, names in sides.items()}
+    pairs = {"": front} | ({"rear_": rear} if rear["left"] and rear["right"] and front != rear else {})
+    if len(pairs) == 2:
+        out.reasons.append(
+            "there are four wheels: if they are mecanum wheels, set base [m], the distance between the axles"
+        )
+    left, right = (front[side][0] for side in ("left", "right"))
     if out.sample.numbers(left) is None or out.sample.numbers(right) is None:
         return
     parts = set(words[left])
@@ -287,9 +298,10 @@ def _add_wheels(out: Guess) -> None:
         ),
         "",
     )
-    out.fields |= {f"left{kind}": left, f"right{kind}": right}
-    if "rpm" in parts:
-        out.units |= {"left_rate": "rpm", "right_rate": "rpm"}
+    for where, names in pairs.items():
+        out.fields |= {f"{where}{side}{kind}": names[side][0] for side in ("left", "right")}
+        if "rpm" in parts:
+            out.units |= {f"{where}left_rate": "rpm", f"{where}right_rate": "rpm"}
 
 
 def _add_units(out: Guess) -> None:

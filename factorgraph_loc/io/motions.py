@@ -22,25 +22,56 @@ HOLD_TIME = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
 TURNS = ("left_angle", "left_rate")  # columns with angles of wheels, which need a radius
 WHEELS = ("left", "left_speed", *TURNS)
+UNEVEN = 0.1  # minimum ratio of the sideways motion of wheels without rollers to their motion ahead that is doubtful
 
 
 class WheelSizes(FileModel):
-    """The sizes of a differential drive. Those of the rig ([odometry.wheels]) have precedence."""
+    """The sizes of a drive with two or four wheels. Those of the rig ([odometry.wheels]) have precedence."""
 
     track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
-    """distance between the wheels"""
+    """distance between the left and the right wheels"""
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
     """radius of the wheels, if their angles are given"""
+    base: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
+    """distance between the axles of four mecanum wheels; without it, four wheels have no rollers"""
 
-    def sizes(self, source: object, what: str, *, turns: bool) -> tuple[float, float]:
-        """Metres per unit, and the track [m]. ``turns``: whether angles of wheels are given.
+    def has_sizes(self) -> bool:
+        """Whether any size is given."""
+        return any(size is not None for size in (self.track, self.radius, self.base))
+
+    def metres(self, source: object, what: str, *, turns: bool) -> float:
+        """Metres per unit. ``turns``: whether angles of wheels are given.
 
         InputError if a size is missing that ``what`` needs.
         """
         if self.track is None or (turns and self.radius is None):
             lacking = "track" if self.track is None else "radius"
             raise InputError(f"{source}: {what} needs {lacking} [m], here or in [odometry.wheels] of the rig")
-        return self.radius if turns and self.radius else 1.0, self.track
+        return self.radius if turns and self.radius else 1.0
+
+    def twists(self, source: object, wheels: Array, warnings: list[str]) -> Array:
+        """The motion (N, 3) ahead, to the left and about the vertical from the motion (N, 2 or 4) of the wheels: left and right,
+        and those behind.
+
+        Mecanum wheels: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot", 2015, eq. 22 to 24.
+        """
+        assert self.track is not None
+        left, right, rear_left, rear_right = (wheels if wheels.shape[1] == 4 else np.hstack((wheels, wheels))).T
+        ahead, aside = (left + right + rear_left + rear_right) / 4.0, (right - left + rear_left - rear_right) / 4.0
+        turn = (right - left + rear_right - rear_left) / (2.0 * (self.track + (self.base or 0.0)))
+        uneven = np.abs(aside).sum() / max(float(np.abs(wheels).mean(axis=1).sum()), ZERO)
+        if self.base is None and uneven > UNEVEN:
+            warnings.append(
+                f"{source}: front and rear wheels differ by {2.0 * uneven:.0%}: set base [m], the distance between the axles, if "
+                "these are mecanum wheels"
+            )
+        return np.column_stack((ahead, aside if self.base else np.zeros(len(ahead)), turn))
+
+
+def wheels_of(left: str, count: int) -> tuple[str, ...]:
+    """The names of two or four wheels, by that of the left one."""
+    pair = (left, left.replace("left", "right"))
+    return pair if count == 2 else (*pair, *(f"rear_{name}" for name in pair))
 
 
 def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[str]) -> Array:
@@ -66,9 +97,9 @@ def after_rest(moves: Array) -> Array:
 
 
 def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[str]) -> Array:
-    """The motions (N - 1, 3) from the distances (N, 2) [m] of a pair of wheels at N timestamps [ns]; ``scales`` (2,): metres per
-    encoder tick. Wrapping of encoders is handled; resets are treated as for poses."""
-    steps = np.stack([wheel_steps(distances[:, i], float(scales[i])) for i in range(2)], axis=-1)
+    """The motions (N - 1, W) from the distances (N, W) [m] of wheels at N timestamps [ns]; ``scales`` (W,): metres per encoder
+    tick. Wrapping of encoders is handled; resets are treated as for poses."""
+    steps = np.stack([wheel_steps(distances[:, i], float(scale)) for i, scale in enumerate(scales)], axis=-1)
     durations = _durations(t_ns)
     speeds = np.abs(steps).max(axis=1, initial=0.0) / durations
     fastest = _largest_before(speeds, SPEED)
@@ -78,19 +109,19 @@ def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array
 
 
 def between_wheels(
-    source: object, t_ns: Integers, distances: Array, scales: Array, track: float, warnings: list[str]
+    source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[str]
 ) -> Array:
-    """The motions (N - 1, 3) of a differential drive with a ``track`` [m]; for the others see :func:`between_ways`."""
-    arc, turn = velocities_of_wheels(between_ways(source, t_ns, distances, scales, warnings), track).T
-    return se2.exp(np.column_stack((arc, np.zeros(len(arc)), turn)))
+    """The motions (N - 1, 3) of a drive with ``sizes``; for the other arguments see :func:`between_ways`."""
+    return se2.exp(sizes.twists(source, between_ways(source, t_ns, distances, scales, warnings), warnings))
 
 
-def velocities_of_wheels(speeds: Array, track: float) -> Array:
-    """Speed and turn rate (N, 2) of a differential drive from the speeds (N, 2) of its left and right wheel. Distances give
-    distances.
-    """
-    left, right = speeds.T
-    return np.column_stack(((left + right) / 2.0, (right - left) / track))
+def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[str]) -> Array:
+    """Speed and turn rate (N, 2) from the speeds (N, 2 or 4) of wheels; for mecanum wheels increments (N, 3), as each speed holds
+    until the next row."""
+    twists = sizes.twists(source, speeds, warnings)
+    if sizes.base is None:
+        return twists[:, [0, 2]]
+    return after_rest(se2.exp(twists[:-1] * (np.diff(t_ns) / 1e9)[:, None]))
 
 
 def odometry_stream(t_ns: Integers, values: Array, t0_ns: int) -> IncrementStream | VelocityStream:
@@ -161,13 +192,13 @@ def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, 
 
 
 def with_wheels_in(rig: Rig, options: Mapping[str, Any]) -> Rig:
-    """The rig, with the wheels of the options if it has none and they are valid."""
+    """The rig, with the two wheels of the options if it has none and they are valid."""
     odometry = options.get("odometry")
     settings = rig.of(OdometrySettings)
     if settings.wheels is not None or not isinstance(odometry, Mapping):
         return rig
     sizes = odometry.get("wheels") or odometry
-    if sizes.get("track") is None:
+    if sizes.get("track") is None or sizes.get("base") is not None:
         return rig
     drive = DifferentialDrive(radius=sizes.get("radius"), track=sizes["track"])
     return rig.model_copy(update={"odometry": settings.model_copy(update={"wheels": drive})})

@@ -63,6 +63,15 @@ def test_counters_of_wheels_that_wrap_get_their_size_from_the_reference(tmp_path
     assert np.sum(log.streams["odometry"].dx) == pytest.approx(SPEED * 59.9, rel=0.02)
 
 
+def test_four_wheels_are_proposed_together(tmp_path):
+    rows = [f"{t:.3f},{','.join(str(int(SPEED * t / 0.001)) for _ in range(4))}" for t in T]
+    write(tmp_path / "day" / "wheels.csv", ["time_s,ticks_fl,ticks_fr,ticks_rl,ticks_rr", *rows])
+    write_truth(tmp_path / "day")
+    _, proposal = log_of(tmp_path)
+    columns = {"left": "ticks_fl", "right": "ticks_fr", "rear_left": "ticks_rl", "rear_right": "ticks_rr"}
+    assert proposal.content["options"]["odometry"]["columns"] == {"t": "time_s"} | columns
+
+
 def test_reads_rounds_and_a_map_beside_the_folder(tmp_path):
     day = tmp_path / "day"
     write(day / "odom.csv", ["t,v,w", *(f"{START + t:.3f},0.5,0.0" for t in T)])

@@ -5,6 +5,7 @@ import pytest
 from mapped_hall import write_mapped
 
 import factorgraph_loc as fgloc
+from factors import se2
 
 ROWS = [(0.0, 0.0, 0.0), (1.0, 2.0, 4.0), (2.0, 4.0, 8.0)]
 
@@ -53,3 +54,29 @@ def test_the_rig_comes_first(table):
         assert moved.w.tolist() == pytest.approx([0.0, 0.4, 0.8])
     ways = fgloc.read_log(table("_speed"), rig=rig).streams["odometry"]
     assert ways.v.tolist() == pytest.approx([0.0, 3.0, 6.0])
+
+
+# ahead, to the left [m/s] and turning [rad/s]; and the speeds of mecanum wheels at +-.2 m along and +-.15 m across the robot
+AHEAD, ASIDE, TURN = 0.3, -0.2, 0.5
+MECANUM = [AHEAD + left * (ASIDE + 0.35 * TURN * turned) for left, turned in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
+
+
+@pytest.mark.parametrize("kind", ["", "_speed"])
+@pytest.mark.parametrize("base", ["base = 0.4\n", ""])
+def test_four_wheels(tmp_path, kind, base):
+    """Mecanum wheels move aside; without ``base`` the wheels of a side are averaged, with a warning that they differ."""
+    rows = [np.array((t, *(np.array(MECANUM) * (1.0 if kind else t)))) for t in (0.0, 0.5, 1.0)]
+    names = [f"{where}{side}{kind}" for where in ("", "rear_") for side in ("left", "right")]
+    columns = "".join(f', {name} = "{column}"' for name, column in zip(names, "abcd", strict=True))
+    columns = f'columns = {{ t = "t"{columns} }}\nunits = {{ t = "s" }}\n'
+    options = f'[options.odometry]\nfile = "wheels.csv"\ntrack = 0.3\n{base}{columns}'
+    wheels = "\n".join(["t,a,b,c,d", *(",".join(map(str, row.tolist())) for row in rows), ""])
+    log = fgloc.read_log(write_mapped(tmp_path, options, wheels=wheels))
+    moved = log.streams["odometry"]
+    assert any("base" in str(warning) for warning in log.warnings) == (not base)
+    if base:
+        expected = se2.exp(0.5 * np.array((AHEAD, ASIDE, TURN)))
+        np.testing.assert_allclose(np.column_stack((moved.dx, moved.dy, moved.dtheta))[1:], [expected] * 2, atol=1e-12)
+    elif kind:
+        np.testing.assert_allclose(moved.v, AHEAD)
+        np.testing.assert_allclose(moved.w, TURN * 0.7 / 0.3)

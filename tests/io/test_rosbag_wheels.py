@@ -60,6 +60,7 @@ def add_topics(made, left, right, *, late=0, kind="std_msgs/msg/Float64"):
         made.write("/right_wheel/speed", t + late, kind, data=float(b))
 
 
+SIZES = {"radius": 0.1, "track": 0.4, "base": 0.3}
 PAIR = {"left": "data", "right": "data", "right_topic": "/right_wheel/speed", "track": 0.4}
 
 
@@ -101,6 +102,23 @@ def test_the_rig_tells_the_size_of_the_wheels(maker):
     assert log.rig == rig
     without = fgloc.read_log(maker.path, reader="rosbag", options={"odometry": told})
     assert without.rig.odometry.wheels.model_dump() == {"radius": 1.0, "track": 0.4}
+
+
+def test_four_joints_that_count(maker, read_drive, refused):
+    """Counts of mecanum wheels, which move the robot straight to its left."""
+    names, ways = ["fl", "fr", "rl", "rr"], np.array((-1.0, 1.0, 1.0, -1.0))
+    for i in range(COUNT):
+        position, none = 10.0 * i * ways + 7.0, np.zeros(0)
+        kind = "sensor_msgs/msg/JointState"
+        maker.stamped("/wheels", T0 + 100 * MS * i, kind, name=names, position=position, velocity=none, effort=none)
+    wheels = {"left": "fl", "right": "fr", "rear_left": "rl", "rear_right": "rr", "unit": 0.02} | SIZES
+    moved = read_drive(maker, odometry={"topic": "/wheels", "wheels": wheels}).streams["odometry"]
+    np.testing.assert_allclose(
+        np.column_stack((moved.dx, moved.dy, moved.dtheta))[1:], [(0.0, 0.02, 0.0)] * 4, atol=1e-12
+    )
+    two = {"left": "fl", "right": "fr"} | SIZES
+    options = {"odometry": {"topic": "/wheels", "wheels": two}}
+    refused(maker.path, "odometry.wheels names 2 joints, expected rear_left", reader="rosbag", options=options)
 
 
 def test_wheels_are_proposed_by_their_names(tmp_path, bag_maker):

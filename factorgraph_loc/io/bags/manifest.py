@@ -20,7 +20,7 @@ from factorgraph_loc.io.proposals import Proposal, proposal_of
 from factorgraph_loc.text import listed
 
 LEFT, RIGHT = re.compile("left", re.IGNORECASE), re.compile("right", re.IGNORECASE)
-WHEEL = re.compile("wheel", re.IGNORECASE)
+WHEEL, REAR = re.compile("wheel", re.IGNORECASE), re.compile("rear|back", re.IGNORECASE)
 WHEELS = {"radius": 0.1, "track": 0.5}  # m
 NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORECASE)
 
@@ -162,13 +162,24 @@ def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
     first = next(bag.messages([topic.name]), None)
     names = [name for name in getattr(first and first.message, "name", ()) if isinstance(name, str)]
     wheels = [name for name in names if WHEEL.search(name)] or names
-    left = next((name for name in wheels if LEFT.search(name)), "left_wheel_joint")
-    right = next((name for name in wheels if RIGHT.search(name)), "right_wheel_joint")
+    rear = [name for name in wheels if REAR.search(name)]
+    front = [name for name in wheels if name not in rear] or wheels
+    left = next((name for name in front if LEFT.search(name)), "left_wheel_joint")
+    right = next((name for name in front if RIGHT.search(name)), "right_wheel_joint")
+    sides = {"left": left, "right": right}
+    if len(rear) == len(front) == 2:
+        sides |= {"rear_left": next(filter(LEFT.search, rear), ""), "rear_right": next(filter(RIGHT.search, rear), "")}
+        notes.append("four wheels: if they are mecanum wheels, set base [m], the distance between the axles, in wheels")
+    values = getattr(first and first.message, "position", ())
+    if len(values) and all(float(value).is_integer() for value in values) and any(values):
+        notes.append(
+            "positions of joints are whole numbers: if they are counts, set unit in wheels to the radians per count"
+        )
     notes.append(
         f"wheels: {left} and {right} are taken for them, of the joints {listed(names)}; measure radius and track [m]: "
         "here, or as [odometry.wheels] in the rig, which comes first"
     )
-    return {"wheels": {"left": left, "right": right} | WHEELS}
+    return {"wheels": sides | WHEELS}
 
 
 def _reference(out: Uses, topics: Sequence[Topic], tree: Tree) -> None:

@@ -6,9 +6,10 @@ Each wheel has a topic, or both wheels are joints of one message.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
@@ -35,24 +36,33 @@ Motion = Callable[[list[str]], tuple[Integers, Array]]
 
 
 class WheelSettings(motions.WheelSizes):
-    """A differential drive. ``radius`` and ``track`` of the rig ([odometry.wheels]) have precedence over these settings."""
+    """Two or four wheels. ``radius`` and ``track`` of the rig ([odometry.wheels]) have precedence over these settings."""
 
     left: str
     """name of the left wheel's joint; for a topic for each wheel, the field with the number"""
     right: str
     """as left, of the right wheel"""
+    rear_left: str | None = None
+    """name of the rear left wheel's joint, if there are four wheels"""
+    rear_right: str | None = None
+    """as rear_left, of the rear right wheel"""
     right_topic: str | None = None
     """topic of the right wheel, if each wheel has a topic"""
-    unit: Literal["rad", "m"] = "rad"
-    """unit of the wheels' values: angles, or distances"""
+    unit: Literal["rad", "m"] | Annotated[float, Field(gt=0.0)] = "rad"
+    """unit of the wheels' values: angles, or distances; a number: radians per count of an encoder"""
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The names of the joints: left, right, and those behind."""
+        return tuple(name for name in (self.left, self.right, self.rear_left, self.rear_right) if name is not None)
 
 
 class JointRows:
-    """Collects the angles or angular velocities of two joints of a topic."""
+    """Collects the angles or angular velocities of the wheels' joints of a topic."""
 
     def __init__(self, bag: Bag, topic: str, wheels: WheelSettings, column: str) -> None:
         self._wheels, self._column = wheels, column
-        self.rows = TopicRows(f"{bag.path} {topic}", 2)
+        self.rows = TopicRows(f"{bag.path} {topic}", len(wheels.joints))
         self._seen: set[str] = set()
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -65,18 +75,18 @@ class JointRows:
                     "expected one for each; select the other with odometry.use"
                 )
             return
-        if self._wheels.left in names and self._wheels.right in names:  # other messages contain other joints
-            wheels = (values[names.index(self._wheels.left)], values[names.index(self._wheels.right)])
-            self.rows.append(item, t_ns, wheels)
+        if set(self._wheels.joints) <= set(names):  # other messages contain other joints
+            self.rows.append(item, t_ns, [values[names.index(joint)] for joint in self._wheels.joints])
 
     def pairs(self, warnings: list[str]) -> tuple[Integers, Array]:
-        """Timestamps (N,), and the left and the right number (N, 2). InputError if no message has both joints."""
+        """Timestamps (N,), and the numbers (N, W) of the wheels. InputError if no message has all joints."""
+        joints = self._wheels.joints
         if not len(self.rows):
-            wrong = next((n for n in (self._wheels.left, self._wheels.right) if n not in self._seen), self._wheels.left)
+            wrong = next((joint for joint in joints if joint not in self._seen), self._wheels.left)
             raise InputError(
-                f"{self.rows.source}: has no message with both wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
+                f"{self.rows.source}: has no message with all wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
             )
-        return self.rows.in_order(("left wheel", "right wheel"), warnings)
+        return self.rows.in_order(joints, warnings)
 
 
 class TwoWheels:
@@ -181,8 +191,16 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
 
 
 def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> Motion:
-    """The motion from the angles, distances or speeds of two wheels, of joints or with a topic each."""
+    """The motion from the angles, distances or speeds of wheels: joints, or two wheels with a topic each."""
     bag = listeners.bag
+    if (wheels.base is not None or len(wheels.joints) == 3) and len(wheels.joints) != 4:
+        raise InputError(
+            f"{bag.path} {options.topic}: odometry.wheels names {len(wheels.joints)} joints, expected rear_left and rear_right too"
+        )
+    if wheels.right_topic is not None and len(wheels.joints) > 2:
+        raise InputError(
+            f"{bag.path} {options.topic}: odometry.wheels.right_topic is given: remove rear_left and rear_right"
+        )
     are_speeds = options.use == "twist"
     rows: JointRows | TwoWheels
     if wheels.right_topic is None:
@@ -195,11 +213,14 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
 
     def motion(warnings: list[str]) -> tuple[Integers, Array]:
         source = rows.rows.source
-        size, track = wheels.sizes(source, "odometry.wheels", turns=wheels.unit == "rad")
+        size = wheels.metres(source, "odometry.wheels", turns=wheels.unit != "m")
+        if isinstance(wheels.unit, float):
+            size *= wheels.unit
         t_ns, numbers = rows.pairs(warnings)
         if are_speeds:
-            return t_ns, motions.velocities_of_wheels(size * numbers, track)
-        moves = motions.between_wheels(source, t_ns, size * numbers, np.full(2, size), track, warnings)
+            return t_ns, motions.of_speeds(source, t_ns, size * numbers, wheels, warnings)
+        scales = np.full(numbers.shape[1], size)
+        moves = motions.between_wheels(source, t_ns, size * numbers, scales, wheels, warnings)
         return t_ns, motions.after_rest(moves)
 
     return motion

@@ -40,11 +40,12 @@ POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y
 ODOMETRY = (
     ("t", "v", "w"),
     ("t", "dx", "dy", "dtheta"),
-    *(("t", left, left.replace("left", "right")) for left in WHEELS),
+    *(("t", *wheels) for left in WHEELS for wheels in (motions.wheels_of(left, 2), motions.wheels_of(left, 4))),
     *POSES,
 )
 LEAST_AROUND = 300.0  # rad between rows, which no robot can rotate
 COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, WHEEL_COLUMNS, POSE_COLUMNS) for c in table.columns}
+COLUMNS |= {f"rear_{name}": column for name, column in COLUMNS.items() if name.startswith(("left", "right"))}
 RATES = ("wx", "wy", "wz")
 FILE_NAME = named("file_name", "a name in the table of the sensor")
 MAP_NAME = named("name", "a name in the map")
@@ -69,8 +70,9 @@ class PosesFile(TimedMapping, Turned):
 class OdometryFile(PosesFile, motions.WheelSizes):
     """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the previous row); x, y, heading or a
     quaternion (poses; only their relative motion is used); left, right (distances of the wheels), left_speed, right_speed
-    (their speeds), left_angle, right_angle (their angles), left_rate, right_rate (their angular rates). ``radius`` and
-    ``track`` of the rig ([odometry.wheels]) have precedence over these settings."""
+    (their speeds), left_angle, right_angle (their angles), left_rate, right_rate (their angular rates). Of four wheels also
+    rear_left, rear_right (rear_left_speed, ...). ``radius`` and ``track`` of the rig ([odometry.wheels]) have precedence over
+    these settings."""
 
 
 class ReferenceFile(PosesFile):
@@ -273,18 +275,21 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
     """Timestamps (N,), and velocities (N, 2) or increments (N, 3). InputError names file and row."""
     path, warnings = folder.file(options.file), folder.warnings
     if options.is_in_format():
-        if options.track is not None or options.radius is not None:
-            raise InputError(f"{path}: format {options.format} has no wheels: remove track and radius")
+        if options.has_sizes():
+            raise InputError(f"{path}: format {options.format} has no wheels: remove track, radius and base")
         t_ns, poses = _in_format(folder, options)
         return t_ns, motions.after_rest(motions.between_poses(path, t_ns, poses, warnings))
     mapped = folder.read(options, ODOMETRY)
     side = next((name for name in WHEELS if name in mapped.columns), None)
-    if side is None and (options.track is not None or options.radius is not None):
+    wheel_names = motions.wheels_of(side, 4 if f"rear_{side}" in mapped.columns else 2) if side else ()
+    if side is None and options.has_sizes():
         raise InputError(
-            f"{path}: track or radius is given, but no columns of wheels are mapped, such as left and right; map them, or remove "
-            "track and radius"
+            f"{path}: track, radius or base is given, but no columns of wheels are mapped, such as left and right; map them, or "
+            "remove it"
         )
-    size, track = options.sizes(path, side, turns=side in TURNS) if side else (1.0, 0.0)
+    if options.base is not None and len(wheel_names) == 2:
+        raise InputError(f"{path}: base is given, but only two wheels are mapped: map rear_{side} too, or remove base")
+    size = options.metres(path, side, turns=side in TURNS) if side else 1.0
     t_ns, columns = _columns(mapped, options.clock_offset)
     if "dx" in columns:
         moves = np.column_stack((columns["dx"], columns["dy"], columns["dtheta"]))
@@ -295,12 +300,11 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
     if "v" in kept:
         return t_ns, np.column_stack((kept["v"], kept["w"]))
     if side is not None:
-        pair = (side, side.replace("left", "right"))
-        wheels = size * np.column_stack([kept[name] for name in pair])
+        wheels = size * np.column_stack([kept[name] for name in wheel_names])
         if side in ("left_speed", "left_rate"):
-            return t_ns, motions.velocities_of_wheels(wheels, track)
-        scales = size * np.array([COLUMNS[name].in_unit(options.units.get(name, 1.0))[1] for name in pair])
-        moves = motions.between_wheels(path, t_ns, wheels, scales, track, warnings)
+            return t_ns, motions.of_speeds(path, t_ns, wheels, options, warnings)
+        scales = size * np.array([COLUMNS[name].in_unit(options.units.get(name, 1.0))[1] for name in wheel_names])
+        moves = motions.between_wheels(path, t_ns, wheels, scales, options, warnings)
     else:
         poses = _planar(path, mapped.rows[keep], kept, options, warnings)
         moves = motions.between_poses(path, t_ns, poses, warnings)

@@ -84,7 +84,7 @@ def _doubtful(ratios: Mapping[str, float]) -> list[str]:
     return [
         f"the reference {what} {ratio:.2f} times as much as the odometry ({keys[what]}, or fgloc calibrate)"
         for what, ratio in ratios.items()
-        if abs(ratio - 1.0) > SCALED and (what == "travels" or 0.5 < ratio < 2.0)
+        if abs(ratio - 1.0) > SCALED and (what == "travels" or -0.5 < ratio < 2.0)
     ]
 
 
