@@ -98,9 +98,7 @@ def _terminal_width() -> int:
 
 
 def first_use() -> None:
-    """Say at a terminal, before a run, that kernels have to be compiled, if none are yet."""
-    if not sys.stderr.isatty():
-        return
+    """Announce before a run that kernels have to be compiled, if none are yet."""
     from factors.odometry.kernels import relative  # which every run needs
 
     function: Any = relative  # as numba makes it
