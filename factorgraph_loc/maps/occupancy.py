@@ -20,6 +20,7 @@ Wall = tuple[float, float, float, float]
 Yaw = Annotated[float, Field(ge=-7.0, le=7.0), InUnit("rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 TOLERANCE = 0.75  # cells between a wall and the cell centres: half a cell for an oblique line
+STRIP = 256  # rows of cells that are read at once
 MIN_EXTENT = 2.0  # cells; smaller groups are noise of the mapping sensor
 
 
@@ -68,8 +69,16 @@ def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
     """Return which cells (rows, columns) are occupied; a transparent cell is unknown."""
     with opened(path, IMAGE) as file, pillow_image(file, path) as image:
         # a colour counts by the mean of its channels, as in map_server
-        channels = image.convert("RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB")
-    values = np.asarray(channels, dtype=np.uint8)
+        mode = "RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB"
+        out = np.empty((image.height, image.width), dtype=bool)
+        for top in range(0, image.height, STRIP):  # in strips, as numbers of all cells at once need much memory
+            strip = image.crop((0, top, image.width, min(top + STRIP, image.height))).convert(mode)
+            out[top : top + STRIP] = _are_occupied(np.asarray(strip, dtype=np.uint8), stated)
+    return out
+
+
+def _are_occupied(values: NDArray[np.uint8], stated: MapFile) -> NDArray[np.bool_]:
+    """Which cells (R, C) of these channels (R, C, 3 or 4) are occupied."""
     grey = values[:, :, :3].mean(axis=2)
     if stated.mode == "raw":  # occupancy in percent, 255 where unknown
         return np.asarray((grey <= 100.0) & (grey >= 100.0 * stated.occupied_thresh))

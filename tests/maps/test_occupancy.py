@@ -1,5 +1,7 @@
 """Occupancy maps of ROS's map_server become walls."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -133,3 +135,16 @@ def test_a_map_without_walls(hall):
     Image.fromarray(np.full((9, 9), 254, dtype=np.uint8)).save(hall.parent / "hall.pgm")
     with pytest.raises(InputError, match="no occupied cells"):
         read_walls(hall)
+
+
+def test_a_large_map_needs_few_bytes_per_cell(tmp_path):
+    """Less than 8 bytes of arrays per cell; floating-point numbers of all cells need more."""
+    cells = np.zeros((2000, 3000), dtype=np.uint8)
+    Image.fromarray(cells).save(tmp_path / "hall.png")
+    (tmp_path / "hall.yaml").write_text(YAML.replace("hall.pgm", "hall.png"))
+    tracemalloc.start()
+    try:
+        assert len(read_walls(tmp_path / "hall.yaml")) == 4
+        assert tracemalloc.get_traced_memory()[1] < 8 * cells.size
+    finally:
+        tracemalloc.stop()
