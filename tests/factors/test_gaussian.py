@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2
 
-from factors import gaussian, positive
+from factors import chi_squared, gaussian, positive
+from factors.least_squares import minima, minimum
 from factors.rfid import factor
 
 
@@ -75,3 +79,115 @@ def test_what_rounding_makes_singular_is_smoothed_to_a_covariance():
     correction, after = positive.smoothed(flat, np.eye(3), np.zeros((3, 3)), np.zeros(3), 0.5 * flat)
     assert np.all(np.isfinite(correction))
     assert np.all(np.diag(after) > 0.0)
+
+
+SIGMAS = np.array((1e9, 1e9, 1e-3))
+
+
+def flat(share):
+    """A covariance (3, 3) of :data:`SIGMAS`, that in one direction has this share of what it has in the others."""
+    turn, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))
+    covariance = (turn * (1.0, 1.0, share)) @ turn.T
+    return (covariance + covariance.T) / 2.0 * SIGMAS[:, None] * SIGMAS
+
+
+@pytest.mark.parametrize("share", [1e-20, 0.0, -1e-17])
+def test_a_covariance_that_rounding_made_singular_is_inverted_as_the_nearest_one(share):
+    covariance = flat(share)
+    assert np.allclose(positive.nearest(covariance), covariance, rtol=1e-9, atol=0.0)
+    whitener = positive.whitener(np.stack((covariance, np.eye(3))))
+    assert np.allclose(whitener[1].T @ whitener[1], np.eye(3))
+    assert np.all(np.isfinite(whitener))
+    assert np.linalg.eigvalsh(positive.nearest(covariance) / SIGMAS[:, None] / SIGMAS)[0] > 0.1 * positive.LEAST
+    assert np.all(np.diag(positive.inverse(covariance)) > 0.0)
+    assert positive.squared(SIGMAS, covariance) > 0.0
+
+
+def test_other_covariances_are_taken_as_they_are():
+    covariance = flat(0.1)
+    assert np.array_equal(positive.whitener(covariance), np.linalg.inv(np.linalg.cholesky(covariance)))
+    assert np.array_equal(positive.inverse(covariance), np.linalg.inv(covariance))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
+def test_what_is_no_covariance_is_refused(bad):
+    with pytest.raises(np.linalg.LinAlgError):
+        positive.nearest(np.diag((1.0, bad)))
+
+
+def test_roots_and_solutions_are_those_of_the_nearest_one_too():
+    line, right = np.array((1.0, 2.0)), np.ones((2, 3))
+    covariance = np.outer(line, line)
+    near = positive.nearest(covariance)
+    root = positive.root(covariance)
+    assert np.allclose(root @ root.T, near, rtol=1e-6)
+    assert np.allclose(positive.solve(covariance, near @ right), right, rtol=1e-2)
+    sound, right = flat(0.5), np.ones((3, 2))
+    assert np.array_equal(positive.root(sound), np.linalg.cholesky(sound))
+    assert np.array_equal(positive.solve(sound, right), np.linalg.solve(sound, right))
+
+
+@given(st.floats(1e-6, 1.0 - 1e-6), st.floats(0.5, 1e4))
+def test_quantiles_and_tails_are_those_of_scipy(probability, dof):
+    value = float(chi_squared.quantile(probability, dof))
+    assert value == pytest.approx(chi2.ppf(probability, dof), rel=1e-6)
+    assert float(chi_squared.survival(value, dof)) == pytest.approx(1.0 - probability, abs=1e-9)
+
+
+TRUTH = np.array(((2.0, -1.0), (0.5, 3.0), (-4.0, 0.1)))
+SCALES = np.array((1e-3, 1e4))
+
+
+def valley(truth, states):
+    """Half the squares of (x - a) / s and of y - b + (x - a)^2 / s^2, in units of very different size."""
+    x, y = ((states - truth) / SCALES).T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    residual = np.stack((x, y + x**2), axis=1)
+    jacobian = np.stack((np.stack((one, zero), axis=1), np.stack((2.0 * x, one), axis=1)), axis=1) / SCALES
+    gradient = np.einsum("nij,ni->nj", jacobian, residual)
+    return 0.5 * np.sum(residual**2, axis=1), gradient, np.einsum("nij,nik->njk", jacobian, jacobian)
+
+
+def test_problems_of_different_scales_are_solved_together():
+    calls = []
+
+    def at(states, which):
+        calls.append(len(which))
+        return valley(TRUTH[which], states)
+
+    start = TRUTH + SCALES * np.array(((3.0, -2.0), (0.0, 0.0), (-30.0, 5.0)))
+    found = minima(at, start, 100, 1e-9 * SCALES)
+    np.testing.assert_allclose((found.states - TRUTH) / SCALES, 0.0, atol=1e-8)
+    np.testing.assert_allclose(found.curvatures[0] * np.outer(SCALES, SCALES), np.eye(2), atol=1e-6)
+    assert calls[:2] == [3, 3]
+    assert calls[2] == 2  # the second began at its minimum, where the cost is zero
+    assert len(calls) < 40
+
+
+def test_a_step_is_no_longer_than_allowed():
+    reached = []
+
+    def at(state):
+        reached.append(state[0])
+        return float(0.5 * (state[0] - 10.0) ** 2), state - 10.0, np.eye(1)
+
+    state, cost, _ = minimum(at, np.zeros(1), 50, 1e-6, largest=1.0)
+    assert np.max(np.diff(reached)) <= 1.0 + 1e-12
+    np.testing.assert_allclose((state[0], cost), (10.0, 0.0), atol=1e-5)
+
+
+def test_a_minimum_beyond_the_bounds_is_at_the_bound():
+    def at(state):
+        return float(0.5 * np.sum((state - 3.0) ** 2)), state - 3.0, np.eye(2)
+
+    state, cost, _ = minimum(at, np.zeros(2), 50, 1e-9, high=np.array((1.0, 9.0)))
+    np.testing.assert_allclose(state, (1.0, 3.0), atol=1e-6)
+    np.testing.assert_allclose(cost, 2.0, atol=1e-6)
+
+
+def test_what_a_problem_does_not_determine_stays():
+    def at(state):
+        return float(0.5 * state[0] ** 2), np.array((state[0], 0.0)), np.diag((1.0, 0.0))
+
+    state, _, _ = minimum(at, np.array((1.0, 7.0)), 50, 1e-9)
+    np.testing.assert_allclose(state, (0.0, 7.0), atol=1e-6)

@@ -1,5 +1,6 @@
 """Tables of other programs: stamps, numbers and columns as they stand there."""
 
+import math
 from datetime import UTC, datetime, timedelta, timezone
 from decimal import Decimal
 from pathlib import Path
@@ -12,9 +13,12 @@ from refusal import refusal
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
-from factorgraph_loc.files.columns import POSES
+from factorgraph_loc.files.columns import POINTS, POSES
 from factorgraph_loc.files.tables import SECONDS, Cells, iso_nanoseconds
+from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
+from factorgraph_loc.sensors.odometry.measurement import VELOCITIES
 from factorgraph_loc.sensors.rfid.map import TAGS
+from factorgraph_loc.sensors.tables import all_tables
 
 STAMPS = st.integers(-(2**61), 2**61)
 
@@ -138,3 +142,39 @@ def test_json_lines_of_several_kinds(read):
 )
 def test_wrong_tables(read, content, mapping, fragments):
     refusal(lambda: read(content, **mapping), *fragments)
+
+
+COLUMNS = [
+    pytest.param(column, id=f"{table.name}.{column.name}")
+    for table in (*all_tables(), POSES, POINTS)
+    for column in table.columns
+]
+
+
+@pytest.mark.parametrize("column", COLUMNS)
+def test_the_first_unit_is_that_of_the_bounds(column):
+    assert next(iter(column.units.values()), 1.0) == 1.0
+    assert column.low < column.high
+    assert column.doc
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_only_what_may_lack_may_be_no_number(value):
+    with pytest.raises(InputError):
+        VELOCITIES["w"].require("a.csv", [2], np.array((value,)))
+    bearing = BEARING_RANGE["bearing"]
+    if math.isnan(value):
+        bearing.require("a.csv", [2], np.array((value,)))
+    else:
+        with pytest.raises(InputError, match=r"radians, not degrees, in -6.28319 to 6.28319, or nothing"):
+            bearing.require("a.csv", [2], np.array((value,)))
+
+
+def test_a_measured_range_is_above_zero():
+    assert BEARING_RANGE["range"].measured.outside(np.array((0.0, 1e-300, 1e-3, 1e5, 2e5))).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        True,
+    ]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.fitting.posterior import Parameter, independent_share, least_squares, maximise
+from factorgraph_loc.fitting.shares import wilson
 
 LINE = (Parameter("slope", 0.0, 1.0, -10.0, 10.0), Parameter("offset", 0.0, 1.0, -10.0, 10.0))
 
@@ -66,3 +67,14 @@ def test_measurements_that_are_repeated_count_once():
     assert often.share == pytest.approx(0.25, rel=0.3)
     np.testing.assert_allclose(often.errors, once.errors, rtol=0.15)
     assert independent_share(np.zeros((3, 2)), np.eye(2)) == 1.0
+
+
+def test_wilson_agrees_with_its_published_figures():
+    """Newcombe, Statistics in Medicine 17(8), 1998, table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29."""
+    for counts, expected in (
+        ((81, 263), (0.2553, 0.3662)),
+        ((15, 148), (0.0624, 0.1605)),
+        ((0, 20), (0.0, 0.1611)),
+        ((1, 29), (0.0061, 0.1718)),
+    ):
+        assert wilson(*counts) == pytest.approx(expected, abs=6e-5)

@@ -1,18 +1,24 @@
 """Estimators against what is known in closed form: poses, and constants of odometry and sensor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from by_hand import made
 from on_a_line import STEP, WHEELS, drive, kalman
 
 from factorgraph_loc import BearingRange, IncrementOdometry, Landmark, Rig, World
+from factorgraph_loc.fusion.graph.chained import Chained
+from factorgraph_loc.fusion.graph.problem import Problem
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeUncertainty
-from factorgraph_loc.sensors.odometry.settings import (
-    OdometryUncertainty,
-)
+from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty
 from factors import se2
-from factors.landmarks.model import log_likelihood
+from factors.graph import PriorFactor, VectorPriorFactor, constants_key, landmark_key, pose_key
+from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import PARAMETERS, BearingRangeModel, log_likelihood
+from factors.motion import Increment
+from factors.odometry.factor import OdometryFactor
 
 # Landmarks so far ahead that range measures x and bearing measures heading: the problem along x is linear and Gaussian.
 FAR = World(landmarks={"far": Landmark(x=1e4, y=0.0)})
@@ -154,3 +160,92 @@ def test_one_look_is_no_better_than_the_map(name):
     found = np.sqrt(np.diag(estimator.estimate().covariance))
     np.testing.assert_allclose(found[:2], 0.3 / np.sqrt(5.0), rtol=0.08)
     assert found[2] == pytest.approx(0.3 / 4.0 / np.sqrt(5.0), rel=0.1)
+
+
+ODOMETRY, BEAM = constants_key(0), constants_key(1)
+MODEL = BearingRangeModel(mounting=(0.1, -0.05, 0.2), range_scale=1.03, depth=True, bearing_bias=0.01, robust=3.0)
+POINTS = np.array(((4.0, 1.0), (5.0, -2.0), (3.0, 3.0), (6.0, 0.5)))
+
+
+def look(rng, pose, **more):
+    """What is seen of the points, one of them without a range and one without a bearing, the last far off."""
+    at = se2.compose(se2.compose(pose, more.get("offset", np.zeros(3))), np.array(MODEL.mounting))
+    local = se2.transform_to(at, POINTS)
+    ranges, bearings = MODEL.range_scale * local[:, 0], np.arctan2(local[:, 1], local[:, 0]) + MODEL.bearing_bias
+    ranges, bearings = ranges + 0.05 * rng.standard_normal(4), bearings + 0.02 * rng.standard_normal(4)
+    ranges[0], bearings[1], ranges[3] = np.nan, np.nan, ranges[3] + 2.0
+    return BearingRangeFactor(MODEL, POINTS, ranges, bearings, **more)
+
+
+@pytest.fixture
+def run():
+    """Eight poses; what looks may have beside their points, each once."""
+    rng = np.random.default_rng(3)
+    step, covariance = np.array((0.3, 0.02, 0.1)), np.diag((0.02, 0.01, 0.02)) ** 2
+    spreads = np.array([np.diag((0.1, 0.2)) ** 2] * 4)
+    offset = {"offset": np.array((0.05, 0.01, 0.03)), "offset_covariance": np.diag((0.05, 0.04, 0.06)) ** 2}
+    twist = {"twist": np.array((0.5, 0.0, 0.3))}
+    extras = [{}, twist, offset, {**offset, **twist, "in_look": 7}, {"point_covariances": spreads}]
+    extras.append({**offset, "point_covariances": spreads})
+    constants = tuple(range(len(PARAMETERS)))
+    factors = [(PriorFactor(np.zeros(3), covariance), (pose_key(0),))]
+    factors += [(VectorPriorFactor(np.zeros(2), np.array((0.02, 0.01))), (ODOMETRY,))]
+    factors += [(VectorPriorFactor(np.zeros(6), np.full(6, 0.02)), (BEAM,))]
+    pose, values = np.zeros(3), {ODOMETRY: np.array((0.01, -0.02)), BEAM: 0.01 * np.arange(6.0)}
+    for i in range(8):
+        if i:
+            moved = Increment(step + 0.01 * rng.standard_normal(3), covariance, 0.5, 0.1)
+            factors.append((OdometryFactor(moved, (0, 2)), (pose_key(i - 1), pose_key(i), ODOMETRY)))
+        factors.append((look(rng, pose, estimated=constants, **extras[i % 6]), (pose_key(i), BEAM)))
+        values[pose_key(i)] = se2.compose(pose, se2.exp(0.05 * rng.standard_normal(3)))
+        pose = se2.compose(pose, step)
+    return factors, values
+
+
+def through_gtsam(factors):
+    """The same problem, which is not told that it is a row."""
+    problem = Problem(factors)
+    problem.__dict__["_chain"] = None
+    return problem
+
+
+def test_the_solution_and_its_covariances_are_those_of_gtsams_elimination(run):
+    factors, values = run
+    ours, theirs = Problem(factors), through_gtsam(factors)
+    assert ours._chain is not None
+    assert ours._chain.cost(ours._chain.begin(values)) == pytest.approx(theirs.cost(values), rel=1e-12)
+    found, expected = ours.solve(values), theirs.solve(values)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    assert found.cost < 0.9 * theirs.cost(values)
+    spreads, wanted = ours.covariances(expected.values, values), theirs.covariances(expected.values, values)
+    for key, value in expected.values.items():
+        np.testing.assert_allclose(found.values[key], value, atol=1e-8)
+        np.testing.assert_allclose(spreads.by_key[key], wanted.by_key[key], rtol=1e-6, atol=1e-12)
+
+
+def test_one_call_linearises_as_each_factor_does(run):
+    """As the plain code of landmarks that are variables does, one by one."""
+    factors, values = run
+    for factor, keys in factors:
+        if not isinstance(factor, BearingRangeFactor):
+            continue
+        at = [values[key] for key in keys]
+        residual, found = factor.linearize(at)
+        for i, point in enumerate(factor.points):
+            spread = None if factor.point_covariances is None else factor.point_covariances[i : i + 1]
+            seen = {"ranges": factor.ranges[i : i + 1], "bearings": factor.bearings[i : i + 1]}
+            one = replace(factor, **seen, point_covariances=spread, free=True, in_look=factor.in_look or len(POINTS))
+            error, (*blocks, _) = one.linearize([*at, point])
+            rows = slice(2 * i, 2 * i + 2)
+            np.testing.assert_allclose(residual[rows], error, atol=1e-12)
+            for block, expected in zip(found, blocks, strict=True):
+                np.testing.assert_allclose(block[rows], expected, atol=1e-12)
+
+
+def test_loops_and_many_parameters_are_left_to_gtsam(run):
+    factors, values = run
+    closing = OdometryFactor(Increment(np.zeros(3), np.eye(3), 1.0))
+    assert Problem([*factors, (closing, (pose_key(1), pose_key(5)))])._chain is None
+    extra = {landmark_key(i): np.zeros(2) for i in range(20)}
+    many = [(VectorPriorFactor(np.zeros(2), np.ones(2)), (key,)) for key in extra]
+    assert Chained([*factors, *many]).begin(values | extra) is None

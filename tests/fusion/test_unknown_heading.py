@@ -1,23 +1,27 @@
-"""A start whose position is known and whose heading is not: every estimator that can find it, by whatever sensor tells it."""
+"""Estimators that do not know the heading, or the place, and find it again."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import camera_world
 import numpy as np
 import pytest
+from by_hand import made
 from landmark_world import simulate, with_sightings
 
-from factorgraph_loc import IncrementOdometry, Rig, Trajectory
-from factorgraph_loc.evaluation.metrics import errors
+from factorgraph_loc import IncrementOdometry, IncrementStream, Log, RfidScan, Rig, Tick, Trajectory
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.log import cut
+from factorgraph_loc.model.log import cut, join
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.simulation.settings import preset
-from factorgraph_loc.simulation.simulate import simulate as simulated
+from factorgraph_loc.simulation import preset
+from factorgraph_loc.simulation import simulate as simulated
 from factors import se2
 
 CONFIGS = {
@@ -136,3 +140,120 @@ def test_the_start_as_a_constraint():
     np.testing.assert_allclose(np.cov(drawn[:, :2].T), mode.covariance[:2, :2], atol=0.03)
     spread = np.cov((se2.compose(drawn, se2.inverse(moved.delta))[:, :2] - position).T)
     assert spread.trace() > covariance.trace()
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return simulate(seconds=20.0)
+
+
+def test_a_lost_track_is_ambiguous_until_its_place_is_found(drive):
+    """The new place is told by one landmark for a while: seen well enough to doubt the old one, not to find the new one."""
+    elsewhere = cut(simulate(seed=3, seconds=45.0), 25.0, 45.0)
+    s = elsewhere.streams["bearing_range"]
+    alone = with_sightings(elsewhere, (np.array(s.landmark) == s.landmark[0]) | (s.t > 33.0))
+    carried = join(cut(drive, 0.0, 10.0), alone)
+    result = run(carried, RunConfig("smoother"))
+    status = np.array(result.status)
+    (t,) = [event.t for event in result.diagnostics.events]
+    assert 18.0 < t < 22.0
+    assert np.all(status[(result.t > 13.0) & (result.t < t)] == "ambiguous")
+    assert np.all(status[result.t > t + 0.1] == "localized")
+    final = errors(result.final, carried.reference)
+    assert np.nanmax(final.position[final.t > t]) < 0.2
+
+
+@pytest.mark.parametrize("name", ["smoother", "batch"])
+def test_one_landmark_does_not_tell_the_place(name, drive):
+    """The start stays open, and everything is still there when the others come."""
+    s = drive.streams["bearing_range"]
+    lone = with_sightings(drive, np.array(s.landmark) == "b")
+    result = run(cut(lone, 0.0, 8.0), RunConfig(name, prior="unknown"))
+    assert result.diagnostics.events == []
+    assert len(result.final) == 0
+    assert "localized" not in result.status
+    assert result.causal() is None
+    (warning,) = result.warnings
+    assert warning.startswith("simulated: never localized: ")
+    if name != "batch":
+        ambiguous = np.array(result.status) == "ambiguous"
+        assert result.status == ("unlocalized",) * int(np.argmax(ambiguous)) + ("ambiguous",) * int(ambiguous.sum())
+        assert np.all(np.isfinite(result.poses[ambiguous]))
+        distance_of_b = np.hypot(*(result.poses[ambiguous, :2] - drive.world.position("b")).T)
+        truth = np.hypot(*(drive.reference.at(result.t[ambiguous])[:, :2] - drive.world.position("b")).T)
+        assert np.abs(distance_of_b - truth).max() < 0.5
+
+    late = with_sightings(drive, (np.array(s.landmark) == "b") | (s.t > 8.0))
+    result = run(late, RunConfig(name, prior="unknown"))
+    assert result.final.t[0] < 0.3
+    assert errors(result.final, drive.reference).position.max() < 0.3
+
+
+def test_landmarks_that_are_to_be_estimated_cannot_tell_the_place(drive):
+    with pytest.raises(InputError, match="cannot start from an unknown pose"):
+        run(drive, RunConfig("smoother", {"landmarks": "unknown"}, prior="unknown"))
+
+
+DURATION = 80.0
+
+
+def office(faults: Mapping[str, Any] | None = None, seed: int = 1, **changes: Any) -> Log:
+    settings = {"drive": {"duration": DURATION}, "faults": dict(faults or {}), **changes}
+    return simulated(preset("office", settings), seed)
+
+
+def test_landmarks_of_a_track_that_was_lost_are_forgotten() -> None:
+    """The odometry jumps by 8 m; tags tell it once, and landmarks that were put to where they seemed to be do not lead back."""
+    seen = {"max_range": 6.0, "rate": 5.0}
+    log = office({}, 3, drive={"duration": 26.0}, world={"tags": 60, "landmarks": 30}, sightings=seen)
+    odometry = log.streams["odometry"]
+    assert isinstance(odometry, IncrementStream)
+    way = odometry.dx + 8.0 * (np.arange(len(odometry.t)) == np.searchsorted(odometry.t, 20.0))
+    carried = replace(log, streams={**log.streams, "odometry": replace(odometry, dx=way)})
+    sensors = ("odometry", "rfid", "bearing_range")
+    result = run(carried, RunConfig("smoother", {"landmarks": "unknown"}, sensors=sensors))
+    (lost,) = [event for event in result.diagnostics.events if event.kind == "lost"]
+    assert abs(lost.fields["since"] - 20.0) < 0.05
+    assert score(result, log)["final.position_rmse"] < 0.15
+
+
+def test_a_robot_that_is_carried_far() -> None:
+    """The way that it is carried tells nothing of the odometry's constants, and these nothing of that way."""
+    hall = {"world": {"width": 60.0, "depth": 36.0, "tags": 180}, "drive": {"duration": 20.0}}
+    world = preset("warehouse", hall).model_copy(update={"world_seed": 1})
+    carried = join(cut(simulated(world, 10), 0.0, 12.0), cut(simulated(world, 11), 0.0, 14.0))
+    result = run(carried, RunConfig("smoother"))
+    (lost,) = result.diagnostics.events
+    assert lost.kind == "lost"
+    causal = errors(result.causal(), carried.reference)
+    assert np.nanmax(causal.position[causal.t > lost.t]) < 0.6
+    assert np.nanmax(errors(result.final, carried.reference).position) < 0.5
+
+
+def test_belief_while_it_seeks_has_particles_that_move_with_the_odometry() -> None:
+    log = office()
+    sensors = ("odometry", "rfid")
+    smoother = made("smoother", log.rig, log.world, sensors, 1)
+    assert smoother.belief().particles is None
+    scans = 0
+    for m in log.measurements(sensors):
+        smoother.process(m)
+        scans += isinstance(m, RfidScan)
+        if scans == 2:
+            break
+    end = m.t + 2.0
+    smoother.process(IncrementOdometry(end, 0.0, 0.0, 0.0))
+    for t in np.arange(m.t + 0.1, end + 0.05, 0.1):  # the search goes on in slices
+        smoother.process(Tick(t))
+    first = smoother.belief()
+    assert first.particles is not None
+    assert first.weights is not None
+    assert np.isclose(first.weights.sum(), 1.0)
+    middle = first.modes[0].pose
+    near = np.hypot(*(first.particles - middle)[:, :2].T) < 3.0
+    assert first.weights[near].sum() > 0.3 * first.modes[0].weight
+    smoother.process(IncrementOdometry(end + 0.4, 0.2, 0.0, 0.0))
+    smoother.process(Tick(end + 0.4))
+    moved = smoother.belief().particles
+    assert moved is not None
+    assert np.allclose(np.hypot(*(moved - first.particles)[:, :2].T), 0.2, atol=0.02)

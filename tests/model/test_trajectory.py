@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from tum_files import read_tum
 
+from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.planar import Mounting, rotations_of
+from factorgraph_loc.model.scoring import Ticks, check_tick_gap
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
 
 
@@ -62,3 +66,66 @@ def test_tum_comes_back_to_the_nanosecond(tmp_path_factory, stamps, t0_ns, headi
 def test_tilted_poses_and_comments(tmp_path):
     (tmp_path / "a.tum").write_text("\ufeff# t x y z qx qy qz qw\r\n\r\n1.0 1 2 3 0.70710678 0 0 0.70710678\r\n")
     np.testing.assert_allclose(read_tum(tmp_path / "a.tum").poses, ((1, 2, 0),), atol=1e-7)
+
+
+def test_a_mounting_turns_about_x_then_y_then_z():
+    for roll, pitch, yaw in np.random.default_rng(1).uniform(-6.0, 6.0, (100, 3)).tolist():
+        turned = Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix()
+        np.testing.assert_allclose(Mounting(roll=roll, pitch=pitch, yaw=yaw).rotation(), turned, rtol=0, atol=1e-14)
+
+
+def test_quaternions_that_are_almost_of_length_one_are_rotations():
+    rng = np.random.default_rng(2)
+    turns = Rotation.random(100, rng=rng)
+    found = rotations_of("poses", np.arange(100), turns.as_quat() * rng.uniform(0.991, 1.009, (100, 1)))
+    np.testing.assert_allclose(found, turns.as_matrix(), rtol=0, atol=1e-14)
+    assert rotations_of("poses", np.arange(0), np.empty((0, 4))).shape == (0, 3, 3)
+
+
+def fired(start, stamps, gap=60.0):
+    ticks = Ticks(start, gap)
+    found = [tick for t in stamps for tick in ticks.advance(t)]
+    return [*found, *ticks.rest()], ticks
+
+
+def grid(start, last):
+    return (start + np.arange(np.floor((last - start) * 10 + 1e-6) + 1) / 10).tolist()
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1234, 1.7e9 + 0.3])
+def test_they_stand_on_a_grid_across_gaps_that_are_short_enough(start):
+    stamps = start + np.cumsum(np.random.default_rng(1).uniform(0.0, 1.0, 300)) + np.repeat((0.0, 59.0), 150)
+    found, ticks = fired(start, stamps.tolist())
+    assert found == grid(start, stamps[-1])
+    assert ticks.seconds == pytest.approx(stamps[-1] - start)
+    assert not ticks.skipped
+
+
+def test_there_are_none_inside_a_gap_that_is_too_long():
+    stamps = [0.0, 0.25, 0.5, 60.77, 61.0]
+    found, ticks = fired(0.0, stamps)
+    assert found == [t for t in grid(0.0, 61.0) if t <= 0.5 or t >= 60.77]
+    assert ticks.skipped == [(0.5, 60.77)]
+    assert ticks.seconds == pytest.approx(61.0 - 60.27)
+    assert fired(0.0, stamps, 61.0)[0] == grid(0.0, 61.0)
+
+
+@pytest.mark.parametrize("far", [1e6, 1.7e9, 1e17])
+def test_a_clock_that_jumps_costs_nothing(far):
+    found, ticks = fired(0.0, [0.0, 0.05, far, far, far + 0.5])
+    assert found[0] == 0.0
+    assert all(t >= far for t in found[1:])
+    assert len(found) <= 8
+    assert ticks.count == len(found)
+
+
+def test_the_start_counts_as_measured_and_what_is_late_fills_no_gap():
+    found, _ = fired(0.0, [100.0, 100.2, 300.0, 200.0, 300.1])
+    assert found == pytest.approx([0.0, 100.0, 100.1, 100.2, 300.0, 300.1])
+
+
+def test_what_the_setting_may_be():
+    check_tick_gap(60.0)
+    for wrong in (0.0, 0.5, -1.0, float("nan"), float("inf"), 1e6):
+        with pytest.raises(InputError, match="tick_gap is"):
+            check_tick_gap(wrong)
