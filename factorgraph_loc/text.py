@@ -2,10 +2,11 @@
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import is_dataclass
-from itertools import islice
+import reprlib
+from collections.abc import Iterable
 from typing import Any
+
+from pydantic_core import to_jsonable_python
 
 MESSAGE = 300  # characters of a message at most
 NAME = 120  # characters of a name, a path or a foreign message
@@ -43,9 +44,36 @@ def plain(text: object, limit: int | None = NAME) -> str:
     return whole if limit is None else shortened(whole, limit)
 
 
+class _Brief(reprlib.Repr):
+    """A ``repr`` that computes no more than is shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxstring = DEPTH, VALUE
+        self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdict = ITEMS
+
+    def repr1(self, value: Any, level: int) -> str:
+        if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
+            value = value.item()  # a numpy scalar, whose repr includes its type
+        return super().repr1(value, level)
+
+    def repr_int(self, value: int, level: int) -> str:
+        digits = int(value.bit_length() * math.log10(2)) + 1
+        return repr(value) if digits <= LONG_NUMBER else f"a whole number of about {digits} digits"
+
+    def repr_instance(self, value: object, level: int) -> str:
+        try:
+            return " ".join(repr(value).split())
+        except Exception:  # the repr of a foreign type may raise anything
+            return f"<{type(value).__name__}>"
+
+
+_BRIEF = _Brief()
+
+
 def quoted(value: object) -> str:
     """The ``repr`` of ``value`` in at most :data:`VALUE` characters. Long texts, long lists and huge integers are abbreviated."""
-    return plain(_written(value, VALUE, DEPTH), VALUE)
+    return plain(_BRIEF.repr(value), VALUE)
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:
@@ -63,15 +91,7 @@ def error_text(error: BaseException) -> str:
 
 def plain_values(value: Any) -> Any:
     """A value as in JSON: dictionaries for data classes and mappings, lists for arrays and tuples, null for NaN and infinity."""
-    if is_dataclass(value):
-        return {name: plain_values(getattr(value, name)) for name in value.__dataclass_fields__}
-    if hasattr(value, "tolist"):  # an array
-        return plain_values(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(key): plain_values(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain_values(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=lambda array: array.tolist())
 
 
 def json_text(content: Any) -> str:
@@ -106,32 +126,3 @@ def _escape(character: str) -> str:
     """Escape a character as in Python; beyond ASCII as in JSON and TOML."""
     code = ord(character)
     return repr(character)[1:-1] if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
-
-
-def _written(value: object, limit: int, depth: int) -> str:
-    """Like ``repr``, but computes no more than is shown."""
-    if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
-        value = value.item()  # a numpy scalar, whose repr includes its type
-    if isinstance(value, (str, bytes)):
-        return repr(shortened(value, limit) if isinstance(value, str) else value[:limit])
-    if isinstance(value, int) and (digits := int(value.bit_length() * math.log10(2)) + 1) > LONG_NUMBER:
-        return f"a whole number of about {digits} digits"
-    if isinstance(value, (Mapping, list, tuple, Set)):
-        return _collection(value, limit, depth)
-    try:
-        return " ".join(repr(value).split())
-    except Exception:  # the repr of a foreign type may raise anything
-        return f"<{type(value).__name__}>"
-
-
-def _collection(values: Mapping[object, object] | Sequence[object] | Set[object], limit: int, depth: int) -> str:
-    begin, end = ("[", "]") if isinstance(values, list) else ("(", ")") if isinstance(values, tuple) else ("{", "}")
-    if depth == 0 and values:
-        return f"{begin}{CUT}{end}"
-    items = [_written(item, limit, depth - 1) for item in islice(values, ITEMS)]
-    if isinstance(values, Mapping):
-        contents = islice(values.values(), ITEMS)
-        items = [f"{key}: {_written(item, limit, depth - 1)}" for key, item in zip(items, contents, strict=True)]
-    if len(values) > ITEMS:
-        items.append(CUT)
-    return f"{begin}{', '.join(items)}{end}"

@@ -84,9 +84,7 @@ def test_an_experiment_gives_its_table(tmp_path):
     assert told == [(0, 2, 0), (1, 2, 0), (2, 2, 0)]
     with pytest.raises(fgloc.InputError, match="--jobs applies to this machine, but --scheduler names a cluster"):
         fgloc.experiment(tmp_path / "drives.toml", out=tmp_path / "out", jobs=1, scheduler="127.0.0.1:1")
-    found = fgloc.status(
-        tmp_path / "drives.toml", changes={"simulation.drive.duration": 6.0}, out=tmp_path / "out", verify=True
-    )
+    found = fgloc.status(tmp_path / "drives.toml", changes={"simulation.drive.duration": 6.0}, out=tmp_path / "out")
     assert found.labels == {"dead_reckoning": {"ok": 2, "failed": 0, "missing": 0, "damaged": 0}}
     changed = {"simulation.drive.duration": 6.0}
     page = fgloc.report(tmp_path / "drives.toml", changes=changed, out=tmp_path / "out")

@@ -90,9 +90,6 @@ def run(
         typer.Option(metavar="ADDRESS", help="Scheduler of a dask.distributed cluster that executes the runs."),
     ] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Run failed runs again.")] = False,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Compare stored results with their checksums; run damaged ones again.")
-    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
     json: Json = False,
 ) -> None:
@@ -102,7 +99,7 @@ def run(
     """
     from factorgraph_loc.experiments.experiment import prepare, run_experiment
 
-    prepared = prepare(file, **options.given(), verify=verify)
+    experiment, prepared = prepare(file, **options.given())
     if dry_run:
         _print_plan(prepared, jobs, retry_failed, json)
         return
@@ -119,21 +116,20 @@ def run(
     except KeyboardInterrupt as stop:
         stop.add_note(f"finished runs are kept in {prepared.folder}; the same command resumes")
         raise
-    _print_done(done, prepared, file, json)
+    _print_done(done, prepared.folder, experiment.report.metrics, file, json)
     if done.failures:
         raise typer.Exit(1)
 
 
-def _print_done(done: Done, prepared: Prepared, file: Path, json: bool) -> None:
+def _print_done(done: Done, folder: Path, metrics: Sequence[str], file: Path, json: bool) -> None:
     show.outcome(done.warnings, done.failures, SHOWN, f", see `fgloc experiment status {file}`")
     if json:
         results = {"runs": done.rows, "failures": done.failures, "warnings": done.warnings}
-        show.document({"folder": str(prepared.folder), **results})
+        show.document({"folder": str(folder), **results})
         return
-    header, lines = _summary(done.rows, prepared.experiment.report.metrics)
-    show.table(header, lines)
+    show.table(*_summary(done.rows, metrics))
     show.line()
-    show.line(f"results are in {prepared.folder}: results.parquet, store/")
+    show.line(f"results are in {folder}: results.parquet, store/")
 
 
 @app.command()
@@ -142,17 +138,16 @@ def status(
     file: File,
     *,
     options: ExperimentOptions,
-    verify: Annotated[bool, typer.Option("--verify", help="Read all results and compare their checksums.")] = False,
     json: Json = False,
 ) -> None:
-    """Show how many runs of an experiment are done, failed, missing or damaged.
+    """Show how many runs of an experiment are done, failed, missing or damaged; results are compared with their checksums.
 
     Example: fgloc experiment status lags.toml
     """
     from factorgraph_loc.experiments.experiment import STATES
     from factorgraph_loc.experiments.experiment import status as count_states
 
-    counted = count_states(file, **options.given(), verify=verify)
+    counted = count_states(file, **options.given())
     if json:
         show.document(vars(counted) | {"folder": str(counted.folder)})
         return
@@ -182,7 +177,7 @@ def report(file: File, *, options: ExperimentOptions, json: Json = False) -> Non
     _print_damaged(written.damaged, file, "left out")
 
 
-def _print_plan(prepared: Prepared, jobs: int | None, again: bool, json: bool) -> None:
+def _print_plan(prepared: Prepared[Any], jobs: int | None, again: bool, json: bool) -> None:
     import os
 
     from factorgraph_loc.experiments.experiment import estimate_seconds
@@ -220,7 +215,7 @@ def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
     if len(runs) > SHOWN:
         show.line(f"damaged: {len(runs) - SHOWN} more")
     if runs:
-        show.line(f"`fgloc experiment run {file} --verify` runs them again")
+        show.line(f"`fgloc experiment run {file}` runs them again")
 
 
 def _span(seconds: float) -> str:
@@ -255,66 +250,51 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
     return ["median (min to max)", "runs", *metrics, SCORED], lines
 
 
-@dataclass(frozen=True)
-class ActiveOptions:
-    """Policies, estimators, seeds and settings of ``fgloc active``."""
-
-    policy: Annotated[
-        str,
-        typer.Option(
-            metavar="A,B",
-            help=f"{', '.join(POLICIES)}; the others are compared with the first.",
-            autocompletion=completion.policies,
-        ),
-    ] = "information"
-    estimator: Annotated[
-        str,
-        typer.Option(
-            "--estimator",
-            "-e",
-            metavar="A,B",
-            help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
-            autocompletion=completion.active_estimators,
-        ),
-    ] = "active_mcl"
-    seeds: Seeds = "0"
-    max_metres: Annotated[
-        float | None, typer.Option(metavar="M", help="Path length after which a robot gives up [m]; by default 100.")
-    ] = None
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
-            "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
-            autocompletion=completion.active_setting,
-        ),
-    ] = None
-
-    def given(self) -> dict[str, Any]:
-        """The arguments of ``active`` of the Python interface."""
-        return {
-            "policies": parse_list(self.policy),
-            "estimators": parse_list(self.estimator),
-            "seeds": parse_seeds(self.seeds),
-            "changes": nested_changes(self.set_ or (), {"max_metres": self.max_metres}),
-        }
+World = Annotated[
+    str,
+    typer.Argument(
+        metavar="WORLD",
+        help="A preset of `fgloc simulate`, or a TOML file of its settings.",
+        autocompletion=completion.preset,
+    ),
+]
+Policies = Annotated[
+    str,
+    typer.Option(
+        metavar="A,B",
+        help=f"{', '.join(POLICIES)}; the others are compared with the first.",
+        autocompletion=completion.policies,
+    ),
+]
+ActiveEstimators = Annotated[
+    str,
+    typer.Option(
+        "--estimator",
+        "-e",
+        metavar="A,B",
+        help=f"{', '.join(ACTIVE_ESTIMATORS)}.",
+        autocompletion=completion.active_estimators,
+    ),
+]
+ActiveChanges = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Setting of robot, policy or world, e.g. policy.horizon=8 or world.tags=20; `fgloc policies` lists those of robot "
+        "and policy, `fgloc presets WORLD` those of the world. May be repeated.",
+        autocompletion=completion.active_setting,
+    ),
+]
 
 
-@takes_options
 def active(
-    world: Annotated[
-        str,
-        typer.Argument(
-            metavar="WORLD",
-            help="A preset of `fgloc simulate`, or a TOML file of its settings.",
-            autocompletion=completion.preset,
-        ),
-    ],
+    world: World,
     out: Out,
-    *,
-    options: ActiveOptions,
+    policy: Policies = "information",
+    estimator: ActiveEstimators = "active_mcl",
+    seeds: Seeds = "0",
+    set_: ActiveChanges = None,
     jobs: Jobs = None,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -331,7 +311,10 @@ def active(
         results = seek(
             world,
             out,
-            **options.given(),
+            policies=parse_list(policy),
+            estimators=parse_list(estimator),
+            seeds=parse_seeds(seeds),
+            changes=nested_changes(set_ or ()),
             jobs=jobs,
             overwrite=overwrite,
             progress=report,

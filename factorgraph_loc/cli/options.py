@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -214,13 +214,12 @@ def parse_settings(
     return settings
 
 
-def nested_changes(texts: Sequence[str], named: Mapping[str, float | None]) -> dict[str, Any]:
-    """The values of ``--set`` as nested tables, and those of options by their dotted key."""
+def nested_changes(texts: Sequence[str]) -> dict[str, Any]:
+    """The values of ``--set`` as nested tables."""
     from factorgraph_loc.files.models import set_key
 
     changes: dict[str, Any] = {}
-    options = [(key, value) for key, value in named.items() if value is not None]
-    for key, value in (*(key_and_value(text, "--set") for text in texts), *options):
+    for key, value in (key_and_value(text, "--set") for text in texts):
         set_key(changes, key, value, "--set")
     return changes
 

@@ -10,7 +10,6 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import Json, MaxGap, Overwrite, takes_options
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.scoring import MAX_DIFF, MAX_GAP, Alignment, Association
 
 
@@ -60,7 +59,6 @@ def score(
         ),
     ],
     reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Another one, of any of these kinds.")],
-    aligned: Annotated[bool, typer.Option("-a", help="As in evo: --align se3.")] = False,
     *,
     options: ScoreOptions,
     json: Json = False,
@@ -72,9 +70,7 @@ def score(
     from factorgraph_loc.api import results
     from factorgraph_loc.evaluation.trajectories.page import errors_table, extents
 
-    if aligned and options.align not in ("none", "se3"):
-        raise InputError(f"-a is --align se3, but --align is {options.align}: give one of them")
-    result = results.score(estimate, reference, **(vars(options) | ({"align": "se3"} if aligned else {})))
+    result = results.score(estimate, reference, **vars(options))
     show.warnings(result.warnings)
     if json:
         show.document(result.document())

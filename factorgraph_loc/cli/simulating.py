@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from factorgraph_loc.cli import completion, show
-from factorgraph_loc.cli.options import Json, nested_changes, takes_options
+from factorgraph_loc.cli.options import Json, nested_changes
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.scoring import parse_seeds
 from factorgraph_loc.plugins import PRESETS
@@ -28,30 +27,6 @@ Changes = Annotated[
 ]
 
 
-@dataclass(frozen=True)
-class ChangeOptions:
-    """Settings that differ from those of the preset."""
-
-    duration: Annotated[
-        float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")
-    ] = None
-    tags: Annotated[int | None, typer.Option(metavar="N", help="Number of tags.")] = None
-    set_: Changes = None
-    image_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Images per second; 5 in the presets.")] = None
-    world_seed: Annotated[
-        int | None,
-        typer.Option(
-            min=0, metavar="N", help="Seed of the world only, for several drives in one world; by default --seed."
-        ),
-    ] = None
-
-    def changes(self) -> dict[str, Any]:
-        """The settings as nested tables."""
-        named = {"drive.duration": self.duration, "world.tags": self.tags, "images.rate": self.image_rate}
-        return nested_changes(self.set_ or (), named | {"world_seed": self.world_seed})
-
-
-@takes_options
 def simulate(
     what: Annotated[
         str,
@@ -64,8 +39,10 @@ def simulate(
     seeds: Annotated[
         str | None, typer.Option(metavar="A:B", help="One log for each seed from A to B-1, in FOLDER/NAME-SEED.")
     ] = None,
-    *,
-    options: ChangeOptions,
+    duration: Annotated[
+        float | None, typer.Option(metavar="S", help="Duration of the drive [s]; 600 in the presets.")
+    ] = None,
+    set_: Changes = None,
     images: Annotated[bool, typer.Option("--images", help="Also render camera images.")] = False,
     json: Json = False,
 ) -> None:
@@ -78,9 +55,10 @@ def simulate(
     from factorgraph_loc.files.models import file_name
     from factorgraph_loc.simulation import named_settings
 
-    changes = options.changes()
+    drive = () if duration is None else (f"drive.duration={duration}",)
+    changes = nested_changes((*(set_ or ()), *drive))
     if "images" in changes and not images:
-        raise InputError("--image-rate and --set images.KEY configure images, expected --images with them")
+        raise InputError("--set images.KEY configures images, expected --images with it")
     settings = named_settings(what, changes)
     written = []
     for number in chosen:

@@ -56,7 +56,7 @@ def runs_of(rows: Sequence[Row], case: Case, policy: str) -> list[Row]:
 
 def metres(rows: Sequence[Row]) -> Array:
     """Metres driven until localized (N,), infinite for runs that never were."""
-    return np.array([row["metres"] if row["localized"] else math.inf for row in rows], dtype=float)
+    return np.array([row["metres"] if row.get("localized") else math.inf for row in rows], dtype=float)
 
 
 def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -73,7 +73,7 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
             if not runs:
                 continue
             driven = metres(runs)
-            ended = [row for row in runs if row["localized"]]
+            ended = [row for row in runs if row.get("localized")]
             failures = len(runs) - len(ended)
             low, high = wilson(failures, len(runs))
             results.append(
@@ -87,7 +87,7 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
                     "failures": failures,
                     "failures_low": low,
                     "failures_high": high,
-                    "claimed_wrong": sum(bool(row["claimed_wrong"]) for row in runs),
+                    "claimed_wrong": sum(bool(row.get("claimed_wrong")) for row in runs),
                     **{key: _median(ended, key) for key in ("error_position", "error_heading", "seconds")},
                     "planning_ms": _median(runs, "planning_ms"),
                 }
@@ -177,7 +177,7 @@ def _interval_text(interval: Sequence[float], digits: int) -> str:
 
 
 def _median(rows: Sequence[Row], key: str) -> float:
-    known = [row[key] for row in rows if row[key] is not None]
+    known = [row[key] for row in rows if row.get(key) is not None]
     return float(np.median(known)) if known else math.nan
 
 
@@ -257,7 +257,9 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
     """The largest distance of a run in this world, 1 if there is none."""
-    return max((row["metres"] or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
+    return (
+        max((row.get("metres") or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
+    )
 
 
 def _step(axis: Axes, run: ActiveRun, index: int) -> None:

@@ -21,24 +21,20 @@ from factorgraph_loc.experiments.experiment import Done, Prepared, run_experimen
 from factorgraph_loc.experiments.experiment_file import NO_TIME_LIMIT, Experiment
 from factorgraph_loc.experiments.log_source import GivenSource
 from factorgraph_loc.experiments.output import TABLES, write_tables
-from factorgraph_loc.experiments.plan import plan
-from factorgraph_loc.experiments.preparation import fill_cache, use_of
+from factorgraph_loc.experiments.plan import PlannedRun, plan
 from factorgraph_loc.experiments.reporting import PAGE, report_experiment
 from factorgraph_loc.experiments.store import Store
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.temporary import new_below, of_system, require_free, temporary_folder
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all
-from factorgraph_loc.io.results import FILES, INDEX, ResultFiles
+from factorgraph_loc.io.results import FILES, ResultFiles
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain
 
-_WRITTEN = (*(name for name in TABLES if name != INDEX), PAGE)
-FINISHED = (
-    *_WRITTEN,
-    *FILES,
-)  # results that are not replaced; an unfinished comparison, which is continued, has none of them
+WRITTEN = (*TABLES, PAGE)
+FINISHED = (*WRITTEN, *FILES)  # results that are not replaced; an unfinished comparison has none of them
 
 
 @dataclass(frozen=True, repr=False)
@@ -107,13 +103,13 @@ def compare(
         "align": align,
     }
     keys["sensors"] = (None if sensors is None else tuple(sensors),)
-    prepared = _prepared(_experiment(logs, named, keys, rpe=rpe), logs, out)
-    for name in _WRITTEN:
+    experiment = _experiment(logs, named, keys, rpe=rpe)
+    prepared = _prepared(experiment, logs, out)
+    for name in WRITTEN:
         (out / name).unlink(missing_ok=True)
     remove_plots(out / "plots")
-    _find_features(logs, prepared)
     done = run_experiment(prepared, jobs=jobs, again=True, progress=lambda made, total, _: progress(made, total))
-    report_experiment(prepared)
+    report_experiment(experiment, prepared)
     _plot(logs, prepared, out / "plots")
     compared = pl.DataFrame(differences(done.rows), schema=DIFFERENCES)
     write_tables(done.table, compared, _table(done.rows, rpe=rpe), out)
@@ -128,18 +124,6 @@ def _named(
         raise InputError(f"settings are given for {unknown[0]}, which is not run here; run: {listed(estimators)}")
     named = {name: settings.get(name, {}) for name in estimators}
     return registry.for_final_only(named) if final_only else named
-
-
-def _find_features(logs: Sequence[Log], prepared: Prepared) -> None:
-    """Find the features of all images first, so that the runs find them in the cache."""
-    for log in logs:
-        fill_cache(
-            use_of(
-                log, run.sensors or log.rig.sensors, run.estimator, registry.settings_of(run.estimator, run.settings)
-            )
-            for run in prepared.runs
-            if run.log == log.name
-        )
 
 
 def _experiment(
@@ -160,12 +144,12 @@ def _experiment(
     return parse_model(Experiment, content, "the comparison")
 
 
-def _prepared(experiment: Experiment, logs: Sequence[Log], out: Path) -> Prepared:
-    """The experiment with its plan, and the states of its runs."""
+def _prepared(experiment: Experiment, logs: Sequence[Log], out: Path) -> Prepared[PlannedRun]:
+    """The runs of the experiment, with the states of stored results."""
     with temporary_folder(of_system("plan")) as folder:  # nothing is written into ``out`` if the input is wrong
         runs = plan(experiment, folder, folder, given=[GivenSource(log, digest_of_log(log)) for log in logs])
     Store(out).create()
-    return Prepared.of(experiment, out, runs)
+    return Prepared.of(out, runs, experiment.limits)
 
 
 def digest_of_log(log: Log) -> str:
@@ -193,7 +177,7 @@ def digest_of_log(log: Log) -> str:
     return total.hexdigest()
 
 
-def _plot(logs: Sequence[Log], prepared: Prepared, folder: Path) -> None:
+def _plot(logs: Sequence[Log], prepared: Prepared[PlannedRun], folder: Path) -> None:
     """The plots of each log; the first seed of each estimator represents all."""
     store = prepared.store
     for log in logs:

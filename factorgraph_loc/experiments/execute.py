@@ -28,12 +28,17 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 class Planned(Protocol):
     """A run as plain data that can be sent to other processes. ``key``: of its results; ``source``: of the data that it loads,
-    which the next run in the same process may share."""
+    which the next run in the same process may share. ``shown``: a description that distinguishes it from the other runs;
+    ``columns``: the first columns of its row in the table of results."""
 
     @property
     def key(self) -> str: ...
     @property
     def source(self) -> Hashable: ...
+    @property
+    def shown(self) -> str: ...
+    @property
+    def columns(self) -> dict[str, Any]: ...
 
     def make(self) -> Files:
         """The files of the run. Raises FglocError if it fails for a known reason."""
@@ -105,7 +110,7 @@ def execute(
                 if not claim.enter_context(store.claim(run.key)):
                     queue.later.append((time.monotonic() + RETRY_INTERVAL, run))
                     continue
-                state = store.state(run.key, thorough=True)  # the caller considers it missing or damaged
+                state = store.state(run.key)  # the caller considers it missing or damaged
                 if state not in ("ok", "failed") or (state == "failed" and again):
                     claims[run.key] = claim.pop_all()
                     return run

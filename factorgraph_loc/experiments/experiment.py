@@ -8,13 +8,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, get_args
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import lines
 from factorgraph_loc.experiments.cluster import Cluster
-from factorgraph_loc.experiments.execute import Executor, execute
-from factorgraph_loc.experiments.experiment_file import Experiment, read_experiment
+from factorgraph_loc.experiments.execute import Executor, Planned, execute
+from factorgraph_loc.experiments.experiment_file import Experiment, Limits, read_experiment
 from factorgraph_loc.experiments.plan import PlannedRun, plan
 from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import State, Store
@@ -25,34 +25,34 @@ if TYPE_CHECKING:
 
 STATES = get_args(State)
 PACE = 20.0  # assumed ratio of log time to computing time of an unknown estimator
+Run = TypeVar("Run", bound=Planned)
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """An experiment with planned ``runs``; its results go to ``folder``, and ``states`` are those of the stored results by key."""
+class Prepared(Generic[Run]):
+    """Planned ``runs`` with their ``limits``; results go to ``folder``, and ``states`` are those of the stored results by key."""
 
-    experiment: Experiment
     folder: Path
-    runs: list[PlannedRun]
+    runs: Sequence[Run]
+    limits: Limits
     states: dict[str, State]
 
     @classmethod
-    def of(cls, experiment: Experiment, folder: Path, runs: list[PlannedRun], *, verify: bool = False) -> Prepared:
-        """The same with the states of stored results; ``verify``: check all checksums."""
+    def of(cls, folder: Path, runs: Sequence[Run], limits: Limits) -> Prepared[Run]:
+        """The same with the states of stored results."""
         store = Store(folder)
-        keys = dict.fromkeys(run.key for run in runs)
-        return cls(experiment, folder, runs, {key: store.state(key, thorough=verify) for key in keys})
+        return cls(folder, runs, limits, {key: store.state(key) for key in dict.fromkeys(run.key for run in runs)})
 
     @property
     def store(self) -> Store:
         """The store of the results."""
         return Store(self.folder)
 
-    def damaged(self) -> list[PlannedRun]:
+    def damaged(self) -> list[Run]:
         """The runs with damaged results."""
         return [run for run in self.runs if self.states[run.key] == "damaged"]
 
-    def todo(self, *, again: bool = False) -> list[PlannedRun]:
+    def todo(self, *, again: bool = False) -> list[Run]:
         """The runs to be made; with ``again`` also the failed ones."""
         done = ("ok",) if again else ("ok", "failed")
         return [run for run in self.runs if self.states[run.key] not in done]
@@ -93,16 +93,15 @@ def experiment(
     jobs: int | None = None,
     scheduler: str | None = None,
     retry_failed: bool = False,
-    verify: bool = False,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
     """Execute those runs of an experiment file that have no stored result yet.
 
-    ``changes``, ``out``, ``data_root``, ``verify``: see :func:`prepare`; damaged runs are repeated. ``jobs``: number of processes,
-    by default one per core. ``scheduler``: address of a ``dask.distributed`` cluster to use instead. ``progress`` is called with
-    the numbers of finished, all and failed runs. A failed run is recorded as a row and in ``failures``; it raises nothing.
+    ``changes``, ``out``, ``data_root``: see :func:`prepare`. ``jobs``: number of processes, by default one per core.
+    ``scheduler``: address of a ``dask.distributed`` cluster to use instead. ``progress`` is called with the numbers of finished,
+    all and failed runs. Damaged runs are repeated. A failed run is recorded as a row and in ``failures``; it raises nothing.
     """
-    prepared = prepare(file, changes, out=out, data_root=data_root, verify=verify)
+    _, prepared = prepare(file, changes, out=out, data_root=data_root)
     return run_experiment(prepared, jobs=jobs, scheduler=scheduler, again=retry_failed, progress=progress)
 
 
@@ -112,10 +111,9 @@ def status(
     changes: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
     data_root: str | Path | None = None,
-    verify: bool = False,
 ) -> ExperimentStatus:
     """How many runs of an experiment file are done, failed, missing or damaged. For the arguments see :func:`prepare`."""
-    planned = prepare(file, changes, out=out, data_root=data_root, verify=verify)
+    _, planned = prepare(file, changes, out=out, data_root=data_root)
     counts = {run.label: dict.fromkeys(STATES, 0) for run in planned.runs}
     for run in planned.runs:
         counts[run.label][planned.states[run.key]] += 1
@@ -133,12 +131,11 @@ def prepare(
     *,
     data_root: str | Path | None = None,
     out: str | Path | None = None,
-    verify: bool = False,
-) -> Prepared:
-    """Plan the experiment of a ``file`` with ``changes``, and look up stored results.
+) -> tuple[Experiment, Prepared[PlannedRun]]:
+    """The experiment of a ``file`` with ``changes``, and its runs with the states of stored results.
 
     ``changes``: values by dotted key, see :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``out``: folder of
-    the results, by default the file's. ``verify``: check all checksums.
+    the results, by default the file's.
 
     Raises InputError for errors in the file and for too many runs, StoreError if the folder for results cannot be written.
     """
@@ -150,11 +147,11 @@ def prepare(
     store = Store(folder)
     store.create()
     runs = plan(experiment, file.parent, store.folder, None if data_root is None else str(data_root))
-    return Prepared.of(experiment, folder, runs, verify=verify)
+    return experiment, Prepared.of(folder, runs, experiment.limits)
 
 
 def run_experiment(
-    prepared: Prepared,
+    prepared: Prepared[Any],
     *,
     jobs: int | None = None,
     scheduler: str | None = None,
@@ -176,12 +173,11 @@ def run_experiment(
     failed = sum(states[run.key] == "failed" and run.key not in waiting for run in prepared.runs)
     made = 0
     progress(made, len(todo), failed)
-    limits = prepared.experiment.limits
     executor: Executor
     if scheduler is None:
-        executor = Processes(max(1, min(jobs or os.cpu_count() or 1, len(todo))), limits)
+        executor = Processes(max(1, min(jobs or os.cpu_count() or 1, len(todo))), prepared.limits)
     else:
-        executor = Cluster(scheduler, limits)
+        executor = Cluster(scheduler, prepared.limits)
     try:
         for key, state in execute(todo, prepared.folder, executor, again=again) if todo else ():
             states[key] = state
@@ -190,7 +186,7 @@ def run_experiment(
     finally:
         for run in todo:  # an interrupt may come between a run's end and its state
             if states[run.key] not in ("ok", "failed"):
-                states[run.key] = prepared.store.state(run.key, thorough=True)
+                states[run.key] = prepared.store.state(run.key)
         finished = [run for run in prepared.runs if states[run.key] in ("ok", "failed")]
         rows = collect(finished, prepared.store)
         write_index(rows, prepared.folder)

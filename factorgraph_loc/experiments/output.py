@@ -30,7 +30,6 @@ from factorgraph_loc.io.results import (
     EVENTS,
     FILES,
     FINAL,
-    INDEX,
     INNOVATIONS,
     LEARNT,
     METRICS,
@@ -45,7 +44,7 @@ from factorgraph_loc.text import json_text, plain_lines, quoted
 from factors.se2 import Array
 
 MAP = "map.world.toml"
-TABLES = (INDEX, "results.csv", "differences.csv", "table.md")
+TABLES = ("results.csv", "differences.csv", "table.md")
 
 
 def write_run(
@@ -266,4 +265,3 @@ def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out:
     write_text(out / "results.csv", plain_lines(table.write_csv()))
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))
-    write_parquet(table, out / INDEX)

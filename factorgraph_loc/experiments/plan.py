@@ -11,7 +11,7 @@ from time import perf_counter
 from typing import Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.warned import SIMULATION
+from factorgraph_loc.evaluation.warned import SIMULATION, SWEEP
 from factorgraph_loc.experiments.experiment_file import (
     EstimatorEntry,
     Experiment,
@@ -20,7 +20,7 @@ from factorgraph_loc.experiments.experiment_file import (
     Sweep,
     canonical,
 )
-from factorgraph_loc.experiments.keys import Facts, load_planned, run_key
+from factorgraph_loc.experiments.keys import Facts, LogFacts, load_planned, run_key
 from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, SimulatedSource, recorded_sources
 from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
@@ -52,6 +52,21 @@ class PlannedRun(RunConfig):
         swept = "".join(f", {key} {value}" for key, value in self.sweep.items())
         return f"{self.log}, {self.label}{swept}, seed {self.seed}"
 
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The first columns of its row, see :func:`~factorgraph_loc.experiments.result_table.load_results`."""
+        return {
+            "label": self.label,
+            "log": self.log,
+            "estimator": self.estimator,
+            "sensors": None if self.sensors is None else ",".join(self.sensors),
+            "prior": self.prior,
+            "seed": self.seed,
+            **{f"{SWEEP}{key}": value for key, value in self.sweep.items()},
+            "key": self.key,
+            "duration": self.duration,
+        }
+
     def make(self) -> dict[str, bytes]:
         """The files of the run. Raises VanishedError if the log differs from the planned one, FglocError if the run fails."""
         from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
@@ -63,12 +78,9 @@ class PlannedRun(RunConfig):
 
 
 @dataclass(frozen=True)
-class _PlannedLog:
+class _PlannedLog(LogFacts):
     source: LogSource
     digest: str
-    name: str
-    duration: float
-    sensors: tuple[str, ...]
 
 
 def plan(
@@ -237,7 +249,7 @@ def _logs(sources: Sequence[LogSource], facts: Facts) -> Iterator[_PlannedLog]:
     for first in sources:
         for number, log in enumerate(facts.logs(first, facts.digest(first))):
             source = RecordedSource(**vars(first) | {"number": number}) if isinstance(first, RecordedSource) else first
-            yield _PlannedLog(source, facts.digest(source), log.name, log.duration, log.sensors)
+            yield _PlannedLog(**vars(log), source=source, digest=facts.digest(source))
 
 
 def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]:

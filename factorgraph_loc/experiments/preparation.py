@@ -1,17 +1,15 @@
 """Preparation of a run: its start (of the user, the log or the reference), its sensors, and the preparation by their packages."""
 
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import suppress
 
 import numpy as np
 
-from factorgraph_loc.errors import FglocError, InputError
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import EXACT_SIGMA, HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import PRIORS, parse_position
-from factorgraph_loc.sensors.camera.use import prepare
 from factorgraph_loc.sensors.interfaces import Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
 from factorgraph_loc.text import listed, quoted
@@ -138,15 +136,6 @@ def checked_use(use: Use) -> Use:
     for _, check in functions("check"):
         use = check(use)
     return use
-
-
-def fill_cache(uses: Iterable[Use]) -> None:
-    """Find the features of a log's images, so that parallel runs find them in the cache.
-
-    Errors of the log are left to the runs.
-    """
-    with suppress(FglocError):
-        any(prepare(use, lambda _: None).images for use in uses)
 
 
 def _filled_columns(log: Log) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from typing import Any
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
 from factorgraph_loc.experiments.experiment import Prepared, prepare
+from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.result_table import collect
@@ -38,16 +39,16 @@ def report(
     """Write the results of an experiment as an HTML page into its folder; for the arguments see
     :func:`~factorgraph_loc.experiments.experiment.prepare`. Damaged results are listed on the page and left out.
     """
-    return report_experiment(prepare(file, changes, out=out, data_root=data_root))
+    return report_experiment(*prepare(file, changes, out=out, data_root=data_root))
 
 
-def report_experiment(prepared: Prepared) -> Report:
+def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) -> Report:
     """Write the report of all existing results of an experiment into its folder.
 
     All results are compared with their checksums; damaged ones are named and excluded. Scenes of the logs are kept in the store.
     Raises InputError without any results, or if the page cannot be written.
     """
-    prepared = Prepared.of(prepared.experiment, prepared.folder, prepared.runs, verify=True)
+    prepared = Prepared.of(prepared.folder, prepared.runs, prepared.limits)
     damaged = [run.shown for run in prepared.damaged()]
     rows = collect((run for run in prepared.runs if prepared.states[run.key] in ("ok", "failed")), prepared.store)
     runs = {run.key: run for run in prepared.runs}
@@ -60,16 +61,15 @@ def report_experiment(prepared: Prepared) -> Report:
         return RunFiles(partial(prepared.store.read, key), scenes[run.log_digest])
 
     path = prepared.folder / PAGE
-    settings = prepared.experiment.report
     with writing(path):
         write_report(
             rows,
             files,
             path,
-            metrics=settings.metrics,
-            baseline=settings.baseline,
-            title=prepared.experiment.name,
-            experiment=json.loads(prepared.experiment.model_dump_json(exclude_unset=True)),
+            metrics=experiment.report.metrics,
+            baseline=experiment.report.baseline,
+            title=experiment.name,
+            experiment=json.loads(experiment.model_dump_json(exclude_unset=True)),
             damaged=damaged,
             versions={"factorgraph-loc": __version__, "its source, sha256": code_version(), **library_versions()},
         )

@@ -2,13 +2,12 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.warned import SWEEP, WARNINGS
-from factorgraph_loc.experiments.plan import PlannedRun
+from factorgraph_loc.evaluation.warned import WARNINGS
+from factorgraph_loc.experiments.execute import Planned
 from factorgraph_loc.experiments.store import Store, StoreError
 from factorgraph_loc.files.bounded import kind
 from factorgraph_loc.files.tables import read_parquet, write_parquet
@@ -18,9 +17,9 @@ from factorgraph_loc.text import error_text
 TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "reason", "key", "scoring.align", WARNINGS}
 
 
-def collect(runs: Iterable[PlannedRun], store: Store) -> pl.DataFrame:
+def collect(runs: Iterable[Planned], store: Store) -> pl.DataFrame:
     """The rows of those runs whose results are stored; see :func:`load_results`. Raises DamagedError for a damaged one."""
-    rows = [_row(run, store.row(run.key)) for run in runs]
+    rows = [run.columns | store.row(run.key) for run in runs]
     keys = dict.fromkeys(key for row in rows for key in row) or dict.fromkeys(sorted(TEXTS))
     table = pl.DataFrame(rows, schema=list(keys), infer_schema_length=None)
     nothing = {
@@ -51,19 +50,3 @@ def load_results(path: str | Path) -> pl.DataFrame:
         return read_parquet(file)
     except InputError as error:
         raise InputError(f"{error}; `fgloc experiment run` writes it again") from error
-
-
-def _row(run: PlannedRun, stored: dict[str, Any]) -> dict[str, Any]:
-    row = {
-        "label": run.label,
-        "log": run.log,
-        "estimator": run.estimator,
-        "sensors": None if run.sensors is None else ",".join(run.sensors),
-        "prior": run.prior,
-        "seed": run.seed,
-        **{f"{SWEEP}{key}": value for key, value in run.sweep.items()},
-        **{name: stored.pop(name) for name in ("status", "kind", "reason")},
-        "key": run.key,
-        "duration": run.duration,
-    }
-    return row | {name: value for name, value in stored.items() if name not in row}

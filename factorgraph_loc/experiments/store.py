@@ -27,12 +27,12 @@ from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.model.scoring import Alignment
 
 Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # as in tables
-Figure = Whole | Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
+Figure = bool | Whole | Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
 FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]  # of a file within the run's folder
 MANIFEST, METRICS, TIMINGS, FAILURE = "manifest.json", "metrics.json", "timings.json", "failure.json"
 TIMING = "timing."  # prefix of timings
 State = Literal["ok", "failed", "missing", "damaged"]
-_AGAIN = "; `fgloc experiment run --verify` makes it again"
+_AGAIN = "; `fgloc experiment run` makes it again"
 
 
 class DamagedError(InputError):
@@ -119,27 +119,15 @@ class Store:
         """The folder of a run."""
         return self.folder / key[:2] / key
 
-    def state(self, key: str, *, thorough: bool = False) -> State:
-        """The state of a run's results.
-
-        A trajectory of the right size that is older than its manifest is not checked further. Other files, and all if
-        ``thorough``, are compared with their checksums.
-        """
-        folder = self.path(key)
+    def state(self, key: str) -> State:
+        """The state of a run's results. All files are compared with their checksums."""
         try:
             manifest = self._manifest(key)
-            written = (folder / MANIFEST).stat().st_mtime_ns
-            for name, said in manifest.files.items():
-                stat = (folder / name).stat()
-                if stat.st_size != said.bytes:
-                    return "damaged"
-                if thorough or stat.st_mtime_ns > written:
-                    self._read(manifest, name)
+            for name in manifest.files:
+                self._read(manifest, name)
             self._row(manifest)  # reads the scores, or the failure
         except DamagedError:
-            return "damaged" if os.path.lexists(folder) else "missing"
-        except OSError:
-            return "damaged"
+            return "damaged" if os.path.lexists(self.path(key)) else "missing"
         return "failed" if FAILURE in manifest.files else "ok"
 
     def read(self, key: str, name: str) -> bytes:

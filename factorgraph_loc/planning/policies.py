@@ -9,7 +9,7 @@ just done one. Only policies that compare candidates use paths to distant places
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -23,7 +23,7 @@ from factorgraph_loc.planning.information import expected_gain, fisher_gain
 from factorgraph_loc.planning.paths import STEP, Path
 from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.plugins import POLICIES
+from factorgraph_loc.plugins import POLICIES, load
 from factorgraph_loc.text import quoted
 from factors import se2
 from factors.se2 import Array
@@ -194,20 +194,15 @@ def nearest_tags(s: Situation) -> Choice:
     return Choice(s.candidates[int(np.argmax(values))], s.settings.policy.replan, values)
 
 
-_POLICIES: Mapping[str, Policy] = {
-    "information": information,
-    "paper_literal": partial(information, sign=-1.0),
-    "random": random,
-    "patrol": patrol,
-    "nearest_tags": nearest_tags,
-}
+paper_literal = partial(information, sign=-1.0)
 
 
 def policy(name: str) -> Policy:
-    """A policy by name. Raises InputError for an unknown name."""
+    """The policy of this module that has the name. Raises InputError for an unknown name."""
     if name not in POLICIES:
         raise InputError(f"no policy is called {quoted(name)}{nearest(name, list(POLICIES))}")
-    return _POLICIES[name]
+    chosen: Policy = load(f"{__name__}:{name}")
+    return chosen
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:

@@ -8,7 +8,7 @@ FEW = ("--set", "particles=300", "--set", "policy.samples=16")
 
 def test_policies_are_compared(fgloc, refused, tmp_path):
     out = tmp_path / "out"
-    few = (*SMALL[:-1], "world.tags=4", "--max-metres", 3)
+    few = (*SMALL[:-1], "world.tags=4", "--set", "max_metres=3")
     done = fgloc("active", "office", "--policy", "information,random", "--seeds", "0:2", *few, *FEW, "-o", out)
     assert done.exit_code == 0, done.stderr
     for text in ("median [m]", "information / random", "p (McNemar)"):
@@ -23,7 +23,7 @@ def test_policies_are_compared(fgloc, refused, tmp_path):
 def test_a_robot_that_finds_nothing_gives_up(fgloc, tmp_path):
     out = tmp_path / "out"
     bare = (*SMALL[:-1], "world.tags=0")
-    done = fgloc("active", "office", *bare, *FEW, "--policy", "patrol", "--max-metres", 3, "-o", out)
+    done = fgloc("active", "office", *bare, *FEW, "--policy", "patrol", "--set", "max_metres=3", "-o", out)
     assert done.exit_code == 0, done.stderr  # that is a result
     (row,) = pl.read_parquet(out / "results.parquet").to_dicts()
     assert not row["localized"]

@@ -41,7 +41,7 @@ def test_runs_are_made_once_and_can_be_looked_at(fgloc, file, tmp_path):
     document = json.loads(again.stdout)
     assert [run["causal.position_rmse"] for run in document["runs"]] == rows["causal.position_rmse"].to_list()
     assert sorted(p.stat().st_mtime_ns for p in (tmp_path / "out" / "lags" / "store").glob("??/*/*")) == before
-    status = fgloc("experiment", "status", file, "--verify", "--json")
+    status = fgloc("experiment", "status", file, "--json")
     labels = json.loads(status.stdout)["labels"]
     assert labels["ekf"] == {"ok": 1, "failed": 0, "missing": 0, "damaged": 0}
     changed = fgloc("experiment", "run", file, "--set", "ekf.max_delay=0.4", "--dry-run", "--json")
@@ -59,13 +59,13 @@ def test_damage_is_told_and_repaired(fgloc, file, tmp_path):
         path.write_bytes(b"?" + path.read_bytes()[1:])
         os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
         break
-    (name,) = json.loads(fgloc("experiment", "status", file, "--verify", "--json").stdout)["damaged"]
-    assert f"damaged: {name}" in fgloc("experiment", "status", file, "--verify").stdout
+    (name,) = json.loads(fgloc("experiment", "status", file, "--json").stdout)["damaged"]
+    assert f"damaged: {name}" in fgloc("experiment", "status", file).stdout
     report = fgloc("experiment", "report", file)
     assert report.exit_code == 0, report.output
     assert f"damaged, left out: {name}" in report.stdout
     assert json.loads(fgloc("experiment", "report", file, "--json").stdout)["damaged"] == [name]
-    assert fgloc("experiment", "run", file, "--verify", "--jobs", 1).exit_code == 0
+    assert fgloc("experiment", "run", file, "--jobs", 1).exit_code == 0
     assert json.loads(fgloc("experiment", "report", file, "--json").stdout)["damaged"] == []
 
 
@@ -92,7 +92,7 @@ def test_an_interrupt_ends_it_cleanly_and_it_goes_on(fgloc, file, tmp_path, proc
     assert stderr.count("\n") == 1
     assert "Traceback" not in stderr
     assert len(pl.read_parquet(tmp_path / "out" / "lags" / "results.parquet")) == 1
-    status = fgloc("experiment", "status", "slow.toml", "--verify")
+    status = fgloc("experiment", "status", "slow.toml")
     (line,) = [line for line in status.stdout.splitlines() if line.startswith("(all)")]
     assert line.split()[1:] == ["1", "0", "1", "0"]
     assert list((tmp_path / "out" / "lags" / "store" / "tmp").iterdir()) == []

@@ -34,11 +34,6 @@ def test_the_document_holds_all_figures(fgloc, pair):
     assert document["estimate"] == str(pair[0])
 
 
-def test_the_short_option_of_evo_aligns(fgloc, refused, pair):
-    assert fgloc("score", *pair, "-a").stdout == fgloc("score", *pair, "--align", "se3").stdout
-    assert "give one of them" in refused("score", *pair, "-a", "--align", "sim3")
-
-
 @pytest.mark.parametrize("suffix", [".tum", ".kitti"])
 def test_the_folder_holds_a_report(fgloc, refused, tmp_path, suffix):
     reference, estimate = wander(7)

@@ -8,7 +8,7 @@ from factorgraph_loc.simulation import preset, simulate
 
 
 def test_a_log_is_written_and_read_back(fgloc, tmp_path):
-    done = fgloc("simulate", "sparse", "-o", tmp_path / "log", "--seed", 4, "--duration", 30, "--tags", 12)
+    done = fgloc("simulate", "sparse", "-o", tmp_path / "log", "--seed", 4, "--duration", 30, "--set", "world.tags=12")
     assert done.exit_code == 0, done.stderr
     assert str(tmp_path / "log") in done.stdout
     (log,) = load(str(tmp_path / "log"))
@@ -34,7 +34,7 @@ def test_a_file_of_settings_takes_the_place_of_a_preset(fgloc, tmp_path):
 
 def test_images_are_written_with_the_log(fgloc, tmp_path):
     small = ("--set", "world.width=9", "--set", "world.depth=8")
-    options = ("--images", "--image-rate", 2, "--duration", 1, "--world-seed", 5, *small)
+    options = ("--images", "--set", "images.rate=2", "--duration", 1, "--set", "world_seed=5", *small)
     done = fgloc("simulate", "office", "-o", tmp_path / "new" / "log", "--seed", 3, *options)
     assert done.exit_code == 0, done.stderr
     assert [folder.name for folder in (tmp_path / "new").iterdir()] == ["log"]
@@ -47,7 +47,7 @@ def test_images_are_written_with_the_log(fgloc, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("office", "--image-rate", 5), "expected --images with them"),
+        (("office", "--set", "images.rate=5"), "expected --images with it"),
         (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
     ],
 )

@@ -8,10 +8,8 @@ import pytest
 from computed_here import Here
 
 from factorgraph_loc import InputError, RunFailedError, Trajectory, World
-from factorgraph_loc.experiments import active
-from factorgraph_loc.experiments.active import ROW, jobs_of, run_jobs
+from factorgraph_loc.experiments import active, experiment
 from factorgraph_loc.planning.closed_loop import ActiveRun, PlanningStep
-from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.simulation.settings import preset
 
 OFFICE = preset("office")
@@ -43,8 +41,7 @@ def calls(monkeypatch):
         return ActiveRun(seed, simulation.name, World(walls=WALLS), policy, estimator, *ends, truth, steps)
 
     monkeypatch.setattr(active, "run_active", run)
-    monkeypatch.setattr(active, "Processes", Here)
-    monkeypatch.setattr(active, "CHUNK", 5)
+    monkeypatch.setattr(experiment, "Processes", Here)
     monkeypatch.setattr(active, "write_picture", lambda figure, path: path.write_text(type(figure).__name__))
     monkeypatch.setattr(active, "png_bytes", lambda figure: type(figure).__name__.encode())
     return seen
@@ -88,7 +85,6 @@ def test_files_of_an_experiment(tmp_path):
 def test_a_run_that_fails_is_a_row(tmp_path):
     results = active.active(OFFICE, tmp_path, seeds=range(5, 10))
     assert [row["status"] for row in results.rows] == ["ok", "ok", "failed", "failed", "ok"]
-    assert list(results.rows[2]) == list(ROW)
     assert results.rows[2]["metres"] is None
     assert results.failures == [
         "office, information, active_mcl, seed 7: the pose is not finite",
@@ -102,22 +98,21 @@ def test_a_run_that_fails_is_a_row(tmp_path):
 def test_input_that_no_run_takes_is_an_error(tmp_path):
     with pytest.raises(InputError, match="inside a wall"):
         active.active(OFFICE, tmp_path, seeds=(0, 1), changes={"start": (0.0, 0.0, 0.0)})
-    assert not (tmp_path / "results.parquet").exists()
+    assert not (tmp_path / "table.md").exists()
 
 
-def test_what_was_interrupted_goes_on(calls, tmp_path):
-    jobs = jobs_of(OFFICE, ("information",), ("active_mcl",), range(12), ActiveSettings())
-    assert [job.seed for job in jobs] == list(range(12))
-    done = run_jobs(jobs[:5], tmp_path, 1).rows
+def test_what_is_stored_is_not_run_again(calls, tmp_path):
+    done = active.active(OFFICE, tmp_path, seeds=range(5)).rows
     calls.clear()
     told = []
-    rows = run_jobs(jobs, tmp_path, 1, lambda *counts: told.append(counts)).rows
+    report = lambda done, total: told.append((done, total))  # noqa: E731
+    rows = active.active(OFFICE, tmp_path, seeds=range(12), overwrite=True, progress=report).rows
     assert {seed for _, _, seed in calls} == set(range(5, 12))
     assert rows[:5] == done
     assert [row["seed"] for row in rows] == list(range(12))
-    assert told[0] == (5, 12)
+    assert told[0] == (0, 7)
     calls.clear()
-    run_jobs(jobs, tmp_path, 1)
+    active.active(OFFICE, tmp_path, seeds=range(12), overwrite=True)
     assert {seed for _, _, seed in calls} == {7, 8}  # those that failed
 
 

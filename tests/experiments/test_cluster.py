@@ -76,7 +76,7 @@ def test_a_worker_that_is_killed_loses_no_run_and_none_is_stored_twice(workers, 
     assert [state for _, state in outcomes] == ["ok"] * 8
     assert stored == dict.fromkeys(keys, 1)
     store = Store(folder)
-    assert all(store.state(key, thorough=True) == "ok" for key in keys)
+    assert all(store.state(key) == "ok" for key in keys)
     assert not list((store.folder / "claims").iterdir())
 
 

@@ -134,7 +134,7 @@ def experiment(log, tmp_path, out, runs_here):  # noqa: ARG001
     def make(text="estimators = ['fake', 'ekf']", folder=out, **options):
         file = tmp_path / "a.toml"
         file.write_text(f'name = "a"\nlogs = ["log"]\n{text}')
-        return prepare(file, out=folder, **options)
+        return prepare(file, out=folder, **options)[1]
 
     return make
 

@@ -26,7 +26,7 @@ def prepared(tmp_path):
     (tmp_path / "tiny.toml").write_text(TEXT)
 
     def prepare_it(made=2):
-        found = prepare(tmp_path / "tiny.toml", out=tmp_path / "out")
+        _, found = prepare(tmp_path / "tiny.toml", out=tmp_path / "out")
         for run in found.runs[:made]:
             assert run_planned(run, tmp_path / "out") == "ok"
         return prepare(tmp_path / "tiny.toml", out=tmp_path / "out")
@@ -35,7 +35,7 @@ def prepared(tmp_path):
 
 
 def test_page_of_what_is_stored(prepared):
-    page = report_experiment(prepared()).page.read_text(encoding="utf-8")
+    page = report_experiment(*prepared()).page.read_text(encoding="utf-8")
     assert "2 estimators on 1 log: 2 runs. All succeeded." in page
     assert "Differences from again &amp; again" in page
     assert code_version() in page
@@ -54,23 +54,23 @@ def damage(run, store):
 
 @pytest.mark.usefixtures("blank_pictures")
 def test_a_damaged_result_is_named_and_left_out(prepared):
-    some = prepared()
+    experiment, some = prepared()
     damage(some.runs[0], some.store)
-    written = report_experiment(some)
+    written = report_experiment(experiment, some)
     assert written.damaged == ["office-0, dead_reckoning, seed 0"]
     page = written.page.read_text(encoding="utf-8")
     assert "1 estimator on 1 log: 1 run." in page
     assert f"1 run is damaged, and excluded: <strong>{written.damaged[0]}</strong>" in page
     damage(some.runs[1], some.store)
     with pytest.raises(InputError, match=r"no runs to report on \(2 are damaged\)"):
-        report_experiment(some)
+        report_experiment(experiment, some)
 
 
 @pytest.mark.usefixtures("blank_pictures")
 def test_what_is_kept_beside_the_results_is_made_again_where_it_is_damaged(prepared, tmp_path):
-    first = report_experiment(prepared()).page.read_bytes()
+    first = report_experiment(*prepared()).page.read_bytes()
     (scene,) = (tmp_path / "out/store/scenes").iterdir()
     for content in (b"", b"[]", b"5", b'{"walls": 3}', b"[" * 5000, b'{"files": {"a": 5}, "logs": 1}'):
         for file in (scene, *(tmp_path / "out/store").glob("*.json")):
             file.write_bytes(content)
-        assert report_experiment(prepared(made=0)).page.read_bytes() == first, content
+        assert report_experiment(*prepared(made=0)).page.read_bytes() == first, content

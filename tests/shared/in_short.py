@@ -25,7 +25,6 @@ def in_short(request):
 @pytest.fixture
 def runs_here(monkeypatch):
     """Comparisons and experiments make their runs in this process. What would be sent to another is pickled all the same."""
-    monkeypatch.setattr("factorgraph_loc.experiments.active.Processes", Here)
     monkeypatch.setattr("factorgraph_loc.experiments.experiment.Processes", Here)
 
 

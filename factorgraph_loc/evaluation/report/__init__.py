@@ -2,6 +2,6 @@
 
 from factorgraph_loc.evaluation.report.page import write_report
 from factorgraph_loc.evaluation.report.results import RunFiles
-from factorgraph_loc.evaluation.report.scene import Scene
+from factorgraph_loc.evaluation.report.tracks import Scene
 
 __all__ = ["RunFiles", "Scene", "write_report"]

@@ -21,7 +21,7 @@ from factorgraph_loc.evaluation.inference import (
 )
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.report import tracks
-from factorgraph_loc.evaluation.report.scene import Scene
+from factorgraph_loc.evaluation.report.tracks import Scene
 from factorgraph_loc.evaluation.scores import Metric
 from factorgraph_loc.evaluation.warned import SIMULATION, SWEEP, Row, label_of
 from factorgraph_loc.io.results import CONFIG, Estimates, ResultFiles

@@ -9,10 +9,9 @@ from typing import Any
 from benchmarking.report import Options, Report
 
 from factorgraph_loc.evaluation.figures import write_picture
-from factorgraph_loc.experiments.active import jobs_of, run_jobs, write_tables
+from factorgraph_loc.experiments.active import active
 from factorgraph_loc.experiments.active_results import comparison, difference_cells, summary_cells
 from factorgraph_loc.planning.settings import ActiveSettings
-from factorgraph_loc.simulation import preset
 
 WORLDS = ("office", "symmetric", "warehouse")
 POLICIES = ("information", "random", "patrol", "nearest_tags", "paper_literal")
@@ -41,9 +40,20 @@ def compared(
 ) -> list[dict[str, Any]]:
     """The rows of all runs, after their summary in the report."""
     options, folder = report.options, report.options.out / report.name
-    jobs = [job for world in worlds for job in jobs_of(preset(world), policies, estimators, range(count), SETTINGS)]
-    results = run_jobs(jobs, options.out, options.jobs, report.tell)
-    report.failed += results.failures
+    rows: list[dict[str, Any]] = []
+    for world in worlds:
+        done = active(
+            world,
+            folder / world,
+            policies=policies,
+            estimators=estimators,
+            seeds=range(count),
+            jobs=options.jobs,
+            overwrite=True,
+            progress=report.tell,
+        )
+        report.failed += done.failures
+        rows += done.rows
     degrees = math.degrees(SETTINGS.heading_limit)
     report.say(
         f"{count} robots in each world, the same for all policies. A robot gives up after {SETTINGS.max_metres:.0f} m. "
@@ -51,8 +61,6 @@ def compared(
         f"{degrees:.0f} degrees. *Claimed wrongly*: localized with an error above three times that. Errors are medians at "
         "the end. Planning is the time of a step."
     )
-    report.table(*summary_cells(results.rows))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_tables(results.rows, folder)
-    write_picture(comparison(results.rows), folder / "comparison.png")
-    return results.rows
+    report.table(*summary_cells(rows))
+    write_picture(comparison(rows), folder / "comparison.png")
+    return rows

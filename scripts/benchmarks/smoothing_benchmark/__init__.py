@@ -52,8 +52,8 @@ def cases_of_section(section: str, report: Report) -> list[Case]:
     """The runs of a section's experiments."""
     cases: list[Case] = []
     for name, names in EXPERIMENTS[section].items():
-        experiment = prepare(FILES / f"{name}.toml", out=report.options.out / name)
-        done = run_experiment(experiment, jobs=report.options.jobs)
+        _, prepared = prepare(FILES / f"{name}.toml", out=report.options.out / name)
+        done = run_experiment(prepared, jobs=report.options.jobs)
         report.failed += done.failures
         cases += cases_of(done.rows, names)
     return cases
@@ -70,14 +70,15 @@ def processor_time(options: Options) -> Report:
     write_picture(picture(cases), options.out / "ratios.png")
     for experiments in EXPERIMENTS.values():
         for file, names in experiments.items():
-            runs = prepare(FILES / f"{file}.toml", out=options.out / file).runs
-            log = runs[0].source.load()
-            for planned in runs:
+            _, prepared = prepare(FILES / f"{file}.toml", out=options.out / file)
+            first = prepared.runs[0]
+            log = first.source.load()
+            for planned in prepared.runs:
                 name = names.get(",".join(planned.sensors or ()))
-                if planned.log == runs[0].log and name is not None:
-                    run(log, planned.config)
+                if planned.log == first.log and name is not None:
+                    run(log, planned)
                     started = process_time()
-                    run(log, planned.config)
+                    run(log, planned)
                     found[name, planned.label] = (process_time() - started) * MINUTE / planned.duration
     times(report, found)
     return report
