@@ -16,14 +16,14 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks, world_estimate
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, constants_of, learnt_from
+from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, constants_of, learnt_from, on_pose
 from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import Binding, Link, NewVariable, Observation, bound_sensors
+from factorgraph_loc.sensors.base import Binding, Link, NewVariable, bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factors import positive, se2
 from factors.motion import Increment
@@ -216,15 +216,15 @@ class Ekf(Filter):
             correction = observation.correct(
                 s.pose, s.covariance, values, s.layout.columns, observation.iterations or self._iterations
             )
+            alone = on_pose(observation, view)
             if observation.is_judged:
                 if not sensor.judge(observation, correction, view):
                     continue
-                self._search.slips.add(partial(_at_its_time, observation, s), self._odometry, view, correction)
+                self._search.slips.add(alone.at_its_time, self._odometry, view, correction)
             if self._search.serves(sensor):
-                on_pose = _on_pose(observation, s)
-                self._search.expect(sensor, on_pose, self._odometry, view)
-                evidence = partial(laplace_evidence, on_pose, s.pose, s.covariance[:POSE, :POSE], correction)
-                self._search.keep(sensor, on_pose, self._odometry, evidence)
+                self._search.expect(sensor, alone, self._odometry, view)
+                evidence = partial(laplace_evidence, alone, s.pose, s.covariance[:POSE, :POSE], correction)
+                self._search.keep(sensor, alone, self._odometry, evidence)
             self._state = s.plus(correction.delta, correction.covariance)
         self._doubt(m)
 
@@ -279,15 +279,3 @@ class Ekf(Filter):
     def _standstill(self) -> _Step:
         """The step to a second measurement of the same time."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))
-
-
-def _on_pose(observation: Observation, state: _State) -> Observation:
-    """An observation of the pose alone, with the blocks of a state."""
-    values, columns = state.layout.values(state.rest), state.layout.columns
-    covariances = {name: state.covariance[columns[name], columns[name]] for name in observation.blocks}
-    return observation.on_pose({name: values[name] for name in observation.blocks}, covariances)
-
-
-def _at_its_time(observation: Observation, state: _State) -> Observation | None:
-    """:func:`_on_pose` at the time of the observation, if that is possible."""
-    return _on_pose(observation, state).at_its_time()

@@ -69,12 +69,12 @@ class Evidence(Protocol):
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array: ...
 
 
-class _Waiting(NamedTuple):
-    """An observation in the queue, and its log-probability under the track that the population competes with."""
+class WeighedObservation(NamedTuple):
+    """An observation with the odometry at its time, and its log-probability under the track (``evidence``), if there is one."""
 
     odometry: ChainState
     observation: Evidence
-    rival: float
+    evidence: float
 
 
 class Population:
@@ -104,7 +104,7 @@ class Population:
         self._informative = 0  # observations with detections
         self._things: set[Hashable] = set()
         self._since = [math.inf for _ in CLEAR]  # since when the pose has had these probabilities
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[WeighedObservation] = deque()
         self._running: Steps[None] | None = None
         self.newest: ChainState | None = None  # the odometry at the last observation that was processed
         self.log_evidence = 0.0  # log-probability of all observations for a robot that began anywhere
@@ -136,13 +136,12 @@ class Population:
         """Poses (N, 3) at the last observation and weights (N,); none before the first observation."""
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
-    def add(self, odometry: ChainState, observation: Evidence, rival: float = 0.0) -> bool:
-        """Queue an observation made at ``odometry``; False if it is older than the last one and is left out. ``rival``: its
-        log-probability under the track."""
+    def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
+        """Queue a :class:`WeighedObservation`; False if it is older than the last one and is left out."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
         if newest is not None and odometry.t < newest.t:
             return False
-        self._waiting.append(_Waiting(odometry, observation, rival))
+        self._waiting.append(WeighedObservation(odometry, observation, evidence))
         return True
 
     def advance(self, work: float = math.inf) -> bool:
@@ -179,7 +178,7 @@ class Population:
         near = np.sum(error * positive.solve(covariance, error.T).T, axis=1) < REACH**2
         return float(self._cloud.weights[near].sum()) < NEGLIGIBLE
 
-    def _processed(self, new: _Waiting) -> Steps[None]:
+    def _processed(self, new: WeighedObservation) -> Steps[None]:
         """Predict to an observation and apply it."""
         odometry, observation = new.odometry, new.observation
         if self._cloud is None or self.newest is None:
@@ -201,7 +200,7 @@ class Population:
         )
         self.newest, self._hypotheses = odometry, None
         self.log_evidence += evidence
-        self.rival_evidence += new.rival
+        self.rival_evidence += new.evidence
         self._informative += observation.found > 0
         self._things.update(observation.things)
         near = self._weight_of_best()

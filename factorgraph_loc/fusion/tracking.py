@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from factorgraph_loc.fusion.population import WeighedObservation
 from factorgraph_loc.fusion.search import DURATION, Search
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -69,14 +70,6 @@ def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
         more = 0.5 * max(MAX_GAP + SPARE - (first - last), 0.0)
         known &= (t <= last - more) | (t >= first + more)
     return known
-
-
-class WeighedObservation(NamedTuple):
-    """An observation with the odometry at its time, and its log-probability under the track (``evidence``)."""
-
-    odometry: ChainState
-    observation: Observation
-    evidence: float
 
 
 # sentences of events

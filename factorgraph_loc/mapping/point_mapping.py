@@ -18,8 +18,19 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.mapping import bundle
 from factorgraph_loc.mapping.bundle import Bundle
-from factorgraph_loc.mapping.feature_tracks import angles_between, chained, keyframes, matched_pairs, overlapping_pairs
-from factorgraph_loc.mapping.triangulation import PARALLAX, Cameras, Tracks, parallax, reproject, triangulate
+from factorgraph_loc.mapping.triangulation import (
+    PARALLAX,
+    Cameras,
+    Tracks,
+    angles_between,
+    chained,
+    keyframes,
+    matched_pairs,
+    overlapping_pairs,
+    parallax,
+    reproject,
+    triangulate,
+)
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.fusion.graph.marginals import IndeterminateError
-from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.problem import IndeterminateError, Problem
 from factorgraph_loc.mapping.tag_observations import TagObservations
 from factorgraph_loc.mapping.tag_search import TagPosterior, of_tags, reach, search
 from factorgraph_loc.model.belief import LearntPoint, PosePrior

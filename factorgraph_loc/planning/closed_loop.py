@@ -21,11 +21,11 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.active_mcl import ActiveMcl
+from factorgraph_loc.planning.information import Sensors
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, usable
 from factorgraph_loc.planning.policies import policy as named_policy
 from factorgraph_loc.planning.robot import SimulatedRobot
-from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import ACTIVE_ESTIMATORS
 from factorgraph_loc.sensors.odometry.simulation import RATE

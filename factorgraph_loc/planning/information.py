@@ -13,19 +13,26 @@ and Modulation Theory", part I, 1968, section 2.4: the Cramer-Rao bound). No mea
 models are nearly linear over the belief.
 """
 
+from __future__ import annotations
+
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.fusion.cloud import pose_moments, systematic
 from factorgraph_loc.maps.free_space import FreeSpace
+from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.world import World
 from factorgraph_loc.planning import particle_kernels
 from factorgraph_loc.planning.paths import Path, free_steps
-from factorgraph_loc.planning.sensors import SPEED, Sensors
-from factorgraph_loc.sensors.interfaces import Array32, Places
+from factorgraph_loc.sensors.interfaces import Array32, Forecast, Places
+from factorgraph_loc.sensors.motion import odometry_model
+from factorgraph_loc.sensors.registry import functions
 from factors import se2
 from factors.motion import ChainState, propagate
 from factors.odometry import model as odometry
@@ -41,6 +48,45 @@ SAMPLES, SCANS = 256, 48  # particles that are weighted, and those that scans ar
 FEWEST = 10  # least number of particles
 SEVERAL = 0.5  # nats: largest difference of a unimodal belief's entropy from that of a Gaussian with its covariance
 WIDEST_HEADING = 0.8  # rad: largest standard deviation of a Gaussian heading
+SPEED = 0.5  # m/s: converts noise of the odometry per second to noise per metre
+METRES_PER_RADIAN = 0.5  # of a robot that turns in place at 1 rad/s
+
+
+@dataclass(frozen=True, eq=False)
+class Sensors:
+    """The sensors of a robot. ``odometry``: noise of the motion; ``forecasts``: of those that observe objects in the map;
+    ``metres_per_radian``: distance driven in the time of a turn by one radian.
+    """
+
+    odometry: OdometryModel
+    forecasts: tuple[Forecast, ...] = ()
+    metres_per_radian: float = METRES_PER_RADIAN
+
+    @property
+    def goals(self) -> Array:
+        """Places (K, 2) near which the sensors are most informative."""
+        return np.concatenate([np.empty((0, 2)), *(forecast.goals for forecast in self.forecasts)])
+
+    @staticmethod
+    def of(
+        world: World,
+        rig: Rig,
+        settings: Any = None,
+        speed: float = SPEED,
+        turn_rate: float = SPEED / METRES_PER_RADIAN,
+        only: Collection[str] | None = None,
+    ) -> Sensors:
+        """All sensors of a rig that observe objects in the world, or ``only`` those with these names, with the rates in a
+        simulation's ``settings``.
+        """
+        made = [
+            forecast(world, rig, speed, settings)
+            for name, forecast in functions("forecast")
+            if only is None or name in only
+        ]
+        # those with goals first: the order affects the rounding of sums
+        forecasts = sorted((f for f in made if f is not None), key=lambda f: not len(f.goals))
+        return Sensors(odometry_model(rig, constants_as_noise=True), tuple(forecasts), speed / turn_rate)
 
 
 def gaussian_entropy(covariance: Array, dims: int = POSE) -> Array:
@@ -80,7 +126,6 @@ def expected_gain(
     paths: Sequence[Path],
     rng: np.random.Generator,
     *,
-    dims: int = POSITION,
     space: FreeSpace | None = None,
     places: NDArray[np.int64] | None = None,
     noise: OdometryModel | None = None,
@@ -90,7 +135,7 @@ def expected_gain(
     """Expected reduction of entropy (C,) [nats] on each of C paths.
 
     The belief has particles (M, 3) in the world frame with weights (M,). The entropy afterwards is that of the pose at the end.
-    ``dims``: :data:`POSITION` or :data:`POSE`. ``space``: a particle whose path leads into a wall stops and measures no more.
+    ``space``: a particle whose path leads into a wall stops and measures no more.
     ``places`` (M,): the mode of each particle; the entropy is then that of the mode index. ``noise``: of the odometry on the path,
     none by default. ``samples``: number of particles that are weighted; ``scans`` of these draw measurements of all ``sensors``.
     """
@@ -113,7 +158,7 @@ def expected_gain(
     posterior = np.empty((len(paths), scans))
     even: Array32 = np.full((1, count), 1.0 / count, dtype=np.float32)
     start = poses[None] if cells is None else cells
-    prior = _entropies(start, np.zeros(1, dtype=np.int64), even, dims, several=several)[0]
+    prior = _entropies(start, np.zeros(1, dtype=np.int64), even, POSE, several=several)[0]
     for c, (path, steps) in enumerate(zip(paths, stations, strict=True)):
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
@@ -129,7 +174,7 @@ def expected_gain(
             # the entropy at the end of the path, up to the alignment with the histogram's cells
             index = np.zeros_like(index)
         weighed = at if cells is None else cells
-        posterior[c] = _entropies(weighed, index, np.exp(log_weights), dims, several=several)
+        posterior[c] = _entropies(weighed, index, np.exp(log_weights), POSE, several=several)
     return np.asarray(prior - posterior.mean(axis=1))
 
 
@@ -187,12 +232,10 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
     return se2.body_to_world(poses[-1], body)
 
 
-def fisher_gain(
-    mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors, *, dims: int = POSITION
-) -> Array:
-    """Expected reduction of entropy (C,) [nats] on each of C paths, in ``dims`` coordinates; see :func:`expected_covariance`.
-    Accuracy better than :data:`~factorgraph_loc.planning.information.FINEST` counts nothing.
+def fisher_gain(mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors) -> Array:
+    """Expected reduction of entropy (C,) [nats] on each of C paths; see :func:`expected_covariance`. Accuracy better than
+    :data:`~factorgraph_loc.planning.information.FINEST` counts nothing.
     """
     fine = np.diag(FINEST**2)
-    entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine, dims) for path in paths]
-    return np.asarray(gaussian_entropy(covariance + fine, dims) - np.array(entropies, dtype=float))
+    entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine) for path in paths]
+    return np.asarray(gaussian_entropy(covariance + fine) - np.array(entropies, dtype=float))

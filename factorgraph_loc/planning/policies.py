@@ -19,9 +19,8 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.belief import Mode
-from factorgraph_loc.planning.information import expected_gain, fisher_gain
+from factorgraph_loc.planning.information import Sensors, expected_gain, fisher_gain
 from factorgraph_loc.planning.paths import STEP, Path
-from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.plugins import POLICIES, load
 from factorgraph_loc.text import quoted
@@ -106,22 +105,13 @@ def information(s: Situation, sign: float = 1.0) -> Choice:
 
 def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """Gains (C,) with respect to the whole belief."""
-    settings = s.settings.policy
-    gains = expected_gain(
-        s.sensors,
-        s.particles,
-        s.weights,
-        paths,
-        s.rng,
-        dims=len(settings.dimensions),
-        samples=settings.samples,
-        space=s.space,
-    )
+    samples = s.settings.policy.samples
+    gains = expected_gain(s.sensors, s.particles, s.weights, paths, s.rng, samples=samples, space=s.space)
     if len(s.modes) != 1:
         return gains
     # otherwise the robot would go back and forth to compensate the noise of the odometry
     alone, (mode,) = replace(s.sensors, forecasts=()), s.modes
-    return gains + fisher_gain(mode.pose, mode.covariance, paths, alone, dims=len(settings.dimensions))
+    return gains + fisher_gain(mode.pose, mode.covariance, paths, alone)
 
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
@@ -130,7 +120,7 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
-        return fisher_gain(mode.pose, mode.covariance, paths, s.sensors, dims=len(s.settings.policy.dimensions))
+        return fisher_gain(mode.pose, mode.covariance, paths, s.sensors)
     # which of equal modes is the heavier is random
     weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
     return expected_gain(

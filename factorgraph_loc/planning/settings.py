@@ -1,15 +1,14 @@
 """Settings of an active run: the robot, when it counts as localized, and the policy."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
 
 Metres = Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("m")]
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
-Dimension = Literal["x", "y", "heading"]
 
 
 class PolicySettings(FileModel):
@@ -25,15 +24,6 @@ class PolicySettings(FileModel):
     """cost of a near path by its length; far ones have none"""
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
     """number of particles for the expectation"""
-    dimensions: tuple[Dimension, ...] = ("x", "y", "heading")
-    """whose entropy counts: all three, or x and y"""
-
-    @field_validator("dimensions")
-    @classmethod
-    def _with_position(cls, value: tuple[Dimension, ...]) -> tuple[Dimension, ...]:
-        if value not in (("x", "y"), ("x", "y", "heading")):
-            raise ValueError("expected x, y or x, y, heading")
-        return value
 
 
 class ActiveSettings(FileModel):

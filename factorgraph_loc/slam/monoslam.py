@@ -5,12 +5,15 @@ turn rate w^R. Points that are not in the map follow. The error state has 12 val
 freedom. The camera is mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
 
 The robot has wheels: odometry replaces the constant-velocity prediction of x, y and heading. Height, roll and pitch stay near
-those of a robot on the floor. Map points are searched at their predicted pixels (:mod:`.monoslam_search`). Other points enter the
+those of a robot on the floor. Map points are searched at their predicted pixels (:mod:`.monoslam_sighting`). Other points enter the
 state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
 """
 
+from __future__ import annotations
+
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -39,9 +42,9 @@ from factorgraph_loc.slam.monoslam_motion import (
     seen_from_above,
     standstill,
 )
-from factorgraph_loc.slam.monoslam_past import UpdateRecord, smoothed
 from factorgraph_loc.slam.monoslam_sighting import FeatureMatcher, Match
 from factorgraph_loc.slam.monoslam_state import (
+    POSE,
     Eye,
     Innovation,
     MapPoint,
@@ -55,7 +58,7 @@ from factorgraph_loc.slam.monoslam_state import (
 )
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.relocalization import LARGEST_HEIGHT, LARGEST_TILT
-from factors import se2
+from factors import positive, se2
 from factors.camera.model import PLANAR, TiltScale, carrier
 from factors.robust import huber_weight
 from factors.se2 import Array
@@ -65,6 +68,45 @@ RECENT = 5.0  # s: a point in the state that was not seen since may be hidden
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
 SCALE = "scale_distance"  # the constant of the odometry
 LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which the pose is unknown
+
+
+@dataclass(frozen=True)
+class UpdateRecord:
+    """``step``: from the previous record; ``covariance`` (12 + P, 12 + P): of ``robot`` and ``constants`` (P,) after the update.
+    ``relocalized``: the pose is independent of the past.
+    """
+
+    t: float
+    step: Step
+    robot: RobotState
+    constants: Array
+    covariance: Array
+    relocalized: bool = False
+
+
+def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
+    """The records, smoothed with all later ones. Velocity and turn rate have no later influence and are not smoothed."""
+    results = list(records[-1:])
+    for next_record, record in zip(records[:0:-1], records[-2::-1], strict=True):
+        results.append(record if next_record.relocalized else _smoothed(record, next_record, results[-1]))
+    return results[::-1]
+
+
+def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
+    """The smoothed ``record``; ``later``: the smoothed ``next_record``."""
+    total, known = len(record.covariance), next_record.step.transition.shape[1]
+    transition = np.zeros((POSE, total))
+    transition[:, :known] = next_record.step.transition[:POSE]
+    kept = np.r_[0:POSE, ROBOT:total]
+    block = np.ix_(kept, kept)
+    error = np.concatenate((later.robot.minus(next_record.step.robot), later.constants - record.constants))
+    motion = transition[:, kept], next_record.step.noise[:POSE, :POSE]
+    change, covariance = np.zeros(total), record.covariance.copy()
+    change[kept], covariance[block] = positive.smoothed(
+        record.covariance[block], *motion, error[kept], later.covariance[block]
+    )
+    robot, constants = record.robot.plus(change[:ROBOT]), record.constants + change[ROBOT:]
+    return replace(record, robot=robot, constants=constants, covariance=covariance, relocalized=False)
 
 
 class MonoslamSettings(FilterSettings):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 
 from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Mapper, Node
 from factorgraph_loc.fusion.graph.settings import GraphSettings
-from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import Sensor
 from factorgraph_loc.sensors.camera.measurement import Pixels
@@ -19,21 +18,20 @@ from factorgraph_loc.slam.unknown_points import UnknownPoints
 from factors.camera.model import CameraModel
 from factors.camera.point import PointFactor
 from factors.graph import Values, gather
-from factors.se2 import Array
 
 KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points that are estimated
 LEAST_COMMON = 0.3  # least share of an image's features in the last keyframe; below it the image becomes a keyframe
 
 
-class PointMapper(Mapper):
+class PointMapper(UnknownPoints):
     """A mapper of points in images, which need keyframes of their own."""
 
     fewest, horizon, estimates = FEWEST, HORIZON, True
     rejected = "camera: not where it was seen"
 
     def __init__(self, camera: CameraSensor, model: CameraModel, diagnostics: Diagnostics) -> None:
+        super().__init__(model, diagnostics, camera.constants)
         self._camera, self.sensor = camera, camera.name
-        self._unknown = UnknownPoints(model, diagnostics, camera.constants)
         self.knows_scale = len(camera.points.map) > 0
         self._things = MovingThings(model)
         self._taken = -math.inf
@@ -63,7 +61,7 @@ class PointMapper(Mapper):
         if m.frame is not None:
             self._tracks = set(names) - moving
         rows = [i for i in range(len(names)) if i not in used]
-        return self._unknown.take(m, rows, keyframe, guess, graph, addition, self._things)
+        return self.take_rows(m, rows, keyframe, guess, graph, addition, self._things)
 
     def is_astray(self, node: Node, values: Values) -> bool:
         factor = node.factor
@@ -73,18 +71,6 @@ class PointMapper(Mapper):
 
     def point(self, node: Node) -> int | None:
         return node.keys[-1] if isinstance(node.factor, PointFactor) else None
-
-    def leave(self, t: float) -> Sequence[int]:
-        return self._unknown.leave(t)
-
-    def keep_only(self, keys: set[int]) -> None:
-        self._unknown.keep_only(keys)
-
-    def forget(self, first: Keyframe) -> Sequence[int]:
-        return self._unknown.forget(first)
-
-    def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        return self._unknown.learnt(values, covariances)
 
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.fusion.graph.graph import Guess
-from factorgraph_loc.maps.common_error import carried
-from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.maps.points import PointMap, carried
 from factorgraph_loc.vision.consensus import CameraPose
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.matching import gates, match

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Node, jumps
+from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Mapper, Node, jumps
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import NOTHING, Estimated
@@ -82,7 +82,7 @@ class _ChosenSightings:
     sightings: list[PointSighting]
 
 
-class UnknownPoints:
+class UnknownPoints(Mapper):
     """The points of a graph by name, and those waiting. ``estimated``: camera constants that are variables."""
 
     def __init__(self, model: CameraModel, diagnostics: Diagnostics, estimated: Estimated = NOTHING) -> None:
@@ -99,7 +99,7 @@ class UnknownPoints:
         self._distance_travelled = 0.0  # m
         self._again_as: dict[Hashable, Hashable] = {}  # names of points that new tracks continue
 
-    def take(
+    def take_rows(
         self,
         m: Pixels,
         rows: Sequence[int],

@@ -6,7 +6,7 @@ occluded points. The most similar feature in its gate is accepted if it passes t
 views of one point are similar.
 
 Without a prediction, the image is compared with a whole small map, or with the most similar keyframes of a large one
-(:mod:`~factorgraph_loc.vision.relocalization`, :mod:`~factorgraph_loc.vision.places`).
+(:mod:`~factorgraph_loc.vision.relocalization`, :mod:`~factorgraph_loc.vision.relocalization`).
 """
 
 import math
@@ -21,8 +21,7 @@ from factorgraph_loc.vision.consensus import CameraPose, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factorgraph_loc.vision.matching import distance_matrix
-from factorgraph_loc.vision.places import KeyframeLooks
-from factorgraph_loc.vision.relocalization import located
+from factorgraph_loc.vision.relocalization import KeyframeLooks, located
 from factors import chi_squared
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel

@@ -57,12 +57,12 @@ def match(
         distances[~allowed] = np.inf
     if distances.size == 0:
         return Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))
-    forward = nearest_neighbours(distances)
-    keep = np.isfinite(forward.best) & forward.is_unique & (forward.best < ratio * forward.second)
-    back = nearest_neighbours(distances.T)
-    keep &= (back.index[forward.index] == np.arange(len(keep))) & back.is_unique[forward.index]
+    index, best, second = nearest_neighbours(distances)
+    back, best_back, second_back = nearest_neighbours(distances.T)
+    keep = np.isfinite(best) & _is_clear(best, second) & (best < ratio * second)
+    keep &= (back[index] == np.arange(len(keep))) & _is_clear(best_back, second_back)[index]
     chosen = np.flatnonzero(keep)
-    return Matches(np.stack([chosen, forward.index[chosen]], axis=1), forward.best[chosen])
+    return Matches(np.stack([chosen, index[chosen]], axis=1), best[chosen])
 
 
 def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
@@ -83,28 +83,21 @@ def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
     return np.asarray(scaled <= -2.0 * math.log1p(-GATE) * determinant[:, None])
 
 
-@dataclass(frozen=True, eq=False)
-class Nearest:
-    """``index`` (N,) of the nearest, its distance ``best`` (N,), that of the ``second`` nearest (N,), infinite without one.
-
-    ``is_unique`` (N,): whether the nearest is nearer by more than rounding.
-    """
-
-    index: Integers
-    best: Array
-    second: Array
-    is_unique: Truths
-
-
-def nearest_neighbours(distances: Array) -> Nearest:
-    """The nearest column in each of N rows of ``distances`` (N, M), M > 0."""
+def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
+    """The nearest column (N,) in each of N rows of ``distances`` (N, M), M > 0; the distances of the nearest (N,), and of the
+    second nearest (N,), infinite without one."""
     rows = np.arange(len(distances))
     index = distances.argmin(axis=1)
     best = distances[rows, index]
     distances[rows, index] = np.inf
     second = distances.min(axis=1)
     distances[rows, index] = best
-    return Nearest(index, best, second, second > (1.0 + ROUNDING) * best)
+    return index, best, second
+
+
+def _is_clear(best: Array, second: Array) -> Truths:
+    """Whether the nearest is nearer than the second nearest by more than rounding."""
+    return np.asarray(second > (1.0 + ROUNDING) * best)
 
 
 def distance_matrix(first: Descriptors, second: Descriptors) -> Array:

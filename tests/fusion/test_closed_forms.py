@@ -8,8 +8,7 @@ from by_hand import made
 from on_a_line import STEP, WHEELS, drive, kalman
 
 from factorgraph_loc import BearingRange, IncrementOdometry, Landmark, Rig, World
-from factorgraph_loc.fusion.graph.chained import Chained
-from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.problem import Chained, Problem
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeUncertainty
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty

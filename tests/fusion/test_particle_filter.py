@@ -11,8 +11,8 @@ from short_logs import SIGNALS, with_signals
 from factorgraph_loc import Rig, RunFailedError, Tag, Tick, VelocityOdometry, World
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.fusion.ancestors import draw_ancestors
 from factorgraph_loc.fusion.cloud import Cloud, largest_share, pose_moments, systematic
+from factorgraph_loc.fusion.particle_smoothing import draw_ancestors
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, BeamSettings, PriorSettings, RfidSettings

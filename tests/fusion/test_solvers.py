@@ -12,8 +12,7 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph import isam
 from factorgraph_loc.fusion.graph.graph import Node
-from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
-from factorgraph_loc.fusion.graph.problem import Problem
+from factorgraph_loc.fusion.graph.problem import IndeterminateError, Problem, covariances
 from factorgraph_loc.fusion.graph.solver import Window
 from factorgraph_loc.fusion.graph.summary import MarginalSummary
 from factorgraph_loc.sensors.odometry.settings import OdometryUncertainty

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factorgraph_loc.mapping.feature_tracks import (
+from factorgraph_loc.mapping.triangulation import (
+    Cameras,
     chained,
     keyframes,
     matched_pairs,
     near_epipolar_lines,
     overlapping_pairs,
 )
-from factorgraph_loc.mapping.triangulation import Cameras
 
 pytestmark = pytest.mark.kernels
 

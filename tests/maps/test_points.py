@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from refusal import refusal
 
 from factorgraph_loc.files.columns import COVARIANCES
-from factorgraph_loc.maps.common_error import LEAST, CommonError, carried, without_common
-from factorgraph_loc.maps.points import PointMap, read_points, write_points
+from factorgraph_loc.maps.points import LEAST, CommonError, PointMap, carried, read_points, without_common, write_points
 from factors import se2
 
 

@@ -11,13 +11,13 @@ from factorgraph_loc import Landmark, Rig, Tag, World
 from factorgraph_loc.planning import particle_kernels
 from factorgraph_loc.planning.information import (
     FINEST,
+    Sensors,
     expected_covariance,
     expected_gain,
     fisher_gain,
     gaussian_entropy,
 )
 from factorgraph_loc.planning.paths import Path, primitives
-from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.sensors.landmarks.measurement import SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import LandmarkForecast
 from factorgraph_loc.sensors.rfid import forecast as expected_scans
@@ -175,7 +175,7 @@ def test_it_agrees_with_the_closed_form_where_the_belief_is_narrow():
     drawn = expected_gain(still, particles, weights, paths, rng, samples=2000, scans=200)
     fine = np.diag(FINEST**2)
     after = np.array([expected_covariance(MEAN, covariance, path, exact) for path in paths])
-    closed = gaussian_entropy(covariance + fine, 2) - gaussian_entropy(after + fine, 2)
+    closed = gaussian_entropy(covariance + fine) - gaussian_entropy(after + fine)
     assert closed.min() > 0.1
     assert abs(drawn - closed).max() < 0.15
 
@@ -202,7 +202,7 @@ def test_what_is_far_or_behind_a_wall_tells_nothing():
 
     def gain(*forecasts):
         draws, sensors = np.random.default_rng(1), replace(NOTHING, forecasts=forecasts)
-        return expected_gain(sensors, particles, weights, ways, draws, dims=3)[0]
+        return expected_gain(sensors, particles, weights, ways, draws)[0]
 
     nothing = gain()
     wall = ((3.6, -10.0, 3.6, 10.0),)
@@ -267,8 +267,7 @@ def tagged(*places):
     return World(tags={f"T{i}": Tag(x=float(x), y=float(y), z=1.2) for i, (x, y) in enumerate(places)})
 
 
-@pytest.mark.parametrize("dims", [2, 3])
-def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow(dims):
+def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow():
     """As narrow as the sensors are nearly linear, with tags at the end of their reach. What the Monte-Carlo gain does not count, as
     too fine, is added to the closed covariances too. The order of the paths is the same."""
     world, paths = tagged((4.8, 3.0), (-1.5, 5.5)), [p for p in primitives(1.5) if p.length > 1.4][::5]
@@ -277,10 +276,10 @@ def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow(dims):
     rng = np.random.default_rng(0)
     particles = rng.multivariate_normal(MEAN, covariance, 2000)
     weights = np.full(2000, 1.0 / 2000)
-    drawn = expected_gain(sensors, particles, weights, paths, rng, dims=dims, noise=NOISE, samples=2000, scans=200)
+    drawn = expected_gain(sensors, particles, weights, paths, rng, noise=NOISE, samples=2000, scans=200)
     fine = np.diag(FINEST**2)
     after = np.array([expected_covariance(MEAN, covariance, path, sensors) for path in paths])
-    closed = gaussian_entropy(covariance + fine, dims) - gaussian_entropy(after + fine, dims)
+    closed = gaussian_entropy(covariance + fine) - gaussian_entropy(after + fine)
     assert abs(drawn - closed).max() < 0.2
     assert abs(np.mean(drawn - closed)) < 0.1
     assert np.corrcoef(drawn, closed)[0, 1] > 0.9
@@ -293,7 +292,7 @@ def test_the_gain_is_the_fall_of_entropy():
     after = expected_covariance(MEAN, COVARIANCE, STRAIGHT, sensors)
     # of what is not finer than counts
     fine = np.diag(FINEST**2)
-    before, left = (gaussian_entropy(covariance + fine, 2) for covariance in (COVARIANCE, after))
+    before, left = (gaussian_entropy(covariance + fine) for covariance in (COVARIANCE, after))
     assert gain == pytest.approx(before - left)
     assert fisher_gain(MEAN, COVARIANCE, [], sensors).shape == (0,)
 

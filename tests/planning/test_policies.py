@@ -12,6 +12,7 @@ from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.planning.information import (
     POSITION,
+    Sensors,
     expected_gain,
     gaussian_entropy,
     has_several_modes,
@@ -19,7 +20,6 @@ from factorgraph_loc.planning.information import (
 )
 from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths
 from factorgraph_loc.planning.policies import Situation, policy, usable
-from factorgraph_loc.planning.sensors import Sensors
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.sensors.motion import odometry_model
 from factorgraph_loc.sensors.rfid.forecast import RfidForecast

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.slam.monoslam_search import agreeing
+from factorgraph_loc.slam.monoslam_sighting import agreeing
 from factorgraph_loc.slam.monoslam_state import Innovation
 
 COMMON, NEW = 6.0, 20.0  # px: what the heading moves all pixels by, and the depth of a new point its own

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from factorgraph_loc.vision.places import NEAREST, KeyframeLooks
+from factorgraph_loc.vision.relocalization import NEAREST, KeyframeLooks
 
 KEYFRAMES, EACH, SIZE = 400, 60, 24
 

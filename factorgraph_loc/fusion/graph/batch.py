@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe
-from factorgraph_loc.fusion.graph.marginals import IndeterminateError
-from factorgraph_loc.fusion.graph.problem import Problem, Solution
+from factorgraph_loc.fusion.graph.problem import IndeterminateError, Problem, Solution
 from factors import se2
 from factors.graph import Factor, PriorFactor, Values, VectorPriorFactor, gather, is_of_keyframe, is_pose
 from factors.se2 import Array

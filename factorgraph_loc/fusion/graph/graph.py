@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.fusion.graph.marginals import DAMPED, blamed
+from factorgraph_loc.fusion.graph.problem import DAMPED, blamed
 from factorgraph_loc.fusion.layout import MOTION, constants_of
 from factorgraph_loc.fusion.tracking import Change
 from factorgraph_loc.maps.points import PointMap

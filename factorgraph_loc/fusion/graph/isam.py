@@ -14,7 +14,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.graph.batch import solve_whole, whole_problem
 from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Node, jumps
-from factorgraph_loc.fusion.graph.marginals import IndeterminateError, covariances
+from factorgraph_loc.fusion.graph.problem import IndeterminateError, covariances
 from factorgraph_loc.fusion.graph.settings import SmootherSettings
 from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, Window
 from factorgraph_loc.fusion.graph.summary import MarginalSummary, is_missing

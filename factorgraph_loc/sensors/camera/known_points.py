@@ -9,9 +9,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from factorgraph_loc.maps.common_error import without_common
 from factorgraph_loc.maps.markers import marker_of
-from factorgraph_loc.maps.points import PointMap
+from factorgraph_loc.maps.points import PointMap, without_common
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.model.setup import MapUse, Setup

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.maps.common_error import CommonError
+from factorgraph_loc.maps.points import CommonError
 from factorgraph_loc.model.settings import Angle, Hertz, Metres, Offset, SensorSettings, Share
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.camera import model as reprojection
