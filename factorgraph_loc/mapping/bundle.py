@@ -18,7 +18,7 @@ from gtsam.symbol_shorthand import K, L, X
 
 from factorgraph_loc.mapping.triangulation import NEAREST, Cameras, Tracks, reproject
 from factorgraph_loc.vision.consensus import Truths
-from factors.camera.model import CameraModel
+from factors.camera.model import CameraModel, undistorted
 from factors.se2 import Array, Integers
 
 ROUNDS = 3
@@ -67,8 +67,8 @@ def adjust(
 ) -> Bundle:
     """Adjust ``points`` (T, 3) and ``cameras``, whose prior poses have ``covariances`` (F, 6, 6), see :class:`Bundle`.
 
-    ``focal``: whether to estimate the focal lengths; ``lens``: and the principal point and the distortion. Raises RuntimeError
-    if the graph cannot be solved.
+    ``focal``: whether to estimate the focal lengths; ``lens``: and the principal point and the distortion, if it is Brown's. Raises
+    RuntimeError if the graph cannot be solved.
     """
     old = np.arange(len(points))
     fixed = gtsam.NonlinearFactorGraph()
@@ -162,13 +162,17 @@ def _optimized(
 ) -> tuple[CameraModel, Cameras, Array]:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.push_back(fixed)
-    calibration = model.calibration()
+    pinhole, pixels = model, tracks.pixels
+    if not model.is_brown:  # GTSAM has no such lens
+        pinhole = replace(model, distortion=(0.0,) * 4, fisheye=False)
+        pixels = undistorted(model, pixels) * (model.fx, model.fy) + (model.cx, model.cy)
+    calibration = pinhole.calibration()
     for i in range(len(cameras)):
         values.insert(X(i), pose3(cameras.positions[i], cameras.rotations[i]))
     for k, point in enumerate(points):
         values.insert(L(k), point)
     noise = robust_noise(model)
-    rows = zip(tracks.frame.tolist(), tracks.track.tolist(), tracks.pixels, strict=True)
+    rows = zip(tracks.frame.tolist(), tracks.track.tolist(), pixels, strict=True)
     if constants:
         values.insert(K(0), calibration)
         for i, k, pixel in rows:

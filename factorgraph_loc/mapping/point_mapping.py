@@ -145,6 +145,10 @@ def map_points(
     if not good.any():
         raise RunFailedError("no feature was matched between images from several places, so no point was mapped")
     total, (chosen, old) = tracks.count, tracks.kept(good[tracks.track])
+    if (settings.focal or settings.lens) and not model.is_brown:
+        raise InputError(
+            "focal and lens adjust a lens of distortion_model plumb_bob with four numbers: remove focal and lens"
+        )
     try:
         adjusted = bundle.adjust(
             model,

@@ -15,18 +15,51 @@ BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
 # columns of a Jacobian: by the pose, by roll and pitch, by the point, and by all parameters of the camera
 TILT, POINT, CONSTANTS, WIDTH = 3, 5, 8, 16
 
-# fx, fy, cx, cy, k1, k2, p1, p2, and 1 / r^2; the distortion polynomial is valid where x^2 + y^2 < r^2
+# fx, fy, cx, cy, k1, k2, p1, p2, and 1 / r^2; the distortion is valid where x^2 + y^2 < r^2. Lenses that are not Brown's have also
+# their kind, k3, k4, k5, k6: numba compiles code for tuples of either length, without a branch
 Lens = tuple[float, ...]
+BROWN = 9
+RATIONAL, FISHEYE = 0.0, 1.0
 Place = tuple[tuple[float, ...], ...]
 
 
+@compiled
+def _radial(k: Lens, rr: float) -> tuple[float, float]:
+    """The radial factor of a lens that is not Brown's at the square ``rr`` of the distance from the axis, and twice its slope.
+
+    Kannala and Brandt, "A generic camera model and calibration method", PAMI 28(8), 2006, eq. 6, for a fisheye lens.
+    """
+    k1, k2, k3, k4, k5, k6 = k[4], k[5], k[-4], k[-3], k[-2], k[-1]
+    if k[-5] == RATIONAL:
+        above, below = 1.0 + rr * (k1 + rr * (k2 + rr * k3)), 1.0 + rr * (k4 + rr * (k5 + rr * k6))
+        rise, fall = k1 + rr * (2.0 * k2 + rr * 3.0 * k3), k4 + rr * (2.0 * k5 + rr * 3.0 * k6)
+        return above / below, 2.0 * (rise - fall * above / below) / below
+    if rr < 1e-8:
+        return 1.0 + (k1 - 1.0 / 3.0) * rr, 2.0 * (k1 - 1.0 / 3.0)
+    r = math.sqrt(rr)
+    angle = math.atan(r)
+    aa = angle * angle
+    seen = angle * (1.0 + aa * (k1 + aa * (k2 + aa * (k3 + aa * k4))))
+    slope = (1.0 + aa * (3.0 * k1 + aa * (5.0 * k2 + aa * (7.0 * k3 + aa * 9.0 * k4)))) / (1.0 + rr)
+    return seen / r, (slope * r - seen) / (r * rr)
+
+
+@compiled
+def radial_slope(k: Lens, rr: float) -> float:
+    """The slope of the distorted distance from the axis, of a lens that is not Brown's, at the square ``rr`` of the distance."""
+    radial, slope = _radial(k, rr)
+    return float(radial + rr * slope)
+
+
 @compiled(inline="always")
-def _brown(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """The distortion polynomial at direction (x, y), and its derivatives xx, xy = yx and yy."""
+def _bent(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
+    """The distortion at direction (x, y) within the valid radius, and its derivatives xx, xy = yx and yy."""
     k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
     rr = x * x + y * y
     radial = 1.0 + k1 * rr + k2 * rr * rr
     slope = 2.0 * (k1 + 2.0 * k2 * rr)
+    if len(k) != BROWN:
+        radial, slope = _radial(k, rr)
     xd = x * radial + 2.0 * p1 * x * y + p2 * (rr + 2.0 * x * x)
     yd = y * radial + p1 * (rr + 2.0 * y * y) + 2.0 * p2 * x * y
     xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
@@ -37,12 +70,12 @@ def _brown(k: Lens, x: float, y: float) -> tuple[float, float, float, float, flo
 
 @compiled(inline="always")
 def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """The distorted direction, and its Jacobian by rows. Beyond its valid radius the polynomial B is extrapolated radially, as
+    """The distorted direction, and its Jacobian by rows. Beyond its valid radius the distortion B is extrapolated radially, as
     t B(x / t) with t = r / radius, so that nothing far outside of the image appears in it."""
     t = math.sqrt(max(1.0, k[8] * (x * x + y * y)))
     inverse = 1.0 / t
     ex, ey = inverse * x, inverse * y
-    xd, yd, xx, xy, yy = _brown(k, ex, ey)
+    xd, yd, xx, xy, yy = _bent(k, ex, ey)
     tx, ty = (k[8] * ex, k[8] * ey) if t > 1.0 else (0.0, 0.0)  # derivatives of t
     ax, ay = xd - xx * ex - xy * ey, yd - xy * ex - yy * ey
     return t * xd, t * yd, xx + ax * tx, xy + ax * ty, xy + ay * tx, yy + ay * ty

@@ -5,7 +5,9 @@ pixel (fx x + cx, fy y + cy) of its distorted direction (x, y), with radial and 
 Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as in OpenCV and ``gtsam.Cal3DS2``. Pixel noise is
 Gaussian with Huber's loss (1964) against outliers.
 
-The polynomial is used up to the radius where the lens would fold the image; directions beyond it, outside of the image of an
+Rational polynomials and fisheye lenses (Kannala and Brandt, 2006) are as in OpenCV too.
+
+The distortion is used up to the radius where the lens would fold the image; directions beyond it, outside of the image of an
 invertible lens, are extrapolated radially, so that they do not appear in the image. Points nearer than
 :data:`~factors.camera.kernels.NEAREST`, or behind the camera, are treated as at that depth: all values are finite and nothing
 raises.
@@ -31,6 +33,8 @@ from factors.se2 import Array
 PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw", "focal", "time_offset")
 FOCAL, TIME_OFFSET = PARAMETERS.index("focal"), PARAMETERS.index("time_offset")
 WIDEST = 4.0  # of x^2 + y^2 (63 degrees off the axis): maximum for the distortion polynomial
+WIDEST_FISHEYE = 400.0  # likewise (87 degrees)
+STEPS = 1000  # radii at which the slope of a distortion is checked
 GRID = 33  # rows and columns of pixels at which a lens is checked
 PLANAR = [3, 4, 2]  # indices in the perturbation of a pose in space: x, y and heading of a level robot
 NONE = 1e-9  # tolerance of distorted directions
@@ -43,11 +47,11 @@ FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 class CameraModel:
     """A camera and its noise.
 
-    ``fx``, ``fy``, ``cx``, ``cy`` [px]; ``distortion`` (k1, k2, p1, p2); ``width``, ``height`` [px] of its images. ``position``
-    (3,) [m] and ``rotation`` (3, 3) of the camera in the robot frame. ``sigma`` [px] in u and in v; ``robust``: scale of Huber's
-    loss in standard deviations. ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images.
-    ``tilt``: standard deviation [rad] of the robot's roll and pitch, which all points of an image have in common: no floor is level
-    to a pixel.
+    ``fx``, ``fy``, ``cx``, ``cy`` [px]; ``distortion`` (k1, k2, p1, p2) or (k1, k2, p1, p2, k3, k4, k5, k6), or of a ``fisheye``
+    (k1, k2, k3, k4), as in OpenCV; ``width``, ``height`` [px] of its images. ``position`` (3,) [m] and ``rotation`` (3, 3) of the
+    camera in the robot frame. ``sigma`` [px] in u and in v; ``robust``: scale of Huber's loss in standard deviations.
+    ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images. ``tilt``: standard deviation [rad]
+    of the robot's roll and pitch, which all points of an image have in common: no floor is level to a pixel.
     """
 
     fx: float
@@ -56,7 +60,8 @@ class CameraModel:
     cy: float
     width: int
     height: int
-    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    fisheye: bool = False
     position: Array = field(default_factory=lambda: np.zeros(3))
     rotation: Array = field(default_factory=FORWARD.copy)
     sigma: float = 1.0
@@ -65,15 +70,20 @@ class CameraModel:
     tilt: float = 0.005
 
     def intrinsics(self) -> Array:
-        """(fx, fy, cx, cy, k1, k2, p1, p2) as an array (8,)."""
-        return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion))
+        """Focal lengths, principal point and distortion as an array."""
+        return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion, *((1.0,) if self.fisheye else ())))
 
     def matrix(self) -> Array:
         """The camera matrix (3, 3)."""
         return np.array(((self.fx, 0.0, self.cx), (0.0, self.fy, self.cy), (0.0, 0.0, 1.0)))
 
+    @property
+    def is_brown(self) -> bool:
+        """Whether the lens has Brown's distortion (k1, k2, p1, p2)."""
+        return len(self.distortion) == 4 and not self.fisheye
+
     def calibration(self) -> gtsam.Cal3DS2:
-        """The calibration for GTSAM."""
+        """The calibration for GTSAM, if the lens :attr:`is_brown`."""
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
@@ -175,14 +185,16 @@ def folded(model: CameraModel) -> Array | None:
 
     The lens is invertible where the determinant of its Jacobian is positive within the valid radius of the polynomial.
     """
-    if not any(model.distortion):
+    if not any(model.distortion) and not model.fisheye:
         return None
     u, v = (np.linspace(-0.5, side - 0.5, GRID) for side in (model.width, model.height))
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     lens = lens_of(model)
     distorted = (pixels - (model.cx, model.cy)) / (model.fx, model.fy)
     directions, errors = reprojection_kernels.undistorted(lens, distorted)
-    bad = ~(errors < NONE) | (lens[8] * np.sum(directions**2, axis=1) >= 1.0)
+    bad = ~(errors < NONE)
+    if not model.fisheye:  # images of a fisheye lens may have corners beyond a right angle
+        bad |= lens[8] * np.sum(directions**2, axis=1) >= 1.0
     return np.asarray(pixels[np.argmax(bad)]) if bad.any() else None
 
 
@@ -239,15 +251,24 @@ def log_likelihood(
 
 
 def lens_of(model: CameraModel) -> Lens:
-    """The camera's constants for the kernels: :meth:`CameraModel.intrinsics` and 1 / r^2. The distortion polynomial is valid up
-    to the radius r, where its radial part stops growing, at most :data:`WIDEST`. Without distortion the last value is 0."""
-    end = 0.0
-    if any(model.distortion):
-        k1, k2, *_ = model.distortion
+    """The camera's constants for the kernels. The distortion is valid up to the radius where its radial part stops growing, at most
+    :data:`WIDEST` or :data:`WIDEST_FISHEYE`."""
+    focal = model.fx, model.fy, model.cx, model.cy
+    if not any(model.distortion) and not model.fisheye:
+        return (*map(float, focal), *(0.0,) * 5)
+    k1, k2, *others = model.distortion
+    if model.is_brown:
         # the slope of the radial part at q = x^2 + y^2 is 1 + 3 k1 q + 5 k2 q^2: a quadratic in 1 / q
         square = 9.0 * k1 * k1 - 20.0 * k2
         end = max(1.0 / WIDEST, 0.5 * (math.sqrt(square) - 3.0 * k1) if square > 0.0 else 0.0)
-    return (*map(float, (model.fx, model.fy, model.cx, model.cy, *model.distortion)), end)
+        return (*map(float, (*focal, *model.distortion)), end)
+    kind = reprojection_kernels.FISHEYE if model.fisheye else reprojection_kernels.RATIONAL
+    p1, p2, *others = (0.0, 0.0, *others, 0.0, 0.0) if model.fisheye else others
+    widest = WIDEST_FISHEYE if model.fisheye else WIDEST
+    lens = (*map(float, (*focal, k1, k2, p1, p2)), 1.0 / widest, kind, *map(float, others))
+    squares = np.linspace(0.0, 1.0, STEPS)[1:] ** 2 * widest
+    falls = [q for q in squares.tolist() if not reprojection_kernels.radial_slope(lens, q) > 0.0]
+    return (*lens[:8], 1.0 / falls[0] if falls else lens[8], *lens[9:])
 
 
 # how level a floor is: in most images the tilt of a robot is that of the floor; in some, as on a sill, it may have any scale

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -110,3 +111,30 @@ def test_jacobians_far_off_the_axis_are_the_numerical_ones(model, radius, angle)
     _, _, by_point = linearize_in_space(model, np.zeros(3), np.eye(3), point[None])
     numerical = derivative(lambda d: project(model, (point + d)[None])[0], 3)
     np.testing.assert_allclose(by_point[0], numerical, rtol=1e-4, atol=1e-2)
+
+
+RATIONAL = CameraModel(400.0, 410.0, 320.0, 240.0, 640, 480, (0.3, -0.1, 1e-3, -2e-3, 0.02, 0.25, -0.05, 0.01))
+FISHEYE = CameraModel(286.0, 287.0, 424.0, 400.0, 848, 800, (-0.0066, 0.0413, -0.0394, 0.0067), fisheye=True)
+
+
+@pytest.mark.parametrize("model", [RATIONAL, FISHEYE], ids=["rational", "fisheye"])
+@given(st.lists(st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2)), min_size=1, max_size=5))
+def test_other_lenses_are_those_of_opencv(model, directions):
+    points = np.column_stack((directions, np.ones(len(directions))))
+    none, numbers = np.zeros(3), np.array(model.distortion)
+    if model.fisheye:
+        expected = cv2.fisheye.projectPoints(points[:, None], none, none, model.matrix(), numbers)[0][:, 0]
+    else:
+        expected = cv2.projectPoints(points, none, none, model.matrix(), numbers)[0].reshape(-1, 2)
+    pixels = project(model, points)
+    np.testing.assert_allclose(pixels, expected, atol=1e-9)
+    np.testing.assert_allclose(undistorted(model, pixels), points[:, :2], atol=1e-9)
+    by_point = linearize_in_space(model, none, np.eye(3), points)[2]
+    for point, jacobian in zip(points, by_point, strict=True):
+        numerical = derivative(lambda moved, point=point: project(model, (point + moved)[None])[0], 3)
+        np.testing.assert_allclose(jacobian, numerical, atol=1e-4)
+
+
+def test_a_fisheye_may_see_more_than_a_right_angle():
+    assert folded(FISHEYE) is None
+    assert folded(replace(RATIONAL, fx=150.0)) is not None

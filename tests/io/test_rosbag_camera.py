@@ -5,6 +5,7 @@ import tracemalloc
 
 import cv2
 import numpy as np
+import pytest
 from rosbag_drive import MS, T0, add_frames, transform
 
 from factors.camera.model import mounting
@@ -78,7 +79,7 @@ def test_an_image_with_too_few_bytes(maker, refuse_drive, tmp_path):
     assert not list((tmp_path / "cache" / "bags").iterdir())
 
 
-def add_info(made, **changes):
+def add_info(made, kind="plumb_bob", **changes):
     upper = str.upper if made.ros1 else str
     lens = {"d": np.array((0.1, 0.02, 0.003, 0.004, 0.0)), "k": np.array((500.0, 0, 320, 0, 510, 240, 0, 0, 1))}
     lens |= {"r": np.eye(3).ravel(), "p": np.zeros(12)} | changes
@@ -89,7 +90,7 @@ def add_info(made, **changes):
         frame="lens",
         height=480,
         width=640,
-        distortion_model="plumb_bob",
+        distortion_model=kind,
         **{upper(name): value for name, value in lens.items()},
         binning_x=0,
         binning_y=0,
@@ -118,12 +119,36 @@ def test_the_camera_of_the_bag(maker, read_drive):
     log = read_drive(maker, camera=CAMERA)
     camera = log.rig.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500.0, 510.0, 320.0, 240.0)
-    assert camera.distortion == (0.1, 0.02, 0.003, 0.004)
+    assert camera.model().distortion == (0.1, 0.02, 0.003, 0.004)
     np.testing.assert_allclose((camera.x, camera.y, camera.z), (0.1, 0.2, 1.5), atol=1e-12)
     np.testing.assert_allclose((camera.roll, camera.pitch, camera.yaw), (0.0, tilt, 0.3), atol=1e-12)
     expected = mounting(0.0, tilt, 0.3)
     np.testing.assert_allclose(camera.model().rotation, expected, atol=1e-12)
     assert log.rig.sensors == ("odometry", "camera")
+
+
+@pytest.mark.parametrize(
+    ("kind", "numbers"),
+    [
+        ("plumb_bob", (0.1, 0.02, 0.003, 0.004, 0.01)),
+        ("rational_polynomial", (0.01,) * 8),
+        ("equidistant", (0.01,) * 4),
+    ],
+)
+def test_lenses_of_several_kinds(maker, read_drive, kind, numbers):
+    add_info(maker, kind, d=np.array(numbers))
+    add_image(maker, T0, np.zeros((480, 640)), "mono8")
+    camera = read_drive(maker, camera=CAMERA).rig.camera
+    assert camera.distortion_model == kind
+    assert camera.distortion == numbers
+    assert camera.model().fisheye == (kind == "equidistant")
+
+
+@pytest.mark.parametrize(("kind", "numbers"), [("fov", (0.9,)), ("plumb_bob", (0.1,) * 8)])
+def test_lenses_without_a_model_are_refused(maker, refuse_drive, kind, numbers):
+    add_info(maker, kind, d=np.array(numbers))
+    add_image(maker, T0, np.zeros((480, 640)), "mono8")
+    refuse_drive(maker, "/camera/camera_info:1:", kind, camera=CAMERA)
 
 
 def test_images_pass_through_memory_one_at_a_time(maker, read_drive):

@@ -20,7 +20,7 @@ from factorgraph_loc.files.temporary import locked, sweep, temporary_folder, wri
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.topics import Stamper, TopicSettings, as_nanoseconds
 from factorgraph_loc.sensors.camera.measurement import ImageStream
-from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.settings import COUNTS, CameraSettings
 from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.feature_cache import cache_folder
 from factors.se2 import Array
@@ -121,7 +121,6 @@ class Info:
         bag.topic(name, INFO)
         self._source = f"{bag.path} {name}"
         self._content: dict[str, Any] = {}
-        self._notes: list[str] = []
         self.frame = ""
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -130,11 +129,14 @@ class Info:
         info = item.message
         k: Array = np.asarray(info.k if hasattr(info, "k") else info.K, dtype=float)
         d: Array = np.asarray(info.d if hasattr(info, "d") else info.D, dtype=float)
-        lens = np.zeros(4)
-        lens[: min(4, len(d))] = d[:4]
-        if np.any(d[4:]):
-            left = f"not {d[4:].tolist()}"
-            self._notes.append(f"of the lens ({info.distortion_model}) only k1, k2, p1, p2 are used, {left}")
+        kind = info.distortion_model or "plumb_bob"
+        if kind not in COUNTS:
+            raise InputError(
+                f"{self._source}:{item.row}: distortion_model is {quoted(kind)}, expected one of {', '.join(COUNTS)}"
+            )
+        count = COUNTS[kind][-1]
+        if np.any(d[count:]):
+            raise InputError(f"{self._source}:{item.row}: d has {len(d)} numbers, {kind} has {count}")
         self.frame = str(info.header.frame_id)
         self._content = {
             "width": int(info.width),
@@ -143,12 +145,12 @@ class Info:
             "fy": float(k[4]),
             "cx": float(k[2]),
             "cy": float(k[5]),
-            "distortion": tuple(lens.tolist()),
+            "distortion_model": kind,
+            "distortion": tuple(np.pad(d[:count], (0, count - len(d[:count]))).tolist()),
         }
 
-    def settings(self, mounting: dict[str, float], notes: list[str]) -> CameraSettings:
-        """The camera at ``mounting``; ignored lens parameters are added to ``notes``."""
-        notes += self._notes
+    def settings(self, mounting: dict[str, float]) -> CameraSettings:
+        """The camera at ``mounting``."""
         return parse_model(CameraSettings, self._content | mounting, self._source)
 
 

@@ -57,11 +57,11 @@ def camera_of(info: Info, frames: StaticFrames, notes: list[str]) -> CameraSetti
     pose = frames.pose(info.frame)
     if pose is None:
         notes.append(f"tf_static has no mounting of {info.frame} on {frames.base}")
-        return info.settings({}, notes)
+        return info.settings({})
     notes.append(f"tf_static has the mounting of {info.frame} on {frames.base}")
     roll, pitch, yaw = angles_of_camera(pose[:3, :3])
     x, y, z = pose[:3, 3].tolist()
-    return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}, notes)
+    return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw})
 
 
 def antennas_of(names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, notes: list[str]) -> RfidSettings:

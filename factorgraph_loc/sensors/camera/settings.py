@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -27,6 +27,7 @@ Lens = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Side = Annotated[int, Field(ge=16, le=100_000), InUnit("px")]
 Distance = Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")]
 Turn = Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")]
+COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # of distortion
 WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 
 
@@ -67,8 +68,10 @@ class CameraSettings(SensorSettings):
     """principal point; 0 is the centre of the upper left pixel"""
     cy: Pixel
     """principal point; 0 is the centre of the upper left pixel"""
-    distortion: tuple[Lens, Lens, Lens, Lens] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2 as in OpenCV"""
+    distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
+    """kind of lens, as in ROS; equidistant is OpenCV's fisheye"""
+    distortion: Annotated[tuple[Lens, ...], Field(min_length=4, max_length=8)] = (0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2 as in OpenCV, and k3, or k3 to k6; k1 to k4 of equidistant"""
     x: Offset = 0.0
     """position of the camera on the robot, forward"""
     y: Offset = 0.0
@@ -95,6 +98,16 @@ class CameraSettings(SensorSettings):
     """standard deviations of constants; those above 0 are estimated"""
 
     @model_validator(mode="after")
+    def _has_its_numbers(self) -> CameraSettings:
+        counts = COUNTS[self.distortion_model]
+        if len(self.distortion) not in counts:
+            expected = " or ".join(map(str, counts))
+            raise ValueError(
+                f"the distortion has {len(self.distortion)} numbers, {self.distortion_model} has {expected}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _is_invertible(self) -> CameraSettings:
         pixel = reprojection.folded(self.model())
         if pixel is not None:
@@ -112,7 +125,8 @@ class CameraSettings(SensorSettings):
             cy=self.cy,
             width=self.width,
             height=self.height,
-            distortion=self.distortion,
+            distortion=self.distortion[:4] if not any(self.distortion[4:]) else (*self.distortion, 0.0, 0.0, 0.0)[:8],
+            fisheye=self.distortion_model == "equidistant",
             position=np.array((self.x, self.y, self.z)),
             rotation=reprojection.mounting(self.roll, self.pitch, self.yaw),
             sigma=self.pixel_sigma,
