@@ -61,13 +61,13 @@ class CameraModel:
     width: int
     height: int
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
-    fisheye: bool = False
     position: Array = field(default_factory=lambda: np.zeros(3))
     rotation: Array = field(default_factory=FORWARD.copy)
     sigma: float = 1.0
     robust: float = 2.0
     tempering: float = 1.0
     tilt: float = 0.005
+    fisheye: bool = False
 
     def intrinsics(self) -> Array:
         """Focal lengths, principal point and distortion as an array."""
