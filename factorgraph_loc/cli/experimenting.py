@@ -179,6 +179,7 @@ def report(file: File, *, options: ExperimentOptions, json: Json = False) -> Non
 
 def _print_plan(prepared: Prepared[Any], jobs: int | None, again: bool, json: bool) -> None:
     import os
+    from datetime import timedelta
 
     from factorgraph_loc.experiments.experiment import estimate_seconds
 
@@ -206,7 +207,8 @@ def _print_plan(prepared: Prepared[Any], jobs: int | None, again: bool, json: bo
         ],
     )
     show.line()
-    show.line(f"{len(prepared.runs)} runs, {len(todo)} to do: about {_span(seconds)} with {processes} processes")
+    span = timedelta(seconds=round(seconds))
+    show.line(f"{len(prepared.runs)} runs, {len(todo)} to do: about {span} with {processes} processes")
 
 
 def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
@@ -216,13 +218,6 @@ def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
         show.line(f"damaged: {len(runs) - SHOWN} more")
     if runs:
         show.line(f"`fgloc experiment run {file}` runs them again")
-
-
-def _span(seconds: float) -> str:
-    for unit, length in (("h", 3600.0), ("min", 60.0)):
-        if seconds >= 2.0 * length:
-            return f"{seconds / length:.0f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[list[str], list[list[str]]]:

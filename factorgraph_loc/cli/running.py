@@ -187,9 +187,6 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
     else:
         hardly = f", or too little: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
         show.line(f"there is no reference to score against{hardly}")
-    if scores["aligned.position_rmse"] is not None:
-        position, heading = (number(scores[f"aligned.{what}_rmse"], n) for what, n in (("position", 3), ("heading", 4)))
-        show.line(f"final, aligned because the map was free: position RMSE {position} m, heading RMSE {heading} rad")
     if scores["landmarks.count"]:
         error, anees = (number(scores[f"landmarks.{what}"], n) for what, n in (("rmse", 3), ("anees", 2)))
         show.line(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideal 2")

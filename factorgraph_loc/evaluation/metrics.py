@@ -1,6 +1,6 @@
 """Accuracy of a trajectory against the reference, and consistency of its covariances.
 
-The map's frame is known, so trajectories are aligned only on request. For runs that estimated the map, aligned figures are added.
+If the map's frame is known, trajectories are aligned only on request.
 
 Pairing of poses: :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with
 Applications to Tracking and Navigation", 2001, section 5.4. Relative pose errors:
@@ -96,14 +96,15 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     ``scoring.max_gap`` [s]: only runs with equal values are comparable. ``causal.*`` and ``final.*`` (see
     :func:`accuracy`) are scored from the first localized causal estimate and, except for ``scored``, are None without a reference
     or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never localized, ``causal.*`` is None, and ``final.*``
-    is scored from its beginning. ``time_to_localized`` [s] counts from the first tick. ``aligned.*`` and ``landmarks.*`` (see
-    :func:`free_map_figures`) are None unless the map was estimated. ``learnt.NAME.value``
+    is scored from its beginning. ``time_to_localized`` [s] counts from the first tick. ``landmarks.*`` (see
+    :func:`landmark_figures`) are None unless the map was estimated. ``learnt.NAME.value``
     and ``learnt.NAME.sigma`` exist for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
     ``timing.*`` always exist, as do ``warnings``, a list of texts.
 
     With ``align`` also ``scoring.align``, and ``causal.*`` and ``final.*`` of :data:`ALIGNED` [m, rad] after that alignment, at the
     same stamps (see :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). They are None without a reference. They
-    are None, with a warning, if the poses do not determine the alignment.
+    are None, with a warning, if the poses do not determine the alignment. A run that estimated its map is aligned by ``se2`` unless
+    ``align`` is another alignment.
     """
     causal = result.causal()
     final = result.final
@@ -118,10 +119,10 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
             figures = dict.fromkeys(ACCURACY) | {"scored": figures["scored"]}
         scores |= {f"{kind}.{name}": value for name, value in figures.items()}
     scores["time_to_localized"] = None if causal is None else float(causal.t[0] - result.t[0])
+    scores |= dict.fromkeys(OF_FREE_MAP)
     if result.config.get("settings", {}).get("landmarks") == FREE_MAP:
-        scores |= free_map_figures(final, result.learnt.landmarks, log, gap)
-    else:
-        scores |= dict.fromkeys(OF_FREE_MAP)
+        scores |= landmark_figures(final, result.learnt.landmarks, log, gap)
+        align = "se2" if align == "none" else align
     scores |= _constants(result.learnt) | _counts(result.diagnostics) | _timing(result.timings)
     if align != "none":
         scores["scoring.align"] = align
@@ -181,15 +182,15 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
     return figures
 
 
-def free_map_figures(
+def landmark_figures(
     trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log, max_gap: float = MAX_GAP
 ) -> dict[str, Any]:
     """``OF_FREE_MAP`` of a run that estimated its map.
 
-    ``aligned.*``: root mean square error of the aligned ``trajectory`` in position [m] and heading [rad]. ``landmarks.*``: of the
-    learnt landmarks that are also in the log's map, after the same alignment: their ``count``, root mean square distance ``rmse``
-    [m] and mean NEES ``anees``, ideally 2. The covariances include the uncertainty of the start, which the alignment removes, so
-    less than 2 is usual. Without a reference the landmarks themselves are aligned. None where a figure is undefined.
+    Of the learnt landmarks that are also in the log's map, after the alignment of the ``trajectory`` in the plane: their
+    ``count``, root mean square distance ``rmse`` [m] and mean NEES ``anees``, ideally 2. The covariances include the uncertainty
+    of the start, which the alignment removes, so less than 2 is usual. Without a reference the landmarks themselves are aligned.
+    None where a figure is undefined.
     """
     figures: dict[str, Any] = dict.fromkeys(OF_FREE_MAP)
     names = [name for name in landmarks if name in log.world.landmarks]
@@ -201,10 +202,6 @@ def free_map_figures(
     else:
         pair = pairs(trajectory, log.reference, max_gap)
         pose = align_points(pair.poses[:, :2], pair.truth[:, :2])
-        error = se2.compose(pose, pair.poses) - pair.truth
-        figures["aligned.position_rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
-        if log.reference.has_heading:
-            figures["aligned.heading_rmse"] = rms(se2.wrap(error[:, 2]))
     if names and np.isfinite(pose).all():
         # in the estimate's own frame, as the covariances
         error = positions - se2.transform_to(pose, truth)

@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
@@ -20,7 +19,7 @@ from uuid import uuid4
 
 from factorgraph_loc.errors import FglocError, InputError, RunFailedError
 from factorgraph_loc.experiments.execute import Executor, Files, Planned, Take, compute, failure
-from factorgraph_loc.experiments.keys import code_version, digest_of, library_versions
+from factorgraph_loc.experiments.keys import software_digest
 from factorgraph_loc.experiments.log_source import RecordedSource
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.files.data_root import DATA_ROOT
@@ -84,7 +83,7 @@ class Cluster(Executor):
         room = QUEUED * max(1, sum(self._client.nthreads().values()))
         while len(self._sent) < min(room, left) and (run := take()) is not None:
             key = f"fgloc-{run.key}-{self._session}"
-            future = self._client.submit(make, _findable(run), version_here(), self._seconds, key=key, pure=False)
+            future = self._client.submit(make, _findable(run), software_digest(), self._seconds, key=key, pure=False)
             self._sent[future] = run
 
     def finished(self) -> Iterator[tuple[str, Files]]:
@@ -126,7 +125,7 @@ def make(run: Planned, version: str, seconds: float) -> _Made:
     from distributed import get_worker  # noqa: PLC0415
 
     address = str(get_worker().address)
-    if version != version_here():
+    if version != software_digest():
         raise InputError(
             f"{address}: this worker has another version of the code, or of a library, than the experiment"
         )
@@ -147,12 +146,6 @@ def make(run: Planned, version: str, seconds: float) -> _Made:
     if isinstance(files, FglocError):
         raise files
     return _Made(files)
-
-
-@lru_cache
-def version_here() -> str:
-    """A digest of the code and the libraries of this process."""
-    return digest_of([code_version(), library_versions()])
 
 
 def _findable(run: Planned) -> Planned:

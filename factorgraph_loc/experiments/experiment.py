@@ -141,7 +141,7 @@ def prepare(
     """
     file = Path(file)
     experiment = read_experiment(file, changes)
-    folder = experiment.folder() if out is None else Path(out)
+    folder = Path(out or experiment.out or f"out/{experiment.name}")
     if (kind_of_path := kind(folder)) not in ("", "a folder"):
         raise InputError(f"{folder}: is {kind_of_path}, expected a folder for the results")
     store = Store(folder)

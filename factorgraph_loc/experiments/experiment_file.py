@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,6 +39,7 @@ from factorgraph_loc.text import listed, plain, quoted
 
 LONGEST_NAME = 200  # maximum characters of the experiment's name, which is a folder name
 MOST = 1000  # maximum number of logs, estimators, sets of sensors and metrics in a file; globs and seeds may expand to more
+MOST_RUNS = 100_000  # maximum number of runs
 NO_TIME_LIMIT = 1e9  # s: no limit of a run
 MOST_SWEPT, MOST_VALUES = 50, 10_000  # maximum number of swept settings, and of values of one
 FIRST = """\
@@ -152,25 +153,12 @@ class Sweep(FileModel):
 
     def points(self, *words: str) -> list[dict[str, Scalar]]:
         """The combinations of settings whose keys begin with one of ``words``, by default of all, without duplicates; one empty
-        combination if there are none."""
-        columns = self._columns(words)
-        combined = (
-            self._rows(columns) if self.mode == "list" else itertools.product(*map(dict.fromkeys, columns.values()))
-        )
-        return [dict(zip(columns, values, strict=True)) for values in combined]
-
-    def count(self, *words: str) -> int:
-        """The number of :meth:`points`, without constructing them."""
-        columns = self._columns(words)
+        combination if there are none. If there are more than :data:`MOST_RUNS`, only one more than that."""
+        columns = {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
+        combined: Iterable[tuple[Scalar, ...]] = itertools.product(*map(dict.fromkeys, columns.values()))
         if self.mode == "list":
-            return len(self._rows(columns))
-        return math.prod(len(set(values)) for values in columns.values())
-
-    def _columns(self, words: Sequence[str]) -> dict[str, Sequence[Scalar]]:
-        return {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
-
-    def _rows(self, columns: Mapping[str, Sequence[Scalar]]) -> Collection[tuple[Scalar, ...]]:
-        return dict.fromkeys(zip(*columns.values(), strict=True)) or [()]
+            combined = dict.fromkeys(zip(*columns.values(), strict=True)) or [()]
+        return [dict(zip(columns, values, strict=True)) for values in itertools.islice(combined, MOST_RUNS + 1)]
 
 
 class ReportSettings(FileModel):
@@ -245,10 +233,6 @@ class Experiment(FileModel):
         if baseline is not None and baseline not in labels:
             raise ValueError(f"report.baseline is {quoted(baseline)}{nearest(baseline, labels)}")
         return self
-
-    def folder(self) -> Path:
-        """The folder of the results."""
-        return Path("out", self.name) if self.out is None else Path(self.out)
 
 
 def write_new(file: Path, *, overwrite: bool = False) -> None:

@@ -66,16 +66,14 @@ def library_versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in LIBRARIES} | {"python": platform.python_version()}
 
 
+def software_digest() -> str:
+    """A digest of the code and the libraries of this process."""
+    return digest_of([code_version(), library_versions()])
+
+
 def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
     """The key of a run, from a log's digest and its effective configuration as plain data."""
-    return digest_of(
-        {
-            "log": log_digest,
-            "config": dict(config),
-            "code": code_version(),
-            "libraries": library_versions(),
-        }
-    )
+    return digest_of({"log": log_digest, "config": dict(config), "software": software_digest()})
 
 
 class VanishedError(InputError):
@@ -177,12 +175,11 @@ class Facts:
 
 def _kept(cache: Path) -> _Kept:
     """The content of a cache; empty if it is missing, damaged, or of other code or libraries."""
-    version = digest_of([code_version(), library_versions()])
     with suppress(InputError, ValidationError):
         kept = _Kept.model_validate_json(bounded.read_bytes(cache, bounded.DATA))
-        if kept.version == version:
+        if kept.version == software_digest():
             return kept
-    return _Kept(version=version)
+    return _Kept(version=software_digest())
 
 
 def _facts(log: Any) -> LogFacts:

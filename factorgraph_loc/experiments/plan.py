@@ -13,6 +13,7 @@ from typing import Any
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import SIMULATION, SWEEP
 from factorgraph_loc.experiments.experiment_file import (
+    MOST_RUNS,
     EstimatorEntry,
     Experiment,
     LogEntry,
@@ -26,8 +27,6 @@ from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
 from factorgraph_loc.model.scoring import RunConfig, check_prior
 from factorgraph_loc.text import quoted
-
-MOST_RUNS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,7 +150,8 @@ def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
     total = 0
     for entry in experiment.estimators:
         words = (entry.shown, entry.name)
-        logs = simulated * experiment.sweep.count(SIMULATION, *words) + recorded * experiment.sweep.count(*words)
+        points = experiment.sweep.points
+        logs = simulated * len(points(SIMULATION, *words)) + recorded * len(points(*words))
         seeds = 1 if facts.estimator(entry.name, {}).deterministic else len(experiment.seeds)
         total += logs * seeds * len(experiment.sensors)
     return total
@@ -159,8 +159,7 @@ def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
 
 def _check_count(count: int, experiment: Experiment) -> None:
     if count > MOST_RUNS:
-        shown = f"{count:,}" if count < 10**12 else f"{count:.1g}"
-        raise InputError(f"the experiment {experiment.name} plans {shown} runs, more than {MOST_RUNS:,}")
+        raise InputError(f"the experiment {experiment.name} plans more than {MOST_RUNS:,} runs")
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:

@@ -45,18 +45,11 @@ class StoredFile(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True)
 
 
-class FileSum(StoredFile):
-    """Size and checksum of a file."""
-
-    bytes: Whole
-    sha256: str
-
-
 class RunManifest(StoredFile):
-    """The ``key`` of a run and its ``files`` by name."""
+    """The ``key`` of a run, and the sha256 of its ``files`` by name."""
 
     key: str
-    files: dict[FileName, FileSum]
+    files: dict[FileName, str]
 
 
 class Failure(StoredFile):
@@ -159,7 +152,7 @@ class Store:
         content = self._content(path)
         if said is None and name != TIMINGS:
             raise DamagedError(f"{path}: is not in {MANIFEST}{_AGAIN}")
-        if said is not None and said.sha256 != _sha256(content):
+        if said is not None and said != _sha256(content):
             raise DamagedError(f"{path}: is damaged (its sha256 differs){_AGAIN}")
         return content
 
@@ -178,21 +171,14 @@ class Store:
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
         """Write the files of a run atomically, replacing existing ones; its claim must be held."""
-        said = {
-            name: {"bytes": len(content), "sha256": _sha256(content)}
-            for name, content in files.items()
-            if name != TIMINGS
-        }
+        said = {name: _sha256(content) for name, content in files.items() if name != TIMINGS}
         manifest = json.dumps({"key": key, "files": said}, indent=1).encode()
         temporary = self.folder / "tmp" / key
         with self._writing():
             _remove(temporary)
             (temporary / "run").mkdir(parents=True)
             try:
-                for name, content in (
-                    *files.items(),
-                    (MANIFEST, manifest),
-                ):  # the manifest last, so that none is younger
+                for name, content in (*files.items(), (MANIFEST, manifest)):
                     _write(temporary / "run" / name, content)
                 _sync(temporary / "run")
                 if self.path(key).parent.is_file():

@@ -196,10 +196,12 @@ def test_aligned_figures_only_where_the_map_was_free(landmarks):
     scores = score(result, log_of(t, truth))
     assert scores["final.position_rmse"] > 1.0
     if landmarks == "unknown":
-        assert scores["aligned.position_rmse"] == pytest.approx(0.0, abs=1e-9)
+        assert scores["final.aligned_position_rmse"] == pytest.approx(0.0, abs=1e-9)
+        assert scores["final.aligned_rotation_rmse"] == pytest.approx(0.0, abs=1e-7)
         assert scores["landmarks.count"] == 0
     else:
         assert all(scores[name] is None for name in OF_FREE_MAP)
+        assert "final.aligned_position_rmse" not in scores
 
 
 def test_innovations_without_degrees_of_freedom_say_nothing():

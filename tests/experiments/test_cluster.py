@@ -113,7 +113,7 @@ def test_the_command_takes_a_scheduler(workers, planned, tmp_path):
 
 def test_workers_with_other_code_are_refused(workers, planned, stored, monkeypatch):
     runs, folder = planned(1)
-    monkeypatch.setattr(cluster, "version_here", lambda: "of another day")
+    monkeypatch.setattr(cluster, "software_digest", lambda: "of another day")
     with pytest.raises(InputError, match="another version of the code"):
         list(execute(runs, folder, Cluster(workers.scheduler_address, Limits())))
     assert not stored

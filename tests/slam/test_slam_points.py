@@ -172,7 +172,7 @@ def test_a_few_named_points_close_a_loop():
     changed = {"world": {"tags": 1, "points": 150}, "pixels": {"rate": 5.0}, "drive": {"duration": 200.0}}
     log = fgloc.simulate("office", 104, changes=changed)
     result = run(log, RunConfig("smoother", UNKNOWN, ("odometry", "sightings")))
-    assert score(result, log)["aligned.position_rmse"] < 0.16
+    assert score(result, log)["final.aligned_position_rmse"] < 0.16
 
 
 def test_points_without_a_map_tell_the_time_offset():

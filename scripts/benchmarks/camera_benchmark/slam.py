@@ -76,8 +76,8 @@ def table(report: Report, found: Attempts) -> None:
 def aligned_cells(found: Attempts, label: str) -> tuple[str, str]:
     runs: list[Attempt] = [runs[label] for runs in found.values() if label in runs and not runs[label].failure]
     cells = []
-    for what, unit in (("position", 1.0), ("heading", 180.0 / np.pi)):
-        values = [one.figures.get(f"aligned.{what}_rmse") for one in runs]
+    for what, unit in (("position", 1.0), ("rotation", 180.0 / np.pi)):
+        values = [one.figures.get(f"final.aligned_{what}_rmse") for one in runs]
         known = [value for value in values if value is not None]
         cells.append(f"{unit * pooled_rms(known):.4f}" if known else NOTHING)
     return cells[0], cells[1]

@@ -13,6 +13,7 @@ from factorgraph_loc.evaluation.statistics import pooled_rms
 from factors.se2 import Array
 
 SMOOTHER = "smoother"
+RMSE = {"causal": "causal.position_rmse", "final": "final.position_rmse", "aligned": "final.aligned_position_rmse"}
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Case:
 
     def error(self, label: str, kind: str) -> float | None:
         """Position RMSE [m], pooled over logs; ``kind`` is causal, final or aligned. None without scores."""
-        scores = self.scores(label, f"{kind}.position_rmse")
+        scores = self.scores(label, RMSE[kind])
         return pooled_rms(list(scores.values())) if scores else None
 
     def anees(self, label: str, kind: str) -> float | None:
@@ -62,7 +63,7 @@ class Case:
 
     def ratio(self, above: tuple[str, str], below: tuple[str, str]) -> Ratio | None:
         """The ratio of position RMSEs, each of a label and a kind, paired by log. None without a log that has both."""
-        a, b = (self.scores(label, f"{kind}.position_rmse") for label, kind in (above, below))
+        a, b = (self.scores(label, RMSE[kind]) for label, kind in (above, below))
         logs = [log for log in a if log in b]
         return rmse_ratio(_of(a, logs), _of(b, logs)) if logs else None
 

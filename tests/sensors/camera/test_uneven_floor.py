@@ -75,7 +75,7 @@ def test_covariances_hold_where_the_points_are_estimated_too():
     for seed in SEEDS:
         log = uneven(simulate(seconds=20.0, seed=seed, limit=60))
         scores = score(run(log, RunConfig("smoother", {"landmarks": "unknown"})), log)
-        found.append([scores[figure] for figure in ("aligned.position_rmse", "causal.anees", "final.anees")])
+        found.append([scores[figure] for figure in ("final.aligned_position_rmse", "causal.anees", "final.anees")])
     position, causal, final = np.mean(found, axis=0)
     assert position < 0.1  # of 0.25 where the points take the tilt for theirs
     # of three drives, whose errors come from one drift each: five standard deviations of 9 degrees of freedom are below 10
