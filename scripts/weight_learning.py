@@ -11,9 +11,9 @@ import numpy as np
 from factorgraph_loc.evaluation.features.repeatability import alike_regions, common
 from factorgraph_loc.evaluation.features.sequences import Sequence
 from factorgraph_loc.files.models import replacing
-from factorgraph_loc.vision.colour import Float
 from factorgraph_loc.vision.colour_features import ColourExtractor, Weights
 from factorgraph_loc.vision.descriptor import OWN_SCALE, VALUES, values
+from factorgraph_loc.vision.keypoints import Float
 from factors.se2 import Array
 
 COUNT = 1000  # points per image

@@ -20,10 +20,10 @@ from factorgraph_loc.fusion.base import Estimator
 from factorgraph_loc.fusion.guarded import Guard, sound
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.map_frame import MapFrame
 from factorgraph_loc.model.measurement import Measurement, Rows, Tick
 from factorgraph_loc.model.result import Timings
 from factorgraph_loc.model.scoring import Ticks
+from factorgraph_loc.model.setup import MapFrame
 from factorgraph_loc.sensors.camera.use import PreparedLog
 from factorgraph_loc.text import listed
 from factors.se2 import Array

@@ -8,7 +8,7 @@ from factorgraph_loc.evaluation.metrics import FEWEST_SCORED
 from factorgraph_loc.evaluation.pairing import pairs
 from factorgraph_loc.model.belief import Status
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.map_frame import MapFrame
+from factorgraph_loc.model.setup import MapFrame
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import detecting
 

@@ -30,10 +30,10 @@ from factorgraph_loc.io.checks import require_bounds, require_one_span
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.map_frame import MapFrame
 from factorgraph_loc.model.measurement import TURN
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.scoring import RunConfig, Ticks, check_max_gap, check_tick_gap
+from factorgraph_loc.model.setup import MapFrame
 from factorgraph_loc.sensors.camera.use import PreparedLog, prepare
 from factorgraph_loc.sensors.interfaces import Ending, Use
 from factorgraph_loc.sensors.registry import detecting, functions, moving

@@ -22,10 +22,10 @@ from factorgraph_loc.fusion.guarded import Guard, sound, sound_belief, sound_tra
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.map_frame import MapFrame
 from factorgraph_loc.model.measurement import Measurement, Tick, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.scoring import Ticks
+from factorgraph_loc.model.setup import MapFrame
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_loc.mapping.tag_observations import TagObservations
+from factorgraph_loc.mapping.tag_slam import TagObservations
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

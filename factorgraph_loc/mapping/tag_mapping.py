@@ -13,9 +13,8 @@ from factorgraph_loc.errors import InputError, RunFailedError
 from factorgraph_loc.mapping import mapping
 from factorgraph_loc.mapping.mapping import LandmarkMap
 from factorgraph_loc.mapping.tag_focusing import focused
-from factorgraph_loc.mapping.tag_observations import TagObservations, tag_observations
 from factorgraph_loc.mapping.tag_search import TagMode, TagPosterior, search
-from factorgraph_loc.mapping.tag_slam import tag_slam
+from factorgraph_loc.mapping.tag_slam import TagObservations, tag_observations, tag_slam
 from factorgraph_loc.model.belief import EXACT_SIGMA, LearntPoint, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory

@@ -4,7 +4,6 @@ __all__ = [
     "belief",
     "diagnostics",
     "log",
-    "map_frame",
     "measurement",
     "planar",
     "pose_path",

@@ -16,8 +16,7 @@ from factorgraph_loc.processes import run_each
 from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.interfaces import times as times_of
-from factorgraph_loc.simulation.renderer import Image, Renderer
-from factorgraph_loc.simulation.scene import make_scene
+from factorgraph_loc.simulation.renderer import Image, Renderer, make_scene
 from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.simulation.simulate import drive, generator, with_sensors
 from factorgraph_loc.simulation.worlds import LOWEST_BOX, make_plan, make_world

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.simulation.scene import LEVELS
 from factors.compiled import compiled
 from factors.se2 import Array
 
 BINS = 2048  # directions in the plan
+LEVELS = 7  # mip levels of a texture, including the first
 TAPS = 4  # maximum number of texture samples on an oblique surface
 STEEPEST = 1e3  # maximum slant
 SLACK = 1e-9  # m, overlap of adjacent faces

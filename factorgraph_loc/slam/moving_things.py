@@ -8,7 +8,7 @@ to agree with the odometry then agree with that turn, too. If some tracks agree 
 a moving thing, even if they are the majority.
 """
 
-from collections.abc import Hashable, Mapping, Sequence, Set
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,22 +30,18 @@ FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m, and how many distances of a p
 
 
 class MovingThings:
-    """Remembers the last images, and which tracks move or stand still."""
+    """Remembers the last images, and which tracks stand still; ``moving``: the tracks of these images on moving things."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
         self._images: list[tuple[Keyframe, Mapping[Hashable, Array]]] = []
-        self._moving: set[Hashable] = set()
+        self.moving: set[Hashable] = set()
         self._steady: set[Hashable] = set()  # tracks that agreed with the wheels
         self._doubts = False
 
-    def moving(self) -> Set[Hashable]:
-        """The tracks of the last images on moving things."""
-        return self._moving
-
     def is_static(self, name: Hashable) -> bool:
         """Whether a track is static. While something moves, such a track must have agreed with the odometry."""
-        return name not in self._moving and (not self._doubts or name in self._steady)
+        return name not in self.moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
         """Learn from the tracks ``names``, seen at ``pixels`` (K, 2) from a keyframe."""
@@ -56,9 +52,9 @@ class MovingThings:
                 self._compare(old_pixels, new_pixels, graph.between(old_keyframe, keyframe))
         self._images.append((keyframe, new_pixels))
         known = set[Hashable]().union(*(pixels_by_name for _, pixels_by_name in self._images))
-        self._moving &= known
+        self.moving &= known
         self._steady &= known
-        self._doubts = not self._moving.isdisjoint(names)
+        self._doubts = not self.moving.isdisjoint(names)
 
     def _compare(self, old: Mapping[Hashable, Array], new: Mapping[Hashable, Array], step: Increment) -> None:
         """Learn from the common tracks of two images, pixels by name, and the ``step`` of the odometry between these."""
@@ -68,12 +64,12 @@ class MovingThings:
         first, second = (np.array([by_name[name] for name in common]) for by_name in (old, new))
         right = fitting(self._model, first, second, step)
         with_other_turn = another(self._model, first, second, step, right)
-        known = np.array([name in self._moving for name in common])
+        known = np.array([name in self.moving for name in common])
         many = 2 * np.count_nonzero(known & ~right) > np.count_nonzero(~right)
         moves = with_other_turn.any() and (many or np.count_nonzero(right & ~with_other_turn) >= ENOUGH)
         self._steady.update(name for name, fits in zip(common, right.tolist(), strict=True) if fits)
         if moves:
-            self._moving.update(name for name, fits in zip(common, right.tolist(), strict=True) if not fits)
+            self.moving.update(name for name, fits in zip(common, right.tolist(), strict=True) if not fits)
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:

@@ -69,37 +69,30 @@ class TriangulatedPoint:
 
 
 class NewPoints:
-    """The collected sightings of points that are not initialized yet, by name or number of the point."""
+    """The collected sightings of points that are not initialized yet, ``waiting`` by name or number of the point."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
-        self._waiting: dict[Hashable, list[PointSighting]] = {}
-
-    def __len__(self) -> int:
-        return len(self._waiting)
+        self.waiting: dict[Hashable, list[PointSighting]] = {}
 
     def count(self, name: Hashable) -> int:
         """The number of collected sightings of a point."""
-        return len(self._waiting.get(name, ()))
-
-    def waiting(self) -> Mapping[Hashable, Sequence[PointSighting]]:
-        """All collected sightings."""
-        return self._waiting
+        return len(self.waiting.get(name, ()))
 
     def add(self, name: Hashable, sighting: PointSighting) -> None:
         """Add a sighting; the oldest ones are dropped."""
-        waiting = self._waiting.setdefault(name, [])
+        waiting = self.waiting.setdefault(name, [])
         waiting.append(sighting)
         del waiting[:-MAX_WAITING]
 
     def those(self, trusted: Callable[[Hashable], bool]) -> Mapping[Hashable, Sequence[PointSighting]]:
         """The collected sightings of ``trusted`` points."""
-        return {name: sightings for name, sightings in self._waiting.items() if trusted(name)}
+        return {name: sightings for name, sightings in self.waiting.items() if trusted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
         """Drop the points that were last seen long before a keyframe, and the ``wrong`` ones."""
         since = keyframe - PATIENCE
-        self._waiting = {k: v for k, v in self._waiting.items() if v[-1].keyframe >= since and k not in wrong}
+        self.waiting = {k: v for k, v in self.waiting.items() if v[-1].keyframe >= since and k not in wrong}
 
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000
@@ -111,7 +104,7 @@ class NewPoints:
         determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}
         for name in names:
-            waiting = self._waiting.get(name, [])
+            waiting = self.waiting.get(name, [])
             if len(waiting) < FEWEST or len(determined) >= most:
                 continue
             for sighting in waiting:
@@ -122,7 +115,7 @@ class NewPoints:
                 continue
             result = agreed(self._model, [s for s, _ in placed], [p for _, p in placed])
             if result is not None:
-                del self._waiting[name]
+                del self.waiting[name]
                 determined.append((name, *result))
         return determined
 

@@ -44,7 +44,7 @@ class PointMapper(UnknownPoints):
         """Whether an image has little in common with that of the last keyframe."""
         if m.frame is None or not self._tracks:
             return False
-        tracks = set(m.frame.tracks.tolist()) - self._things.moving()
+        tracks = set(m.frame.tracks.tolist()) - self._things.moving
         return len(tracks & self._tracks) < LEAST_COMMON * len(tracks)
 
     def take(self, m: Pixels, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
@@ -55,7 +55,7 @@ class PointMapper(UnknownPoints):
         else:
             names, used = m.frame.tracks.tolist(), set(points.used.tolist())
         self._things.learn(keyframe, names, m.pixels, graph)
-        moving = self._things.moving()
+        moving = self._things.moving
         used |= {i for i, name in enumerate(names) if name in moving}
         self._taken = m.t
         if m.frame is not None:

@@ -170,13 +170,13 @@ class UnknownPoints(Mapper):
         fresh = [i for i, name in enumerate(chosen.names) if name not in self._points]
         for i in fresh:
             self._new.add(chosen.names[i], chosen.sightings[i])
-        self._new.forget(keyframe.index, movers.moving())
+        self._new.forget(keyframe.index, movers.moving)
         waiting = [
             n for i in fresh if self._new.count(n := chosen.names[i]) >= FEWEST_SIGHTINGS and movers.is_static(n)
         ]
         bundle = self._cameras.bundled(keyframe, guess[0], self._new.those(movers.is_static), self._floor.sigma, graph)
         cameras, pose = bundle or (
-            self._cameras.cameras(keyframe, guess[0], waiting, self._new.waiting(), graph),
+            self._cameras.cameras(keyframe, guess[0], waiting, self._new.waiting, graph),
             guess[0],
         )
         for name, point, sightings in self._new.ready(waiting, cameras.get, most):

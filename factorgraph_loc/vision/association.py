@@ -19,16 +19,14 @@ from scipy.spatial.distance import cdist
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.vision.consensus import CameraPose, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.keypoints import Descriptors, Integers
+from factorgraph_loc.vision.keypoints import Descriptors, Float, Integers
 from factorgraph_loc.vision.matching import distance_matrix
-from factorgraph_loc.vision.relocalization import KeyframeLooks, located
+from factorgraph_loc.vision.relocalization import KeyframeLooks, as_numbers, located
 from factors import chi_squared
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.compiled import compiled
 from factors.se2 import Array
-
-BITS = np.array([bin(i).count("1") for i in range(256)], dtype=np.int64)
 
 RATIO, GLOBAL_RATIO = 0.85, 0.8
 NEAREST, FARTHEST = 0.2, 50.0  # m, of points that are searched
@@ -79,7 +77,8 @@ class Associator:
         self._owners = points.owners[order]
         self._starts = np.searchsorted(self._owners, np.arange(len(points) + 1)).astype(np.int64)
         self._seen_from = np.ascontiguousarray(points.seen_from[order], dtype=float)
-        self._descriptors: Descriptors = np.ascontiguousarray(points.descriptors[order])
+        self._descriptors: Descriptors = points.descriptors[order]
+        self._numbers = _numbers(self._descriptors)
         self._places: KeyframeLooks | None = None
         self._largest_cost = self._cost_limit()
         corners = np.array(((-0.5, -0.5), (model.width, -0.5), (-0.5, model.height), (model.width, model.height)))
@@ -180,12 +179,7 @@ class Associator:
         return owners[best[kept]], np.flatnonzero(kept)
 
     def _costs(self, pairs: Integers, begins: Integers, views: Integers, frame_descriptors: Descriptors) -> Array:
-        if self._binary:
-            costs = bit_distances(pairs, begins, views, self._descriptors, frame_descriptors, BITS)
-        else:
-            frame_descriptors = np.ascontiguousarray(frame_descriptors, dtype=np.float32)
-            costs = distances(pairs, begins, views, self._descriptors, frame_descriptors)
-        return np.asarray(costs)
+        return np.asarray(distances(pairs, begins, views, self._numbers, _numbers(frame_descriptors)))
 
     def _cost_limit(self) -> float:
         """Upper limit of the cost of a match: few pairs of views of different points are below it."""
@@ -198,6 +192,10 @@ class Associator:
             return math.inf
         limit = float(np.quantile(different, CHANCE))
         return limit if self._binary else limit**2
+
+
+def _numbers(descriptors: Descriptors) -> Float:
+    return np.ascontiguousarray(as_numbers(descriptors), dtype=np.float32)
 
 
 def _gates(covariances: Array) -> tuple[Array, Array]:
@@ -263,7 +261,7 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
 @compiled(fastmath=True)
 def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any) -> Array:
-    """Squared distance (N,) of each pair's feature from the nearest view of its point.
+    """Squared distance (N,) of each pair's feature from the nearest view of its point; of bits it is the Hamming distance.
 
     ``frame_descriptors`` (K, D): of the features; ``known`` (V, D): of the views.
     """
@@ -277,23 +275,6 @@ def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, fr
             total = np.float32(0.0)
             for d in range(size):
                 total += (f[d] - k[d]) * (f[d] - k[d])
-            best = min(best, total)
-        out[i] = best
-    return out
-
-
-@compiled
-def bit_distances(
-    pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any, bits: Integers
-) -> Array:
-    """As :func:`distances`, with the Hamming distance."""
-    out = np.empty(len(pairs))
-    for i in range(len(pairs)):
-        best = 1 << 30
-        for j in range(begins[pairs[i, 0]], begins[pairs[i, 0] + 1]):
-            total = 0
-            for d in range(known.shape[1]):
-                total += bits[frame_descriptors[pairs[i, 1], d] ^ known[views[j], d]]
             best = min(best, total)
         out[i] = best
     return out

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from factorgraph_loc.vision.colour import Float
-from factorgraph_loc.vision.keypoints import Integers, Keypoints
+from factorgraph_loc.vision.keypoints import Float, Integers, Keypoints
 from factorgraph_loc.vision.scale_space import ScaleSpace
 from factors.se2 import Array
 

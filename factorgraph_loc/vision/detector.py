@@ -10,7 +10,6 @@ multi-scale oriented patches", CVPR 2005, section 2.1)."""
 import cv2
 import numpy as np
 
-from factorgraph_loc.vision.colour import Float
 from factorgraph_loc.vision.kernels import (
     Int32,
     corner_strength,
@@ -19,7 +18,7 @@ from factorgraph_loc.vision.kernels import (
     refined_peaks,
     structure_tensor,
 )
-from factorgraph_loc.vision.keypoints import PARTS, Keypoints, spread_out
+from factorgraph_loc.vision.keypoints import PARTS, Float, Keypoints, spread_out
 from factorgraph_loc.vision.scale_space import SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
 from factors.se2 import Array
 

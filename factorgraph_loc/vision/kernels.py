@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.vision.colour import Float
+from factorgraph_loc.vision.keypoints import Float
 from factors.compiled import compiled
 from factors.se2 import Array
 

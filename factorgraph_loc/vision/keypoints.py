@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from factors.se2 import Array
 
+Float = NDArray[np.float32]
 Integers = NDArray[np.int64]
 Descriptors = NDArray[Any]
 

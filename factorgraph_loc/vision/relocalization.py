@@ -166,7 +166,7 @@ class KeyframeLooks:
     def __init__(self, descriptors: Descriptors, seen_from: Array) -> None:
         _, self._of = np.unique(seen_from, axis=0, return_inverse=True)
         self._of = self._of.ravel()
-        values = _values(descriptors)
+        values = as_numbers(descriptors)
         sample = values[np.linspace(0, len(values) - 1, min(SAMPLE, len(values))).astype(np.int64)]
         begin = sample[np.linspace(0, len(sample) - 1, min(WORDS, len(sample))).astype(np.int64)]
         with warnings.catch_warnings(action="ignore"):  # of words that nothing is nearest to, which stay where they are
@@ -178,7 +178,7 @@ class KeyframeLooks:
 
     def views(self, descriptors: Descriptors) -> Integers:
         """The rows of the map's descriptors that the keyframes see that are most like an image with ``descriptors`` (N, D)."""
-        (description,) = self._described(_values(descriptors), np.zeros(len(descriptors), dtype=np.int64))
+        (description,) = self._described(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)
         alike[np.argsort(-(self._looks @ description), kind="stable")[:NEAREST]] = True
         return np.flatnonzero(alike[self._of])
@@ -193,7 +193,7 @@ class KeyframeLooks:
         return np.asarray(flat / np.maximum(np.linalg.norm(flat, axis=1), 1e-9)[:, None])
 
 
-def _values(descriptors: Descriptors) -> Array:
+def as_numbers(descriptors: Descriptors) -> Array:
     """Descriptors as real numbers, with a number for each bit of binary ones."""
     if descriptors.dtype == np.uint8:
         descriptors = np.unpackbits(descriptors, axis=1)

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from factorgraph_loc.vision.colour import Float
 from factorgraph_loc.vision.images import MIN_SIDE
 from factorgraph_loc.vision.kernels import sample_patches
-from factorgraph_loc.vision.keypoints import Integers
+from factorgraph_loc.vision.keypoints import Float, Integers
 from factors.se2 import Array
 
 SCALES = 4  # characteristic scales of an octave

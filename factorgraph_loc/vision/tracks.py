@@ -11,8 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from factorgraph_loc.vision.colour import Float
-from factorgraph_loc.vision.keypoints import Descriptors, Integers
+from factorgraph_loc.vision.keypoints import Descriptors, Float, Integers
 from factorgraph_loc.vision.matching import Truths, match
 from factors.camera.model import CameraModel, undistorted
 from factors.se2 import Array

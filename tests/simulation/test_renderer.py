@@ -9,8 +9,7 @@ import pytest
 
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.simulation import preset
-from factorgraph_loc.simulation.renderer import Renderer
-from factorgraph_loc.simulation.scene import ROOM_HEIGHT, make_scene
+from factorgraph_loc.simulation.renderer import ROOM_HEIGHT, Renderer, make_scene
 from factorgraph_loc.simulation.settings import ImageSettings
 from factorgraph_loc.simulation.worlds import LOWEST_BOX, Plan, make_plan
 from factors.camera import model as reprojection

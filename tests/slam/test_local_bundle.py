@@ -5,7 +5,7 @@ import numpy as np
 
 from factorgraph_loc.fusion.graph.graph import Keyframe
 from factorgraph_loc.fusion.graph.problem import Problem
-from factorgraph_loc.slam.local_bundle import LocalBundle, bundled
+from factorgraph_loc.slam.keyframe_cameras import LocalBundle, bundled
 from factorgraph_loc.slam.new_points import sightings_of
 from factors import se2
 from factors.camera import model as reprojection

@@ -93,7 +93,7 @@ def test_a_point_waits_for_three_sightings_and_for_parallax() -> None:
     assert name == "a"
     assert [s.keyframe for s in sightings] == [0, 1, 2, 3, 4]
     np.testing.assert_allclose(found.position, POINT, atol=1e-5)
-    assert len(waiting) == 0
+    assert not waiting.waiting
 
 
 def test_a_wrong_sighting_is_left_out() -> None:

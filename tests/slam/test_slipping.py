@@ -121,9 +121,9 @@ def test_an_object_that_has_most_of_the_tracks_is_seen_to_move(across):
     for seed in SEEDS:
         things = looked(seed, across=across)
         # a few features of either agree with both motions
-        assert len(things.moving() & {f"object{i}" for i in range(OBJECT)}) > 0.8 * OBJECT
+        assert len(things.moving & {f"object{i}" for i in range(OBJECT)}) > 0.8 * OBJECT
         assert sum(things.is_static(f"room{i}") for i in range(ROOM)) >= 0.9 * ROOM
-        assert not any(things.is_static(name) for name in things.moving())
+        assert not any(things.is_static(name) for name in things.moving)
         assert not things.is_static("new")
 
 
@@ -131,7 +131,7 @@ def test_an_object_that_is_too_slow_for_one_step_is_seen_to_move_over_several():
     """Its motion in one step may be an error of the wheels."""
     for seed in SEEDS:
         things = looked(seed, across=SLOW, images=4)
-        assert len(things.moving() & {f"object{i}" for i in range(OBJECT)}) > 0.8 * OBJECT
+        assert len(things.moving & {f"object{i}" for i in range(OBJECT)}) > 0.8 * OBJECT
         assert sum(things.is_static(f"room{i}") for i in range(ROOM)) >= 0.8 * ROOM
 
 
@@ -139,6 +139,6 @@ def test_an_object_that_is_too_slow_for_one_step_is_seen_to_move_over_several():
 def test_wheels_that_slip_are_no_moving_thing(slid):
     for seed in SEEDS:
         things = looked(seed, slid=slid, room=60, count=0)
-        assert not things.moving()
+        assert not things.moving
         assert things.is_static("room0")
         assert things.is_static("new")

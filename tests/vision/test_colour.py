@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from factorgraph_loc.vision.colour import colour_channels
+from factorgraph_loc.vision.colour_features import colour_channels
 
 
 def test_channels_are_the_published_combinations_of_red_green_and_blue() -> None:

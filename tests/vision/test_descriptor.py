@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.vision import descriptor
-from factorgraph_loc.vision.colour import colour_channels
-from factorgraph_loc.vision.colour_features import ColourExtractor
+from factorgraph_loc.vision.colour_features import ColourExtractor, colour_channels
 from factorgraph_loc.vision.descriptor import LOG_SCALES, OWN_SCALE, RECORD, VALUES, records, values
 from factorgraph_loc.vision.images import as_image
 from factorgraph_loc.vision.keypoints import Keypoints

@@ -124,13 +124,12 @@ class Window(FullHistory):
     def __init__(
         self, parameters: gtsam.ISAM2Params, threshold: float, on_failure: Callable[[str], None], lag: float
     ) -> None:
-        parameters.setRelinearizeThreshold(threshold)
+        super().__init__(parameters, threshold, on_failure)
         self.lag = lag
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
-        self._ours = LinearFactors(threshold, parameters.relinearizeSkip, on_failure)
         self._stamps: dict[int, float] = {}  # of the variables that may leave
-        # at the last marginalisation: all factors, linearisation points of iSAM2, those of a new window, and slots of our
-        # factors
+        # at the begin or the last marginalisation: all factors, linearisation points of iSAM2, those of a new window, and slots of
+        # our factors
         self._left: _State = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
@@ -138,19 +137,9 @@ class Window(FullHistory):
         for node in nodes:
             if is_point(node.keys[-1]):  # points leave when they are seen no more
                 stamps[node.keys[-1]] = t
-        self._add((), nodes, values, stamps)
+        self.begin((), nodes, values, stamps)
 
     def begin(
-        self,
-        factors: Sequence[gtsam.NonlinearFactor],
-        nodes: Sequence[Node],
-        values: Values,
-        stamps: Mapping[int, float],
-    ) -> None:
-        self._add(factors, nodes, values, stamps)
-        self._left = self._state()
-
-    def _add(
         self,
         factors: Sequence[gtsam.NonlinearFactor],
         nodes: Sequence[Node],
@@ -179,7 +168,7 @@ class Window(FullHistory):
         for key in leaving:
             del self._stamps[key]
             self._ours.forget(key)
-        if leaving:
+        if leaving or not self._left[0].size():
             self._left = self._state()
 
     def value(self, key: int) -> Array:

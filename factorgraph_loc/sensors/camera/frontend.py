@@ -36,7 +36,6 @@ from factors.camera.model import CameraModel
 
 # what features depend on, and what tracks depend on in addition
 FEATURE_CODE = (
-    "colour.py",
     "colour_features.py",
     "descriptor.py",
     "detector.py",
