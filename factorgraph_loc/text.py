@@ -1,9 +1,11 @@
-"""Safe display of names and values of foreign origin: bounded length, one line, no control characters."""
+"""Notices, and the safe display of names and values of foreign origin: bounded length, one line, no control characters."""
 
 import json
 import math
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from string import Formatter
 from typing import Any
 
 from pydantic_core import to_jsonable_python
@@ -16,6 +18,33 @@ ITEMS = 5  # items shown of a value that is a list or a table
 DEPTH = 3  # nesting levels shown of a value
 LONG_NUMBER = 40  # digits above which an integer is described instead of printed
 CUT = "..."
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A warning or note of a ``kind``, such as ``late_rows``. Printed, it is its ``sentence`` with the ``fields`` in the braces."""
+
+    kind: str
+    sentence: str
+    fields: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        return plain(self.sentence.format(**self.fields), None)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+    def about(self, name: str) -> "Notice":
+        """The notice with the ``name`` of its log or file in front."""
+        return Notice(self.kind, "{about}: " + self.sentence, {"about": name, **self.fields})
+
+
+def notice(kind: str, sentence: str, *values: object) -> Notice:
+    """A notice with the ``values`` of its fields, numbers and texts, in the order of the names in the ``sentence``."""
+    names = dict.fromkeys(name for _, name, _, _ in Formatter().parse(sentence) if name)
+    numbers = (value.item() if hasattr(value, "item") else value for value in values)
+    plainly = (value if isinstance(value, int | float | str) else str(value) for value in numbers)
+    return Notice(kind, sentence, dict(zip(names, plainly, strict=True)))
 
 
 def number(value: float | None, digits: int = 4) -> str:

@@ -19,6 +19,7 @@ from factorgraph_loc.sensors.odometry.simulation import wheel_odometry
 from factorgraph_loc.sensors.rfid.map import TagsFile, read_tags
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, ends_of, rounds_from_gaps
+from factorgraph_loc.text import Notice, notice
 from factors import se2
 
 ANTENNAS = ("first", "second", "third")
@@ -63,7 +64,7 @@ def read_reference(path: Path) -> tuple[Trajectory, int]:
     return Trajectory(checks.seconds(t_ns[keep], int(t_ns[0])), poses[keep]), int(t_ns[0])
 
 
-def read_reads(folder: Path, t0_ns: int, end: float) -> tuple[RfidStream, tuple[str, ...]]:
+def read_reads(folder: Path, t0_ns: int, end: float) -> tuple[RfidStream, tuple[Notice, ...]]:
     """The inventory rounds of all antennas that are within the odometry, 0 to ``end`` seconds, and warnings."""
     tables = [np.loadtxt(folder / f"{antenna}.txt", dtype=str, ndmin=2).reshape(-1, 8) for antenna in ANTENNAS]
     table = np.concatenate(tables)
@@ -77,7 +78,8 @@ def read_reads(folder: Path, t0_ns: int, end: float) -> tuple[RfidStream, tuple[
     first = np.searchsorted(number, np.arange(len(end_ns)))
     whole = (t_ns[first] >= t0_ns) & ((end_ns - t0_ns) / 1e9 <= end)
     keep = whole[number]
-    left_out = f"{folder}: {np.count_nonzero(~keep)} of {len(keep)} reads are outside of the reference and skipped"
+    sentence = "{source}: {outside} of {reads} reads are outside of the reference and skipped"
+    left_out = notice("outside_reference", sentence, folder, np.count_nonzero(~keep), len(keep))
     reads = ReadsByRound(
         t_ns[keep],
         (np.cumsum(whole) - 1)[number[keep]],

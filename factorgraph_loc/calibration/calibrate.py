@@ -14,7 +14,7 @@ from factorgraph_loc.model.measurement import are_alike
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.smoothed import Traced
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import Notice, listed, notice
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Calibration:
     """Result of a calibration.
 
     ``rig``: the learnt one, or the ``input_rig`` if it was ``refused`` for this reason. ``knowledge``: of all logs. ``trials``:
-    scores on held-out logs, empty if logs have no reference or are too short. ``doubts``: warnings, one line each.
+    scores on held-out logs, empty if logs have no reference or are too short. ``doubts``: warnings.
     """
 
     logs: tuple[str, ...]
@@ -31,7 +31,7 @@ class Calibration:
     knowledge: Knowledge
     trials: tuple[Trial, ...]
     refused: str
-    doubts: tuple[str, ...]
+    doubts: tuple[Notice, ...]
 
 
 def calibrate(
@@ -69,27 +69,25 @@ def calibrate(
     refused = refusal(trials) if trials else "the logs are too short to hold out parts of them"
     doubts = [*knowledge.notes, *_doubted(trials)]
     if not has_heading(logs[0]):
-        doubts.append("The reference has no headings: only the range scale is learnt.")
+        doubts.append(notice("no_headings", "The reference has no headings: only the range scale is learnt."))
     if len(logs) == 1:
-        doubts.append("One log does not show differences between runs: the uncertainties are those of the input rig.")
+        sentence = "One log does not show differences between runs: the uncertainties are those of the input rig."
+        doubts.append(notice("one_log", sentence))
     if refused:
-        doubts.append(f"The input rig is kept: {refused}.")
+        doubts.append(notice("refused", "The input rig is kept: {why}.", refused))
     return Calibration(
         names, start, start if refused else knowledge.rig, knowledge, tuple(trials), refused, tuple(doubts)
     )
 
 
-def _doubted(trials: Sequence[Trial]) -> list[str]:
-    """Elements of the map that the smoother doubts on held-out logs, one line for each kind."""
+def _doubted(trials: Sequence[Trial]) -> list[Notice]:
+    """Elements of the map that the smoother doubts on held-out logs, a warning for each kind."""
     doubted: dict[str, dict[str, None]] = {}
     for trial in trials:
         for kind, names in trial.doubted.items() if trial.estimator == "smoother" else ():
             doubted.setdefault(kind, {}).update(dict.fromkeys(names))
-    return [
-        f"The smoother doubts the map on held-out logs: {kind.replace('_', ' ')} {listed(names)}."
-        for kind, names in doubted.items()
-        if names
-    ]
+    sentence = "The smoother doubts the map on held-out logs: {kind} {names}."
+    return [notice(kind, sentence, kind.replace("_", " "), listed(names)) for kind, names in doubted.items() if names]
 
 
 def check(logs: Sequence[Log], *, blind: bool = False) -> None:

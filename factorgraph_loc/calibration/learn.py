@@ -11,6 +11,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Calibrator, SensorKnowledge
 from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.sensors.smoothed import Traced
+from factorgraph_loc.text import Notice, notice
 
 SETTLED = 0.3  # standard errors that the last turn may change
 
@@ -32,14 +33,12 @@ class Knowledge:
         return tuple(constant for sensor in self.sensors.values() for constant in sensor.constants)
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """Warnings, one line each."""
+    def notes(self) -> tuple[Notice, ...]:
+        """The warnings."""
         notes = [note for sensor in self.sensors.values() for note in sensor.notes]
         if self.turns and self.turns[-1] >= SETTLED:
-            notes.append(
-                f"The last of {len(self.turns)} turns still changed a value by {self.turns[-1]:.1f} standard errors: the logs "
-                "hardly determine it."
-            )
+            change = "The last of {turns} turns still changed a value by {change:.1f} standard errors: "
+            notes.append(notice("unsettled", change + "the logs hardly determine it.", len(self.turns), self.turns[-1]))
         return tuple(notes)
 
 

@@ -10,7 +10,7 @@ import typer
 
 from factorgraph_loc.cli import show
 from factorgraph_loc.cli.options import DataRoot, Json, LogName, LogOptions, takes_options
-from factorgraph_loc.text import number
+from factorgraph_loc.text import number, one_line
 
 if TYPE_CHECKING:
     from factorgraph_loc.evaluation.inspect import Inspection, StreamSummary
@@ -133,7 +133,7 @@ def _print(log: Log, inspection: Inspection) -> None:
     if not inspection.problems:
         show.line("no warnings")
     for problem in inspection.problems:
-        show.line(f"! {problem}")
+        show.line(f"! {one_line(str(problem))}")
 
 
 def _row(name: str, stream: StreamSummary) -> tuple[str, ...]:
@@ -153,7 +153,7 @@ def _document(log: Log, inspection: Inspection) -> dict[str, Any]:
         "streams": inspection.streams,
         "reference": inspection.reference,
         **inspection.found,
-        "problems": inspection.problems,
+        "problems": [one_line(str(problem)) for problem in inspection.problems],
     }
 
 

@@ -245,14 +245,14 @@ def _reasons(made: MadeTags) -> dict[str, str]:
 def _notes(made: LandmarkMap) -> list[str]:
     """Lines on results that are not in the table."""
     unseen = ", ".join(made.unseen)
-    return [*made.notes, *([f"not observed, kept from the given map: {unseen}"] if unseen else [])]
+    return [*map(str, made.notes), *([f"not observed, kept from the given map: {unseen}"] if unseen else [])]
 
 
 def _notes_on_tags(made: MadeTags) -> list[str]:
     """Lines on results that are not in the table: unmapped tags, and the RMS distance from the given positions."""
     listed = {entry.landmark for entry in made.made.entries}
     unmapped = {name: why for name, why in made.open.items() if name not in listed}
-    lines = [*made.made.notes]
+    lines = [*map(str, made.made.notes)]
     kept = [name for name in made.open if name in made.world.tags]
     if kept:
         lines.append(f"not located, kept from the given map: {', '.join(kept)}")

@@ -33,12 +33,12 @@ def note(text: str) -> None:
     print(plain(text, None), file=sys.stderr, flush=True)
 
 
-def warnings(texts: Sequence[str]) -> None:
+def warnings(doubts: Sequence[object]) -> None:
     """Print warnings on stderr, one per line; only the first :data:`WARNINGS` of them."""
-    for text in texts[:WARNINGS]:
-        note(f"warning: {one_line(text)}")
-    if len(texts) > WARNINGS:
-        note(f"warning: {len(texts) - WARNINGS} more are listed with the results")
+    for doubt in doubts[:WARNINGS]:
+        note(f"warning: {one_line(str(doubt))}")
+    if len(doubts) > WARNINGS:
+        note(f"warning: {len(doubts) - WARNINGS} more are listed with the results")
 
 
 def outcome(doubts: Sequence[str], failures: Sequence[str], most: int | None = None, more: str = "") -> None:

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from factorgraph_loc.text import Notice
 from factorgraph_loc.version import __version__
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def render(template: str, **values: Any) -> str:
     return _environment().get_template(template).render(version=__version__, **values)
 
 
-def sectioned(title: str, lead: str, doubts: Sequence[str], sections: Mapping[str, Sequence[Part]]) -> str:
+def sectioned(title: str, lead: str, doubts: Sequence[Notice], sections: Mapping[str, Sequence[Part]]) -> str:
     """Return a page with a ``lead`` paragraph, highlighted ``doubts``, and ``sections`` by their title."""
     names = {f"section-{i}": name for i, name in enumerate(sections)}
     parts = dict(zip(names, sections.values(), strict=True))

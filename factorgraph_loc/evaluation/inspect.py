@@ -10,7 +10,7 @@ from factorgraph_loc.io.checks import gap_warnings, long_gaps
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Summary
 from factorgraph_loc.sensors.registry import functions
-from factorgraph_loc.text import one_line
+from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array
 
 
@@ -27,11 +27,11 @@ class StreamSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The content of a log: streams and reference, results of each sensor (``sensors``, by name), and problems as lines of text."""
+    """The content of a log: streams and reference, results of each sensor (``sensors``, by name), and problems."""
 
     streams: Mapping[str, StreamSummary]
     reference: StreamSummary | None
-    problems: tuple[str, ...]
+    problems: tuple[Notice, ...]
     sensors: Mapping[str, Summary]
 
     @property
@@ -46,17 +46,19 @@ class Inspection:
 
 
 def inspect(log: Log) -> Inspection:
-    """Inspect a log: summaries of its streams, and problems as lines of text."""
+    """Inspect a log: summaries of its streams, and problems."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
     reference = None if log.reference is None else _summary(log.reference.t)
     problems = list(log.warnings)
-    problems += [f"the log has no {sensor}, which the rig lists" for sensor in log.rig.sensors if sensor not in streams]
-    problems += [f"{name} is empty" for name, summary in streams.items() if summary.rows == 0]
+    missing = [sensor for sensor in log.rig.sensors if sensor not in streams]
+    problems += [notice("no_stream", "the log has no {sensor}, which the rig lists", sensor) for sensor in missing]
+    empty = [name for name, summary in streams.items() if summary.rows == 0]
+    problems += [notice("empty_stream", "{stream} is empty", name) for name in empty]
     for name, summary in (*streams.items(), *([("reference", reference)] if reference else [])):
         problems += gap_warnings(name, summary.gaps)
     sensors = {name: summarize(log) for name, summarize in functions("summarize")}
-    problems += [line for summary in sensors.values() for line in summary.problems]
-    return Inspection(streams, reference, tuple(dict.fromkeys(map(one_line, problems))), sensors)
+    problems += [problem for summary in sensors.values() for problem in summary.problems]
+    return Inspection(streams, reference, tuple(dict.fromkeys(problems)), sensors)
 
 
 def _summary(t: Array) -> StreamSummary:

@@ -26,6 +26,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult, Timings
 from factorgraph_loc.model.scoring import MAX_GAP, Alignment
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.text import notice
 from factors import chi_squared, positive, se2
 from factors.se2 import Array
 
@@ -99,7 +100,7 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
     is scored from its beginning. ``time_to_localized`` [s] counts from the first tick. ``landmarks.*`` (see
     :func:`landmark_figures`) are None unless the map was estimated. ``learnt.NAME.value``
     and ``learnt.NAME.sigma`` exist for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
-    ``timing.*`` always exist, as do ``warnings``, a list of texts.
+    ``timing.*`` always exist, as do ``warnings``, a list.
 
     With ``align`` also ``scoring.align``, and ``causal.*`` and ``final.*`` of :data:`ALIGNED` [m, rad] after that alignment, at the
     same stamps (see :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). They are None without a reference. They
@@ -131,7 +132,8 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
             try:
                 aligned |= _aligned(trajectory, log, align, gap)
             except InputError as error:
-                scores[WARNINGS] = list(dict.fromkeys((*scores[WARNINGS], f"not aligned: {error}")))
+                warning = notice("not_aligned", "not aligned: {error}", error)
+                scores[WARNINGS] = list(dict.fromkeys((*scores[WARNINGS], warning)))
             scores |= {f"{kind}.{name}": value for name, value in aligned.items()}
     return scores
 

@@ -13,7 +13,7 @@ Row = Mapping[str, Any]
 def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
     """The scores of a run as cells of a row: lists are omitted, except for the warnings, which become one text."""
     cells = {name: value for name, value in scores.items() if not isinstance(value, list)}
-    return cells | {WARNINGS: "\n".join(scores.get(WARNINGS, ())) or None}
+    return cells | {WARNINGS: "\n".join(map(str, scores.get(WARNINGS, ()))) or None}
 
 
 def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:

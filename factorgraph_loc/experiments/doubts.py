@@ -11,55 +11,61 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.setup import MapFrame
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import detecting
+from factorgraph_loc.text import Notice, notice
 
 LEAST_SHARE = 0.9  # fraction of the time with estimates
 
 
-def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[str, ...]:
+def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, ...]:
     """Warnings for a reference with too few poses to be scored, or that covers a part of the time only."""
     reference = log.reference
     if reference is None or not len(reference) or not len(final):
         return ()
     count = int(np.sum(np.isfinite(pairs(final, reference, max_gap).poses[:, 0])))
     if count < FEWEST_SCORED:
-        return (
-            f"{log.name}: only {count} poses of the reference have an estimate, expected at least {FEWEST_SCORED}: "
-            "nothing is scored",
+        few = (
+            "{log}: only {poses} poses of the reference have an estimate, expected at least {least}: nothing is scored"
         )
+        return (notice("few_scored", few, log.name, count, FEWEST_SCORED),)
     begin, end = max(reference.t[0], final.t[0]), min(reference.t[-1], final.t[-1])
     whole = final.t[-1] - final.t[0]
     if end - begin >= LEAST_SHARE * whole:
         return ()
-    return (
-        f"{log.name}: scored over {end - begin:.1f} s of {whole:.1f} s: the reference is there from {begin:.1f} s to {end:.1f} s",
+    sentence = (
+        "{log}: scored over {scored:.1f} s of {whole:.1f} s: the reference is there from {begin:.1f} s to {end:.1f} s"
     )
+    return (notice("partly_scored", sentence, log.name, end - begin, whole, begin, end),)
 
 
-def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[str, ...]:
+def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
     """A warning about the common error, along the trajectory, of a map that was made without a reference."""
     if frame.error is None or not len(final):
         return ()
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
     median, most = np.sqrt((np.median(worst), worst.max()))
-    return (
-        f"{log.name}: the map was made without a reference: it may be wrong by {median:.2g} m here, {most:.2g} m at most (standard "
-        "deviations), which the covariances contain",
+    sentence = (
+        "{log}: the map was made without a reference: it may be wrong by {median:.2g} m here, {most:.2g} m at most (standard "
+        "deviations), which the covariances contain"
     )
+    return (notice("bent_map", sentence, log.name, median, most),)
 
 
-def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[str, ...]:
+def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[Notice, ...]:
     """Warnings for gaps (begin, end) [s] between measurements without estimates inside."""
     if not skipped:
         return ()
     begin, end = max(skipped, key=lambda gap: gap[1] - gap[0])
     count = "a gap" if len(skipped) == 1 else f"{len(skipped)} gaps"
-    return (
-        f"{log.name}: {count} above {tick_gap:g} s without any measurement, the longest {end - begin:.0f} s at {begin:.1f} s: "
-        "there are no estimates inside",
+    sentence = (
+        "{log}: {gaps} above {limit:g} s without any measurement, the longest {length:.0f} s at {t:.1f} s: "
+        "there are no estimates inside"
     )
+    return (notice("gaps", sentence, log.name, count, tick_gap, end - begin, begin),)
 
 
-def never_localized(log: Log, sensors: Sequence[str], status: Sequence[Status], final: Trajectory) -> tuple[str, ...]:
+def never_localized(
+    log: Log, sensors: Sequence[str], status: Sequence[Status], final: Trajectory
+) -> tuple[Notice, ...]:
     """Warnings for an unknown start that was never resolved, in terms of what ``sensors`` observe in the map; ``status``: of
     each causal estimate."""
     kinds_of_status = set(status)
@@ -75,4 +81,4 @@ def never_localized(log: Log, sensors: Sequence[str], status: Sequence[Status], 
         why = f"its {names} did not determine the pose"
     else:
         why = f"no {names} of the map were detected"
-    return (f"{log.name}: never localized: {why}",)
+    return (notice("never_localized", "{log}: never localized: {why}", log.name, why),)

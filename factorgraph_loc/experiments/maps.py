@@ -35,7 +35,7 @@ from factorgraph_loc.sensors.landmarks.summary import require_mappable
 from factorgraph_loc.sensors.registry import sensors
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import Notice, quoted
 from factors import se2
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class MadeMap:
     world: World
     frame: str
     details: LandmarkMap | MadeTags | PointReport | DroppedTags
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
     draw: Callable[[], Figure]
 
     def write(self, out: Path, *, overwrite: bool = False) -> None:

@@ -12,7 +12,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import PRIORS, parse_position
 from factorgraph_loc.sensors.interfaces import Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import Notice, listed, notice, quoted
 
 # of a start taken from the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
@@ -109,18 +109,19 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     return sensors
 
 
-def unused(log: Log, sensors: tuple[str, ...]) -> tuple[str, ...]:
+def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
     """Warnings about unusable sensors of the rig, and about missing odometry."""
     available = (*log.streams, *_filled_columns(log))
-    doubts = [
-        f"{log.name}: the rig lists the sensor {s}, the log has none" for s in log.rig.sensors if s not in available
-    ]
+    sentence = "{log}: the rig lists the sensor {sensor}, the log has none"
+    doubts = [notice("no_stream", sentence, log.name, s) for s in log.rig.sensors if s not in available]
     lacking = {s: section for s in log.streams if s in log.rig.sensors and (section := lacking_section(log.rig, s))}
     for section in dict.fromkeys(lacking.values()):
         names = ", ".join(name for name, of in lacking.items() if of == section)
-        doubts.append(f"{log.name}: {names} left out, as the rig {log.rig.name} has no [{section}]")
+        sentence = "{log}: {sensors} left out, as the rig {rig} has no [{section}]"
+        doubts.append(notice("no_section", sentence, log.name, names, log.rig.name, section))
     if not moving(sensors):
-        doubts.append(f"{log.name}: run without odometry, the motion between measurements is unknown")
+        sentence = "{log}: run without odometry, the motion between measurements is unknown"
+        doubts.append(notice("no_odometry", sentence, log.name))
     return tuple(doubts)
 
 

@@ -37,6 +37,7 @@ from factorgraph_loc.model.setup import MapFrame
 from factorgraph_loc.sensors.camera.use import PreparedLog, prepare
 from factorgraph_loc.sensors.interfaces import Ending, Use
 from factorgraph_loc.sensors.registry import detecting, functions, moving
+from factorgraph_loc.text import Notice, notice
 from factorgraph_loc.version import __version__
 
 _REHEARSAL = 2.0  # s from the first observation
@@ -108,15 +109,15 @@ class _Start(NamedTuple):
 
     prior: PosePrior | None
     source: str
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior | None, source: str) -> _Start:
     """The start of a run with the stated ``prior``; InputError if the estimator cannot start there."""
     log = use.log
     if prior is None and config.prior is None and not detecting(log.world, log.streams):
-        warning = f"{log.name}: has neither a start nor a reference: begins at (0, 0, 0); --prior says where else"
-        return _Start(at_origin(log), "origin", (warning,))
+        sentence = "{log}: has neither a start nor a reference: begins at (0, 0, 0); --prior says where else"
+        return _Start(at_origin(log), "origin", (notice("no_start", sentence, log.name),))
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
             f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
@@ -173,8 +174,8 @@ def _result(
         *use.warnings,
         *unused(log, use.sensors),
         *prepared.warnings,
-        *(line for result in reviews.values() for line in result.warnings),
-        *(line for result in reliability.values() for line in result.doubts),
+        *(warning for result in reviews.values() for warning in result.warnings),
+        *(doubt for result in reliability.values() for doubt in result.doubts),
         *never_localized(log, use.sensors, causal.estimates.status, end.final),
         *partly_scored(log, end.final, config.max_gap),
         *in_bent_map(log, causal.frame, end.final),

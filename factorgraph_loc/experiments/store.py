@@ -25,6 +25,7 @@ from factorgraph_loc.evaluation.warned import row_of
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.model.scoring import Alignment
+from factorgraph_loc.text import Notice
 
 Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # as in tables
 Figure = bool | Whole | Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
@@ -64,7 +65,7 @@ class Figures(StoredFile):
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Figure | list[Figure] | Alignment] = Field(init=False)
-    warnings: list[str] = []
+    warnings: list[Notice] = []
 
 
 Kind = TypeVar("Kind", bound=StoredFile)
@@ -140,7 +141,7 @@ class Store:
             failure = parse_stored(Failure, self._read(manifest, FAILURE), folder / FAILURE)
             state = {"status": "failed", "kind": failure.kind, "reason": failure.reason}
         else:
-            scores = parse_stored(Figures, self._read(manifest, METRICS), folder / METRICS).model_dump()
+            scores = dict(parse_stored(Figures, self._read(manifest, METRICS), folder / METRICS))
         with suppress(DamagedError):  # timings are optional
             times = parse_stored(Figures, self._read(manifest, TIMINGS), folder / TIMINGS)
             scores |= {name: value for name, value in times.model_dump().items() if name.startswith(TIMING)}

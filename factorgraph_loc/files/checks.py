@@ -6,6 +6,7 @@ import numpy as np
 
 from factorgraph_loc.errors import bad_field, require
 from factorgraph_loc.files.columns import SECONDS
+from factorgraph_loc.text import Notice, listed, notice
 from factors.odometry.model import composed
 from factors.se2 import Array, Integers
 
@@ -20,25 +21,25 @@ def require_finite(source: object, rows: Integers, names: Sequence[str], table: 
         require(np.isfinite(values), source, rows, name, values, "a finite number")
 
 
-def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[str]) -> Integers:
+def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
     """Indices (M,) of the rows to keep of a stream with non-decreasing timestamps (N,): the last one of equal timestamps."""
     _require_order(source, rows, t_ns)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
     if dropped := len(t_ns) - len(keep):
-        warnings.append(f"{source}: {dropped} rows have the timestamp of the row after them and are skipped")
+        skipped = "{source}: {rows} rows have the timestamp of the row after them and are skipped"
+        warnings.append(notice("same_stamp", skipped, source, dropped))
     return keep
 
 
 def increments_in_order(
-    source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[str]
+    source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[Notice]
 ) -> tuple[Integers, Array]:
     """Timestamps (M,) and motions (M, 3) since the one before: ``moves`` (N, 3) with equal timestamps (N,) are composed."""
     _require_order(source, rows, t_ns)
     last, out = composed(t_ns, moves)
     if joined := len(t_ns) - len(last):
-        warnings.append(
-            f"{source}: {joined} increments have the timestamp of the row before them and are composed with it"
-        )
+        sentence = "{source}: {rows} increments have the timestamp of the row before them and are composed with it"
+        warnings.append(notice("composed_increments", sentence, source, joined))
     return t_ns[last], out
 
 
@@ -52,7 +53,7 @@ def _require_order(source: object, rows: Integers, t_ns: Integers) -> None:
 
 
 def arrivals(
-    source: object, rows: Integers, t_ns: Integers, warnings: list[str], *, max_late_ns: int | None = MAX_LATE_NS
+    source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], *, max_late_ns: int | None = MAX_LATE_NS
 ) -> None:
     """Check timestamps (N,) in order of arrival: one older than an earlier one is late, and an InputError above ``max_late_ns``."""
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
@@ -62,11 +63,17 @@ def arrivals(
         expected = f"a timestamp at most 0.5 s older than the newest before it, {int(newest[i])} ns"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
     if count := int(np.count_nonzero(late)):
-        warnings.append(f"{source}: {count} rows are late, by at most {late.max() * 1e-9:.3f} s")
+        sentence = "{source}: {rows} rows are late, by at most {delay:.3f} s"
+        warnings.append(notice("late_rows", sentence, source, count, late.max() * 1e-9))
+
+
+def unread_columns(source: object, names: Iterable[str]) -> Notice:
+    """The warning about columns that no option reads."""
+    return notice("unread_columns", "{source}: columns that are not read: {columns}", source, listed(names))
 
 
 def last_in_order(
-    source: object, rows: Integers, t_ns: Integers, warnings: list[str], names: Sequence[str] | None = None
+    source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], names: Sequence[str] | None = None
 ) -> Integers:
     """Indices (M,) of the rows to keep, in order of arrival: the last row of equal timestamps (N,), and of equal ``names`` if
     given.
@@ -75,10 +82,10 @@ def last_in_order(
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)
     last = {key: i for i, key in enumerate(keys)}
     if dropped := len(t_ns) - len(last):
-        what = "have the timestamp of a later row and are skipped"
+        sentence = "{source}: {rows} rows have the timestamp of a later row and are skipped"
         if names is not None:
-            what = "see a landmark that a later row sees at the same timestamp: skipped"
-        warnings.append(f"{source}: {dropped} rows {what}")
+            sentence = "{source}: {rows} rows see a landmark that a later row sees at the same timestamp: skipped"
+        warnings.append(notice("same_stamp", sentence, source, dropped))
     return np.array(sorted(last.values()), dtype=np.int64)
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.checks import unread_columns
 from factorgraph_loc.files.models import FileModel, InUnit, flattened, inside, nearest, parse_json, read_text
 from factorgraph_loc.files.tables import Cells, csv_rows, rows_of_length
-from factorgraph_loc.text import listed, quoted, well_formed
+from factorgraph_loc.text import Notice, listed, notice, quoted, well_formed
 from factors.se2 import Integers
 
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
@@ -122,13 +123,13 @@ def _mapped(
 class TableFolder:
     """A folder of tables, with notes on unread rows and columns.
 
-    ``warnings``: lines about the content of the tables. Several mappings may read one file. A row or column counts as read if one
+    ``warnings``: about the content of the tables. Several mappings may read one file. A row or column counts as read if one
     of them reads it.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.warnings: list[str] = []
+        self.warnings: list[Notice] = []
         self._read: dict[Path, list[tuple[Cells, ColumnMapping]]] = {}
 
     def file(self, name: str) -> Path:
@@ -142,13 +143,14 @@ class TableFolder:
     def noted(self, cells: Cells, mapping: ColumnMapping) -> Cells:
         """Record which content of their file the ``cells`` use, for warnings about the rest, and return the cells."""
         if cells.passed:
-            self.warnings.append(f"{cells.path}: {cells.passed} objects that lack mapped columns are skipped")
+            sentence = "{source}: {objects} objects that lack mapped columns are skipped"
+            self.warnings.append(notice("incomplete_objects", sentence, cells.path, cells.passed))
         self._read.setdefault(cells.path, []).append((cells, mapping))
         return cells
 
-    def left_out(self) -> list[str]:
-        """A line for each file with rows that no mapping chooses, and one for all files with the same columns that are not read."""
-        lines = []
+    def left_out(self) -> list[Notice]:
+        """A warning for each file with rows that no mapping chooses, and one for all files with the same unread columns."""
+        warnings = []
         columns: dict[tuple[str, ...], list[str]] = {}
         for path, tables in self._read.items():
             read: set[int] = set()
@@ -159,17 +161,17 @@ class TableFolder:
                 read.update(rows)
             if unchosen > 0:
                 names = listed(dict.fromkeys(name for _, mapping in tables for name in mapping.where))
-                lines.append(
-                    f"{path.name}: {unchosen} of {count + tables[0][0].passed} rows have another {names} than where says"
-                )
+                sentence = "{source}: {unchosen} of {rows} rows have another {columns} than where says"
+                rows_of_file = count + tables[0][0].passed
+                warnings.append(notice("unchosen_rows", sentence, path.name, unchosen, rows_of_file, names))
             never = [set(cells.left_out) for cells, _ in tables]
             names_of = tuple(name for name in tables[0][0].left_out if all(name in unread for unread in never))
             columns.setdefault(names_of, []).append(path.name)
         for unread, (first, *more) in columns.items():
             if unread:
                 files = f"{first} and {len(more)} more files" if more else first
-                lines.append(f"{files}: columns that are not read: {listed(unread)}")
-        return lines
+                warnings.append(unread_columns(files, unread))
+        return warnings
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:

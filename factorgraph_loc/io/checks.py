@@ -15,7 +15,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import columns_of
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import Notice, listed, notice
 from factors.se2 import Array
 
 LONG_GAP = 5.0  # s
@@ -74,31 +74,33 @@ def long_gaps(t: Array) -> tuple[tuple[float, float], ...]:
     return tuple((float(t[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + ROUNDING))
 
 
-def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[str]:
+def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]:
     """A warning about the gaps (start, length) of a stream, if there are any."""
     if not gaps:
         return []
     start, length = max(gaps, key=lambda gap: gap[1])
     count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-    return [f"{name}: {count} above {LONG_GAP:g} s, the longest {length:.1f} s at t = {start:.3f} s"]
+    sentence = "{stream}: {gaps} above {limit:g} s, the longest {length:.1f} s at t = {start:.3f} s"
+    return [notice("gaps", sentence, name, count, LONG_GAP, length, start)]
 
 
-def look_over(log: Log) -> list[str]:
+def look_over(log: Log) -> list[Notice]:
     """Warnings about a whole log; InputError if it has measurements but no odometry."""
     odometry = log.streams.get("odometry")
     if odometry is None and log.reference is not None and not log.streams:
         return []
     if odometry is None or len(odometry.t) == 0:
         raise InputError(f"{log.name}: has no odometry, which every estimator needs")
-    warnings = []
-    warnings += gap_warnings("odometry", long_gaps(odometry.t))
+    warnings = gap_warnings("odometry", long_gaps(odometry.t))
     for name, stream in log.streams.items():
         if name != "odometry" and (early := int(np.count_nonzero(stream.t < odometry.t[0]))):
-            warnings.append(f"{name}: {early} rows come before the first odometry")
+            sentence = "{stream}: {rows} rows come before the first odometry"
+            warnings.append(notice("before_odometry", sentence, name, early))
     sightings = log.streams.get("bearing_range")
     if isinstance(sightings, BearingRangeStream):
         unknown = [name for name in sightings.landmark if name not in log.world.landmarks]
         if unknown:
             names = listed(sorted(set(unknown)))
-            warnings.append(f"bearing_range: {len(unknown)} rows name landmarks that the map lacks: {names}")
+            sentence = "bearing_range: {rows} rows name landmarks that the map lacks: {landmarks}"
+            warnings.append(notice("unknown_landmarks", sentence, len(unknown), names))
     return warnings

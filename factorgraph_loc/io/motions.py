@@ -12,6 +12,7 @@ from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.settings import DifferentialDrive, OdometrySettings
+from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array, Integers
 
@@ -49,7 +50,7 @@ class WheelSizes(FileModel):
             raise InputError(f"{source}: {what} needs {lacking} [m], here or in [odometry.wheels] of the rig")
         return self.radius if turns and self.radius else 1.0
 
-    def twists(self, source: object, wheels: Array, warnings: list[str]) -> Array:
+    def twists(self, source: object, wheels: Array, warnings: list[Notice]) -> Array:
         """The motion (N, 3) ahead, to the left and about the vertical from the motion (N, 2 or 4) of the wheels: left and right,
         and those behind.
 
@@ -61,10 +62,11 @@ class WheelSizes(FileModel):
         turn = (right - left + rear_right - rear_left) / (2.0 * (self.track + (self.base or 0.0)))
         uneven = np.abs(aside).sum() / max(float(np.abs(wheels).mean(axis=1).sum()), ZERO)
         if self.base is None and uneven > UNEVEN:
-            warnings.append(
-                f"{source}: front and rear wheels differ by {2.0 * uneven:.0%}: set base [m], the distance between the axles, if "
+            sentence = (
+                "{source}: front and rear wheels differ by {share:.0%}: set base [m], the distance between the axles, if "
                 "these are mecanum wheels"
             )
+            warnings.append(notice("uneven_wheels", sentence, source, 2.0 * uneven))
         return np.column_stack((ahead, aside if self.base else np.zeros(len(ahead)), turn))
 
 
@@ -74,7 +76,7 @@ def wheels_of(left: str, count: int) -> tuple[str, ...]:
     return pair if count == 2 else (*pair, *(f"rear_{name}" for name in pair))
 
 
-def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[str]) -> Array:
+def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[Notice]) -> Array:
     """The motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
     At a reset (a jump to the origin faster than any motion before, or zeros after a pause) the previous motion is continued.
@@ -96,7 +98,7 @@ def after_rest(moves: Array) -> Array:
     return np.vstack((np.zeros((1, 3)), moves))
 
 
-def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[str]) -> Array:
+def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[Notice]) -> Array:
     """The motions (N - 1, W) from the distances (N, W) [m] of wheels at N timestamps [ns]; ``scales`` (W,): metres per encoder
     tick. Wrapping of encoders is handled; resets are treated as for poses."""
     steps = np.stack([wheel_steps(distances[:, i], float(scale)) for i, scale in enumerate(scales)], axis=-1)
@@ -109,13 +111,13 @@ def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array
 
 
 def between_wheels(
-    source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[str]
+    source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[Notice]
 ) -> Array:
     """The motions (N - 1, 3) of a drive with ``sizes``; for the other arguments see :func:`between_ways`."""
     return se2.exp(sizes.twists(source, between_ways(source, t_ns, distances, scales, warnings), warnings))
 
 
-def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[str]) -> Array:
+def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[Notice]) -> Array:
     """Speed and turn rate (N, 2) from the speeds (N, 2 or 4) of wheels; for mecanum wheels increments (N, 3), as each speed holds
     until the next row."""
     twists = sizes.twists(source, speeds, warnings)
@@ -162,7 +164,7 @@ def _largest_before(rates: Array, least: float) -> Array:
     return out
 
 
-def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[str]) -> Array:
+def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
     """Steps (N - 1, D), with the previous one continued at each reset; ``resets``: their indices."""
     durations = _durations(t_ns)
     for i in resets.tolist():
@@ -170,10 +172,9 @@ def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, w
         steps[i] = previous * min(float(durations[i]), HOLD_TIME)
     if len(resets):
         at = (int(t_ns[resets[0] + 1]) - int(t_ns[0])) / 1e9
-        times = "" if len(resets) == 1 else f" {len(resets)} times, first"
-        warnings.append(
-            f"{source}: the odometry is reset{times} {at:.1f} s after its start: the previous motion is continued there"
-        )
+        times = "" if len(resets) == 1 else " {resets} times, first"
+        reset = f"{{source}}: the odometry is reset{times} {{t:.1f}} s after its start: the previous motion is continued there"
+        warnings.append(Notice("odometry_reset", reset, {"source": str(source), "resets": len(resets), "t": at}))
     return steps
 
 

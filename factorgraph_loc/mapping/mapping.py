@@ -24,6 +24,7 @@ from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import Landmark
+from factorgraph_loc.text import Notice, notice
 from factors import positive, se2
 from factors.se2 import Array
 
@@ -40,6 +41,7 @@ VERDICTS = {
     "not judged": "not judged",
 }
 MIN_COMMON = 3  # landmarks: two can always be aligned with two others at the same distance
+UNJUDGED = ": it is not judged; the new map is in the frame of the run's start"  # end of a note
 FACTORS = (0.01, 4.0)  # bounds of the variance factor
 MAX_PAIRS = 5000  # if there are more, this many are drawn at random
 MAX_ITERATIONS = 20
@@ -76,14 +78,14 @@ class LandmarkMap:
     """A map, and how it was made.
 
     ``frame`` (3,): pose of the run's frame in the map's. ``judged``: whether the log's map was compared with it, so that both
-    have one frame. ``notes``: remarks for the user, one line each.
+    have one frame. ``notes`` for the user.
     """
 
     world: World
     entries: tuple[Entry, ...]
     frame: Array
     judged: bool
-    notes: tuple[str, ...]
+    notes: tuple[Notice, ...]
 
     @property
     def unseen(self) -> tuple[str, ...]:
@@ -144,15 +146,15 @@ def make_map(
     if not given:
         return _assemble(log, learnt, np.zeros(3), {})
     if len(common) < MIN_COMMON and not in_frame:
-        note = f"only {len(common)} of the given map's landmarks were mapped, expected {MIN_COMMON} or more to compare"
-        return _unjudged(log, learnt, note)
+        few = "only {mapped} of the given map's landmarks were mapped, expected {least} or more to compare"
+        return _unjudged(log, learnt, notice("few_mapped", few + UNJUDGED, len(common), MIN_COMMON))
     points = [learnt[name] for name in common]
     targets = np.array([log.world.position(name) for name in common])
     surveys = np.array([given[name].spread() for name in common])
     alignment = IN_FRAME if in_frame else align_robustly(points, targets, surveys)
     if not in_frame and alignment.inliers < max(MIN_COMMON, len(common) / 2):
-        note = f"only {alignment.inliers} of {len(common)} landmarks agree with the given map under one alignment"
-        return _unjudged(log, learnt, note)
+        few = "only {inliers} of {mapped} landmarks agree with the given map under one alignment"
+        return _unjudged(log, learnt, notice("few_inliers", few + UNJUDGED, alignment.inliers, len(common)))
     moved = {name: _moved(point, alignment) for name, point in learnt.items()}
     wrong = [n for n in common if _differ(moved[n], given[n])]
     verdicts = {name: _verdict(name, moved, given, wrong) for name in common}
@@ -253,10 +255,9 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
     return f"moved by {np.hypot(*offset):.2f} m"
 
 
-def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: str) -> LandmarkMap:
+def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: Notice) -> LandmarkMap:
     """The map in the frame of the start, without the given one, which cannot be aligned with it."""
-    notes = [f"{note}: it is not judged; the new map is in the frame of the run's start"]
-    return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
+    return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=[note])
 
 
 def _assemble(
@@ -268,7 +269,7 @@ def _assemble(
     keep: tuple[str, ...] = (),
     flagged: Sequence[str] = (),
     judged: bool = False,
-    notes: Sequence[str] = (),
+    notes: Sequence[Notice] = (),
 ) -> LandmarkMap:
     """The map with the landmarks of the given one in their order, then the new ones; those in ``keep`` are the given ones."""
     entries, landmarks = [], {}

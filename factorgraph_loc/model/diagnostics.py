@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+from factorgraph_loc.text import Notice
 
 # an addition: the list or count, its name, and the added rows or number
 Addition = tuple[dict[str, Any], str, Any]
 
 
 @dataclass(frozen=True)
-class Event:
-    """An event at ``t`` [s], of a ``kind``, with ``fields``. Printed, it is its ``sentence`` with the fields in the braces."""
+class Event(Notice):
+    """A notice about what happened at ``t`` [s]."""
 
     t: float
-    kind: str
-    sentence: str
-    fields: Mapping[str, Any] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        return self.sentence.format(**self.fields)
 
 
 @dataclass
@@ -82,7 +78,7 @@ class Diagnostics:
 
     def event(self, t: float, kind: str, sentence: str, **fields: Any) -> None:
         """Record an event; an event that is repeated after going back in time is recorded once."""
-        event = Event(t, kind, sentence, fields)
+        event = Event(kind, sentence, fields, t)
         if event not in self.events:
             self.events.append(event)
 

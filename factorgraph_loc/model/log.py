@@ -12,7 +12,7 @@ from factorgraph_loc.model.measurement import Measurement, Rows, Stream, joined,
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.text import well_formed
+from factorgraph_loc.text import Notice, well_formed
 from factors.se2 import Array, Integers
 
 NOT_READ, RIG_NOTES = (
@@ -45,7 +45,7 @@ class Log:
     reference: Trajectory | None = None
     start: StartPose | None = None
     t0_ns: int = 0
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

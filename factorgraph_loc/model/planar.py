@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field
 
 from factorgraph_loc.errors import InputError, require
 from factorgraph_loc.files.models import FileModel, InUnit
+from factorgraph_loc.text import Notice
 from factors.se2 import Array, Integers
 
 RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a warning and for an error
@@ -102,7 +103,7 @@ def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Arra
 
 
 def on_floor(
-    source: object, positions: Array, rotations: Array | None, warnings: list[str], turned: Turned = AS_IT_IS
+    source: object, positions: Array, rotations: Array | None, warnings: list[Notice], turned: Turned = AS_IT_IS
 ) -> Array:
     """Planar poses (N, 3) of positions (N, 3) and optional rotations (N, 3, 3): x, y and the direction of the robot's x axis.
 
@@ -123,10 +124,13 @@ def on_floor(
             f"{source}: the height of poses varies by {rise:.1f} m, expected a robot on a floor (at most {MOST:g} m); set axes "
             'to the axes that point forward, left and up, or to "body" if these are x, y and z'
         )
-    problems = [f"vary in height by {rise:.2f} m"] if rise > RISE else []
-    problems += [f"tilt by up to {math.degrees(tilt):.0f} degrees"] if tilt > TILT else []
+    problems = ["vary in height by {rise:.2f} m"] if rise > RISE else []
+    problems += ["tilt by up to {tilt:.0f} degrees"] if tilt > TILT else []
     if problems:
-        warnings.append(f"{source}: poses {' and '.join(problems)}, which is ignored; check axes and mounting")
+        sentence = f"{{source}}: poses {' and '.join(problems)}, which is ignored; check axes and mounting"
+        warnings.append(
+            Notice("not_planar", sentence, {"source": str(source), "rise": rise, "tilt": math.degrees(tilt)})
+        )
     return poses
 
 

@@ -13,6 +13,7 @@ import scipy
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.model.planar import AS_IT_IS, Turned, on_floor, rotations_of
+from factorgraph_loc.text import Notice
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ class PosePath(Exchange):
     rotations: Array
     t_ns: Integers | None
     has_rotations: bool = True
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -140,7 +141,7 @@ class PosePath(Exchange):
         positions = np.column_stack([np.interp(t, own, self.positions[:, i]) for i in range(3)])
         return replace(self, positions=positions, rotations=rotations, t_ns=t_ns)
 
-    def on_floor(self, warnings: list[str], turned: Turned = AS_IT_IS) -> Array:
+    def on_floor(self, warnings: list[Notice], turned: Turned = AS_IT_IS) -> Array:
         """Planar poses (N, 3): see :func:`~factorgraph_loc.model.planar.on_floor`."""
         return on_floor(self.name, self.positions, self.rotations if self.has_rotations else None, warnings, turned)
 

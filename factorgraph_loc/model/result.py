@@ -10,6 +10,7 @@ from factorgraph_loc.model.belief import Learnt, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.text import Notice
 from factors.se2 import Array
 
 
@@ -28,7 +29,7 @@ class Reliability:
     predicted: Array
     sigma: Array
     overdispersion: float
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class RunResult:
     diagnostics: Diagnostics
     learnt: Learnt
     timings: Timings
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     reliability: Mapping[str, Reliability] = field(default_factory=dict)
     doubts_model: tuple[bool, ...] = ()
 

@@ -22,6 +22,7 @@ from factorgraph_loc.fitting.posterior import (
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.smoothed import Traced, pooled_constants
+from factorgraph_loc.text import Notice
 from factors.se2 import Array
 
 BLOCK = 20.0  # s; errors within a block may be correlated
@@ -47,14 +48,14 @@ class Residuals:
 class SensorKnowledge:
     """The result for a sensor.
 
-    ``sections`` of the rig; the ``constants``; ``notes``: warnings, one line each; ``figures``: plain values for the report;
+    ``sections`` of the rig; the ``constants``; ``notes``: warnings; ``figures``: plain values for the report;
     ``residuals``: of each log; ``details``: the data that its pictures show; ``correlations``: see
     :meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`.
     """
 
     sections: Mapping[str, Any] = field(default_factory=dict)
     constants: Sequence[FittedConstant] = ()
-    notes: Sequence[str] = ()
+    notes: Sequence[Notice] = ()
     figures: Mapping[str, Any] = field(default_factory=dict)
     residuals: Sequence[Residuals] = ()
     details: Any = None

@@ -19,6 +19,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import channels, functions, sensor_of
+from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array
 
 STEP = 0.05  # s between compared times and between shifts
@@ -45,7 +46,7 @@ class Use:
     modalities: Container[str]
     estimates_points: bool
     given: Collection[str] = ()
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,9 @@ class Ending:
 
 @dataclass(frozen=True)
 class Review:
-    """The review of a finished run by a sensor: ``warnings``, one line each, and the ``reliability`` of its model."""
+    """The review of a finished run by a sensor: ``warnings`` and the ``reliability`` of its model."""
 
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     reliability: Reliability | None = None
 
 
@@ -95,15 +96,15 @@ class Summary:
 
     found: Mapping[str, Any] = field(default_factory=dict)
     in_map: Mapping[str, int] = field(default_factory=dict)
-    problems: Sequence[str] = ()
+    problems: Sequence[Notice] = ()
     text: Sequence[Paragraph] = ()
 
 
-def line(name: str, shift: float, than: str, setting: str, offset: float) -> str:
-    """The message that ``name`` is stamped ``shift`` [s] later than ``than``, with the ``time_offset`` [s] that corrects it."""
+def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
+    """The warning that ``name`` is stamped ``shift`` [s] later than ``than``, with the ``time_offset`` [s] that corrects it."""
     late = "later" if shift > 0.0 else "earlier"
-    mends = f"{setting}.time_offset = {offset:+.2f}"
-    return f"{name} is stamped about {abs(shift):.2f} s {late} than {than}: set {mends} in the rig"
+    sentence = "{stream} is stamped about {shift:.2f} s {late} than {other}: set {section}.time_offset = {offset:+.2f} in the rig"
+    return notice("time_offset", sentence, name, abs(shift), late, than, setting, offset)
 
 
 def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:

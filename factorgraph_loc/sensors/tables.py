@@ -22,6 +22,7 @@ from factorgraph_loc.files.values import names, numbers, seconds_of, within
 from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import Channel, SensorType, channels, sensors
+from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class Reading:
 
     rig: Rig
     t0_ns: int
-    warnings: list[str]
+    warnings: list[Notice]
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
     return stream_of(table, only, reading.t0_ns, reading.warnings)
 
 
-def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[str]) -> Stream:
+def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
     """The stream of a table's rows.
 
     If the rows of one timestamp form a measurement, the last row of each name is kept, otherwise the last row of each timestamp.
@@ -124,14 +125,15 @@ def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
     return np.asarray(np.isnan(columns).all(axis=0))
 
 
-def _without_small(column: Column, rows: TableRows, warnings: list[str]) -> Array:
+def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> Array:
     """The numbers (N,) of a column, with those below its ``left_out_below`` removed."""
     values = rows.numbers[column.name]
     small = np.flatnonzero(values < column.left_out_below)
     if not len(small):
         return values
-    first = f"{rows.path}:{int(rows.rows[small[0]])}: {column.name} is {values[small[0]]:g}"
-    warnings.append(f"{first}: {len(small)} {column.name}s that are not above 0 are skipped")
+    sentence = "{source}:{row}: {column} is {value:g}: {rows} {column}s that are not above 0 are skipped"
+    first, value = rows.rows[small[0]], values[small[0]]
+    warnings.append(notice("not_positive", sentence, rows.path, first, column.name, value, len(small)))
     return np.where(values >= column.left_out_below, values, np.nan)
 
 

@@ -66,7 +66,7 @@ def test_a_log_without_reads() -> None:
     none = inspect(make_log(**only(np.zeros(360, dtype=bool)[: len(stream_of(log).t)])))
     assert none.found["rfid"] is not None
     assert none.found["rfid"].reads == none.found["rfid"].rounds == 0
-    assert "antenna left of the rig is never active" in none.problems
+    assert "antenna left of the rig is never active" in map(str, none.problems)
 
 
 def test_tags_that_do_not_match_the_map() -> None:
@@ -74,7 +74,7 @@ def test_tags_that_do_not_match_the_map() -> None:
     found = inspect(dataclasses.replace(make_log(), world=world))
     assert found.found["rfid"] is not None
     assert (found.found["rfid"].unread, found.found["rfid"].unknown) == (("C", "D"), {"B": 120})
-    assert found.problems == (
+    assert tuple(map(str, found.problems)) == (
         "2 of 3 tags of the map are never read: C, D",
         "120 reads are of 1 tags that the map lacks: B",
     )
@@ -84,18 +84,19 @@ def test_an_antenna_that_stops() -> None:
     stream = stream_of(make_log())
     right = np.array(stream.antenna) == "right"
     (problem,) = inspect(make_log(**only(~right | (stream.t < 30.0)))).problems
-    assert problem == "antenna right stops at 29.5 s, 30.0 s before the others"
+    assert str(problem) == "antenna right stops at 29.5 s, 30.0 s before the others"
     # its rounds go on, without a read
     epc = ["" if r and t >= 30.0 else e for r, t, e in zip(right, stream.t, stream.epc, strict=True)]
     (problem,) = inspect(make_log(epc=epc)).problems
-    assert problem == "antenna right reads nothing after 29.0 s"
+    assert str(problem) == "antenna right reads nothing after 29.0 s"
     epc = ["" if r else e for r, e in zip(right, stream.epc, strict=True)]
-    assert inspect(make_log(epc=epc)).problems == ("antenna right reads nothing",)
+    (problem,) = inspect(make_log(epc=epc)).problems
+    assert str(problem) == "antenna right reads nothing"
 
 
 def test_clocks_that_do_not_agree() -> None:
     t = stream_of(make_log()).t
     (problem,) = inspect(make_log(t=t + 3.0)).problems
-    assert problem == "the reads reach 2.6 s after the odometry: do their clocks agree?"
+    assert str(problem) == "the reads reach 2.6 s after the odometry: do their clocks agree?"
     (problem,) = inspect(make_log(t=np.where(t >= 30.0, t - 10.0, t))).problems
-    assert problem == "38 rounds have stamps up to 9.5 s before an earlier one: did the clock of the reader jump?"
+    assert str(problem) == "38 rounds have stamps up to 9.5 s before an earlier one: did the clock of the reader jump?"

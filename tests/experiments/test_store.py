@@ -1,17 +1,20 @@
 """Results on disk are whole or not there, damage is found, and two processes do not meet at one run."""
 
+import json
 import multiprocessing
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.store import FAILURE, MANIFEST, METRICS, TIMINGS, DamagedError, Store, StoreError
+from factorgraph_loc.text import notice
 
 KEY, OTHER = "ab" * 32, "cd" * 32
 FILES = {
@@ -79,6 +82,13 @@ def test_gross_damage_is_found(store, what):
     assert store.state(KEY) == "damaged"
     store.put(KEY, FILES)
     assert store.state(KEY) == "ok"
+
+
+def test_stored_warnings_are_printed_as_before(store):
+    sentence = "{source}: {rows} rows are late, by at most {delay:.3f} s"
+    warning = notice("late_rows", sentence, Path("a.csv"), np.int64(3), np.float64(0.25))
+    store.put(KEY, FILES | {METRICS: json.dumps({"warnings": [vars(warning)]}).encode()})
+    assert store.row(KEY)["warnings"] == str(warning) == "a.csv: 3 rows are late, by at most 0.250 s"
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def use_log(folder, draw, path="", **options):
     """Read a log, and inspect it, write it again, or drive it."""
     for log in fgloc.load(str(folder / path), **options):
         for warning in log.warnings:
-            require_line(warning, 600)
+            require_line(str(warning), 600)
         assert all(math.isfinite(t) for stream in log.streams.values() for t in stream.t)
         match draw(st.sampled_from(("info", "run", "convert"))):
             case "info":

@@ -80,7 +80,8 @@ def test_rig_and_world_replace_those_of_the_log(native, tmp_path):
     (log,) = load(str(native), rig=tmp_path / "o.rig.toml", world=tmp_path / "o.world.toml")
     assert (log.rig.name, log.world.name) == ("other", "other")
     # checked against the map that is used
-    assert log.warnings == ("bearing_range: 1 rows name landmarks that the map lacks: B",)
+    (warning,) = log.warnings
+    assert str(warning) == "bearing_range: 1 rows name landmarks that the map lacks: B"
 
 
 BAD_MANIFESTS = {

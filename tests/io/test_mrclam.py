@@ -31,7 +31,7 @@ def test_what_is_read(mrclam, read):
     assert len(list(sightings.measurements(0.0))) == 1
     assert log.world.landmarks["6"].sigma == 0.0002
     np.testing.assert_array_equal(log.reference.t, (-0.056, 0.044))
-    left_out, no_rig = log.warnings
+    left_out, no_rig = map(str, log.warnings)
     assert (
         "Robot1_Measurement.dat: 2 rows have a landmark that is not among the names taken from Barcodes.dat: skipped"
         in left_out

@@ -90,7 +90,9 @@ def test_ranges_that_cannot_be_are_left_out_and_bearings_beside_them_kept(native
     assert list(seen.landmark) == ["A", "B", "A"]
     np.testing.assert_array_equal(seen.range, (1.5, np.nan, 1.4))
     np.testing.assert_array_equal(seen.bearing, (0.0, 0.2, 0.1))
-    assert any("bearing_range.csv:3: range is 0: 2 ranges that are not above 0 are skipped" in w for w in log.warnings)
+    assert any(
+        "bearing_range.csv:3: range is 0: 2 ranges that are not above 0 are skipped" in str(w) for w in log.warnings
+    )
 
 
 BAD_FILES = {
@@ -132,7 +134,7 @@ def test_duplicate_stamps_the_last_wins(native, one):
     (native / "odometry.csv").write_text("t_ns,v,w\n0,1,0\n0,2,0\n1,3,0\n1,4,0\n1,5,0\n")
     log = one(native)
     np.testing.assert_array_equal(log.streams["odometry"].v, (2.0, 5.0))
-    assert "odometry.csv: 3 rows have the timestamp of the row after them" in log.warnings[0]
+    assert "odometry.csv: 3 rows have the timestamp of the row after them" in str(log.warnings[0])
 
 
 def test_increments_of_one_stamp_are_one_motion(native, one):
@@ -144,9 +146,8 @@ def test_increments_of_one_stamp_are_one_motion(native, one):
     assert len(odometry.t) == 3
     moves = np.column_stack((odometry.dx, odometry.dy, odometry.dtheta))
     np.testing.assert_allclose(moves, ((0, 0, 0), (2, 0, 0.5), (1, 1, -0.5)), atol=1e-12)
-    assert (
-        "odometry.csv: 3 increments have the timestamp of the row before them and are composed with it"
-        in log.warnings[0]
+    assert "odometry.csv: 3 increments have the timestamp of the row before them and are composed with it" in str(
+        log.warnings[0]
     )
 
 
@@ -155,14 +156,14 @@ def test_duplicate_sightings_the_last_wins(native, one):
         file.write("1600000000,A,3,\n1600000000,B,4,\n")
     log = one(native)
     np.testing.assert_array_equal(log.streams["bearing_range"].range, (2.5, np.nan, 3.0, 4.0))
-    assert "bearing_range.csv: 1 rows see a landmark that a later row sees" in log.warnings[0]
+    assert "bearing_range.csv: 1 rows see a landmark that a later row sees" in str(log.warnings[0])
 
 
 def test_late_sightings_keep_their_place(native, one):
     (native / "bearing_range.csv").write_text(HEADER + "1600000000,A,1,0\n1100000000,A,2,0\n1700000000,A,3,0\n")
     log = one(native)
     np.testing.assert_array_equal(log.streams["bearing_range"].t, (0.6, 0.1, 0.7))
-    assert "1 rows are late, by at most 0.500 s" in log.warnings[0]
+    assert "1 rows are late, by at most 0.500 s" in str(log.warnings[0])
 
 
 WARNED = {
@@ -191,7 +192,7 @@ WARNED = {
 def test_warned_and_kept(native, one, name, text, fragment):
     (native / name).write_text(text)
     (warning,) = one(native).warnings
-    assert fragment in warning
+    assert fragment in str(warning)
 
 
 def test_parquet_is_read_too_but_not_both(native, one, refused):
@@ -283,7 +284,7 @@ def test_what_is_written_comes_back(tmp_path_factory, log, format):
     (back,) = load(str(folder))
     assert (back.name, back.rig, back.world, back.t0_ns) == (log.name, log.rig, log.world, log.t0_ns)
     assert back.metadata == log.metadata
-    assert all("a gap above" in w or "gaps above" in w or "before the first" in w for w in back.warnings)
+    assert all(w.kind in ("gaps", "before_odometry") for w in back.warnings)
     assert set(back.streams) == set(log.streams)
     for name, stream in log.streams.items():
         assert type(back.streams[name]) is type(stream)

@@ -72,7 +72,7 @@ def test_missing_images_are_left_out_with_a_warning(seen, one):
     log = one(seen)
     assert [file.name for file in log.streams["camera"].file] == ["a.png", "c.png"]
     (warning,) = log.warnings
-    assert warning.endswith("camera.csv: 2 of 4 images are missing and skipped, the first is b.png of row 3")
+    assert str(warning).endswith("camera.csv: 2 of 4 images are missing and skipped, the first is b.png of row 3")
 
 
 BAD = {

@@ -86,7 +86,7 @@ def test_rounds_from_inventories(hall, one):
     assert (first.antennas, len(first.tags)) == (("left", "right", "back"), 3)
     assert (second.antennas, second.tags, third.t) == (("right",), (), 0.24)
     (warning,) = log.warnings
-    assert "rfid.csv: 1 of 4 reads lie outside of every inventory and are skipped" in warning
+    assert "rfid.csv: 1 of 4 reads lie outside of every inventory and are skipped" in str(warning)
 
 
 def test_inventories_of_antennas_that_read_nothing(hall, one):

@@ -38,7 +38,7 @@ def test_old_bags_hold_no_definitions(undefined, read, refuse):
 def test_a_topic_that_nobody_can_read_does_not_hide_the_others(undefined):
     found = proposed(undefined)
     assert set(found.options) == {"odometry", "reference"}
-    assert any("/rfid is of type shop_msgs/msg/Reads, which the bag does not define" in note for note in found.notes)
+    assert any("/rfid is of type shop_msgs/msg/Reads, which the bag does not define" in note for note in found.remarks)
 
 
 def test_a_type_of_ros_that_the_bag_defines_otherwise(tmp_path, bag_maker, refuse):

@@ -66,7 +66,7 @@ def test_frames_are_proposed_where_nothing_else_is_odometry_or_a_reference(tmp_p
         "base_frame": "base_footprint",
     }
     assert found.uses == {"/tf": "odometry, reference", "/tf_static": "sensor mounting"}
-    (note,) = found.notes
+    (note,) = found.remarks
     assert note.startswith("base_footprint in map, of /tf, is used as the reference: remove it if it is an estimate")
 
 
@@ -78,7 +78,7 @@ def test_what_is_measured_comes_before_frames(maker, read_drive):
     read_drive(maker)
     found = proposed(maker.path)
     assert found.options == {"odometry": {"topic": "/odom"}, "reference": {"topic": "/mocap/pose"}}
-    assert found.notes == [
+    assert found.remarks == [
         "odometry could also be /tf",
         "/tf has the frames axle in odom, odom in vicon: parent and child of [options.reference] would use two",
     ]

@@ -50,7 +50,7 @@ def test_rows_of_one_stamp_give_a_warning(tmp_path):
     (tmp_path / "a.tum").write_text(TUM + "1 5 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
     found = read_trajectory(tmp_path / "a.tum")
     assert found.positions[:, 0].tolist() == [5.0, 0.0]
-    assert "1 rows have the timestamp of the row after them and are skipped" in found.warnings[0]
+    assert "1 rows have the timestamp of the row after them and are skipped" in str(found.warnings[0])
 
 
 def test_a_topic_of_a_bag(maker):

@@ -162,7 +162,7 @@ def test_too_few_common_landmarks_are_not_judged():
     points = places(6)
     made = make_map(log(world(points[:2])), learnt(points))
     assert not made.judged
-    assert "only 2 of the given map's landmarks" in made.notes[0]
+    assert "only 2 of the given map's landmarks" in str(made.notes[0])
     assert verdicts(made)["0"] == "not judged"
     np.testing.assert_array_equal(made.world.position("0"), learnt(points)["0"].position)
 
@@ -170,7 +170,7 @@ def test_too_few_common_landmarks_are_not_judged():
 def test_a_map_of_another_place_is_not_judged():
     made = make_map(log(world(places(8, seed=5))), learnt(places(8), stated=0.01))
     assert not made.judged
-    assert "landmarks agree with the given map under one alignment" in made.notes[0]
+    assert made.notes[0].kind == "few_inliers"
 
 
 def test_many_landmarks_are_aligned_by_a_sample_of_pairs():

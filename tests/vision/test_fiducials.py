@@ -160,8 +160,10 @@ def test_images_that_are_no_images_and_those_without_markers(hall):
     broken.write_text(MANIFEST.replace("images.csv", "none.csv").replace("tag36h11", "5x5_50"))
     (other,) = load(str(broken))
     assert "sightings" not in other.streams
-    assert any("1 images cannot be used" in line and "truth.csv" in line for line in other.warnings)
-    assert any("no marker of 5x5_50 was found in 2 images" in line for line in other.warnings)
+    warnings = {w.kind: w.fields for w in other.warnings}
+    assert warnings["unreadable_images"]["images"] == 1
+    assert "truth.csv" in warnings["unreadable_images"]["first"]
+    assert warnings["no_markers"] == {"family": "5x5_50", "images": 2}
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from factorgraph_loc.model.scoring import (
     Association,
     check_max_gap,
 )
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.se2 import Array, Integers
 
 _MANY = 0.5  # share of poses that are paired, below which there is a warning
@@ -61,7 +61,7 @@ class TrajectoryScore:
     ``estimate`` (aligned), ``reference``: N associated poses each. ``transform``: from the frame of the estimate to that of the
     reference. ``ape``: absolute errors (N,). ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a
     second; None without rotations or stamps. ``lengths`` [m] and ``poses`` of the whole estimate and of the whole reference.
-    ``settings``: of association and alignment. ``warnings``: one line for each doubt.
+    ``settings``: of association and alignment. ``warnings``: one for each doubt.
     """
 
     estimate: PosePath
@@ -73,7 +73,7 @@ class TrajectoryScore:
     lengths: tuple[float, float]
     poses: tuple[int, int]
     settings: dict[str, Any]
-    warnings: tuple[str, ...]
+    warnings: tuple[Notice, ...]
 
     @property
     def figures(self) -> dict[str, float | None]:
@@ -151,10 +151,12 @@ def score_paths(
     poses = len(estimate), len(reference)
     warnings = [*estimate.warnings, *reference.warnings, *_doubts(estimate, reference, associate_by, align)]
     if associate_by == "nearest" and len(aligned) < _MANY * min(poses):
-        warnings.append(
-            f"{estimate.name}: {len(aligned)} of {min(poses)} poses have a stamp within {max_diff:g} s in {reference.name}: "
+        sentence = (
+            "{estimate}: {paired} of {poses} poses have a stamp within {max_diff:g} s in {reference}: "
             "a larger max_diff finds more, and associate interpolate needs none"
         )
+        values = estimate.name, len(aligned), min(poses), max_diff, reference.name
+        warnings.append(notice("few_pairs", sentence, *values))
     return TrajectoryScore(aligned, truth, transform, *errors, lengths, poses, settings, tuple(warnings))
 
 
@@ -222,22 +224,20 @@ def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
 
-def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[str]:
+def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[Notice]:
     """Warnings about likely mistakes: heights in a comparison with a planar trajectory, and a plane that is not the floor."""
     if align == "se2":
         rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]
-        return [
-            f"{name}: z varies by {rise:.1f} m, and is ignored: does it point up?"
-            for name, rise in rises
-            if rise > MOST
-        ]
+        sentence = "{path}: z varies by {rise:.1f} m, and is ignored: does it point up?"
+        return [notice("not_planar", sentence, name, rise) for name, rise in rises if rise > MOST]
     flat, uneven = (estimate, reference) if estimate.is_planar else (reference, estimate)
     if associate_by == "interpolate" or not flat.is_planar or align in ("se3", "sim3"):
         return []
     apart = float(np.abs(uneven.positions[:, 2] - flat.positions[0, 2]).max())
     if apart <= RISE:
         return []
-    return [
-        f"{flat.name} is planar, and {uneven.name} is up to {apart:.1f} m above or below it: heights count, but not with "
+    sentence = (
+        "{planar} is planar, and {other} is up to {height:.1f} m above or below it: heights count, but not with "
         "align se2 or associate interpolate"
-    ]
+    )
+    return [notice("heights_count", sentence, flat.name, uneven.name, apart)]

@@ -21,7 +21,7 @@ from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.topics import Stamper, TopicSettings, as_nanoseconds
 from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import COUNTS, CameraSettings
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import Notice, quoted
 from factorgraph_loc.vision.feature_cache import cache_folder
 from factors.se2 import Array
 
@@ -100,7 +100,7 @@ class Images:
         self._rows.append((item.row, header, item.received, file))
         self._t_ns.append(t_ns)
 
-    def stream(self, t0_ns: int, warnings: list[str]) -> ImageStream:
+    def stream(self, t0_ns: int, warnings: list[Notice]) -> ImageStream:
         """The images; newly extracted ones are moved to the cache folder."""
         if self._written is not None:
             with writing(self._folder), locked(self._folder.parent / LOCK):

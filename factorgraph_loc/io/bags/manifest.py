@@ -55,19 +55,19 @@ class BagManifest(Proposal):
 
 @dataclass
 class Uses:
-    """``options`` of the reader; ``uses``: use of each topic, by name; ``notes``: remarks for the user."""
+    """``options`` of the reader; ``uses``: use of each topic, by name; ``remarks`` for the user."""
 
     options: dict[str, Any] = field(default_factory=dict)
     uses: dict[str, str] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
     def take(self, sensor: str, topics: Sequence[Topic], **settings: Any) -> None:
-        """Use the first of ``topics`` for a sensor and note the rest; nothing without topics."""
+        """Use the first of ``topics`` for a sensor and remark on the rest; nothing without topics."""
         if topics:
             self.options[sensor] = {"topic": topics[0].name, **settings}
             self.uses[topics[0].name] = sensor
         if topics[1:]:
-            self.notes.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
+            self.remarks.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
 
 
 def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
@@ -90,15 +90,15 @@ def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
             for topic in opened.topics.values()
         )
     unused = [f"not used: {t.topic} ({t.type}, {t.messages} messages)" for t in topics if t.use is None]
-    proposal = proposal_of("rosbag", path, folder, uses.options, [*uses.notes, *unused])
+    proposal = proposal_of("rosbag", path, folder, uses.options, [*uses.remarks, *unused])
     return BagManifest(**vars(proposal), duration=span, topics=topics)
 
 
 def propose(bag: Bag) -> Uses:
-    """Propose uses of the topics. Of several topics for one sensor the most likely one is used, and a note lists the others."""
+    """Propose uses of the topics. Of several topics for one sensor the most likely one is used, and a remark lists the others."""
     out = Uses()
     topics = [topic for topic in bag.topics.values() if topic.count]
-    tree = tree_of(bag, out.notes)
+    tree = tree_of(bag, out.remarks)
     _motion(out, bag, topics, tree)
     _reference(out, topics, tree)
     out.take("imu", [topic for topic in topics if topic.type == IMU])
@@ -118,7 +118,9 @@ def propose(bag: Bag) -> Uses:
         out.options["base_frame"] = robot
     if tree.topic and tree.topic not in out.uses:
         frames = listed(f"{child} in {tree.parents[child]}" for child in sorted(tree.moving))
-        out.notes.append(f"{tree.topic} has the frames {frames}: parent and child of [options.reference] would use two")
+        out.remarks.append(
+            f"{tree.topic} has the frames {frames}: parent and child of [options.reference] would use two"
+        )
     return out
 
 
@@ -137,14 +139,14 @@ def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
         and not NOT_MEASURED.search(topic.name)
     ]
     if not ranked:
-        out.notes.append("no topic looks like odometry, which every estimator needs: name one in [options.odometry]")
+        out.remarks.append("no topic looks like odometry, which every estimator needs: name one in [options.odometry]")
         return
     settings: dict[str, Any] = frames if ranked[0].type in TF else {}
     if ranked[0].type == ODOMETRY and _has_no_pose(bag, ranked[0]):
         settings = {"use": "twist"}
-        out.notes.append(f"the orientations in {ranked[0].name} are not set: its velocities are used, not its poses")
+        out.remarks.append(f"the orientations in {ranked[0].name} are not set: its velocities are used, not its poses")
     elif ranked[0].type == JOINTS:
-        settings = _joints(bag, ranked[0], out.notes)
+        settings = _joints(bag, ranked[0], out.remarks)
     out.take("odometry", ranked, **settings)
 
 
@@ -157,7 +159,7 @@ def _has_no_pose(bag: Bag, topic: Topic) -> bool:
     return not any((turned.x, turned.y, turned.z, turned.w))
 
 
-def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
+def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
     """The settings of wheels that are joints, by the names in the first message."""
     first = next(bag.messages([topic.name]), None)
     names = [name for name in getattr(first and first.message, "name", ()) if isinstance(name, str)]
@@ -169,13 +171,15 @@ def _joints(bag: Bag, topic: Topic, notes: list[str]) -> dict[str, Any]:
     sides = {"left": left, "right": right}
     if len(rear) == len(front) == 2:
         sides |= {"rear_left": next(filter(LEFT.search, rear), ""), "rear_right": next(filter(RIGHT.search, rear), "")}
-        notes.append("four wheels: if they are mecanum wheels, set base [m], the distance between the axles, in wheels")
+        remarks.append(
+            "four wheels: if they are mecanum wheels, set base [m], the distance between the axles, in wheels"
+        )
     values = getattr(first and first.message, "position", ())
     if len(values) and all(float(value).is_integer() for value in values) and any(values):
-        notes.append(
+        remarks.append(
             "positions of joints are whole numbers: if they are counts, set unit in wheels to the radians per count"
         )
-    notes.append(
+    remarks.append(
         f"wheels: {left} and {right} are taken for them, of the joints {listed(names)}; measure radius and track [m]: "
         "here, or as [odometry.wheels] in the rig, which comes first"
     )
@@ -191,14 +195,14 @@ def _reference(out: Uses, topics: Sequence[Topic], tree: Tree) -> None:
     plain = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name)]
     if plain:
         out.take("reference", plain[:1])
-        out.notes.append(f"{plain[0].name} is used as the reference: remove it if it is an estimate, not the truth")
+        out.remarks.append(f"{plain[0].name} is used as the reference: remove it if it is an estimate, not the truth")
     robot = tree.robot()
     world = None if robot is None else tree.above(robot, WORLD)
     if not plain and world is not None:
         settings = {"topic": tree.topic, "parent": world, "child": robot}
         out.options["reference"] = settings
         out.uses[tree.topic] = ", ".join(dict.fromkeys((*filter(None, [out.uses.get(tree.topic)]), "reference")))
-        out.notes.append(
+        out.remarks.append(
             f"{robot} in {world}, of {tree.topic}, is used as the reference: remove it if it is an estimate, as of amcl or SLAM, "
             "not the truth"
         )
@@ -218,7 +222,7 @@ def _camera(out: Uses, topics: Sequence[Topic]) -> None:
     if settings:
         out.uses[settings["info"]] = "camera: lens"
     else:
-        out.notes.append("no CameraInfo belongs to the images: the rig has to describe the camera")
+        out.remarks.append("no CameraInfo belongs to the images: the rig has to describe the camera")
 
 
 def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
@@ -232,7 +236,7 @@ def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, l
         try:
             custom.append((topic, leaves(bag.store(topic.name), topic.type)))
         except InputError as error:  # the topic may be irrelevant
-            out.notes.append(str(error))
+            out.remarks.append(str(error))
     return custom
 
 
@@ -246,18 +250,18 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     settings: dict[str, Any] = {"fields": fields}
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
-        out.notes.append(f"{topic.name} does not distinguish antennas: all reads are assigned to one, set in antenna")
+        out.remarks.append(f"{topic.name} does not distinguish antennas: all reads are assigned to one, set in antenna")
     if units := _units(fields):
         settings["units"] = units
     if LIST in fields["epc"] and LIST not in fields.get("antenna", LIST):
         settings["rounds"] = "message"
-        out.notes.append(
+        out.remarks.append(
             "rfid: each message is treated as one inventory round of its antenna, an empty one as a round without reads"
         )
     out.take("rfid", [topic, *(candidate for candidate, _ in candidates if candidate is not topic)], **settings)
     doubtful = [name for name in UNITS if name in fields and name not in units]
     if doubtful:
-        out.notes.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
+        out.remarks.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
 
 
 def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
@@ -266,7 +270,7 @@ def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     if candidates and "bearing_range" not in out.options:
         topic, fields = candidates[0]
         out.take("bearing_range", [candidate for candidate, _ in candidates], fields=fields)
-        out.notes.append(
+        out.remarks.append(
             f"{topic.name} is taken for ranges [m] to landmarks of the map that {fields['landmark']} names"
         )
 

@@ -20,7 +20,7 @@ from factorgraph_loc.io.bags.poses import POSES, PoseTopic, StaticFrames, poses_
 from factorgraph_loc.io.bags.topics import LIST, TF, Listeners, TopicRows, TopicSettings, check_path
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.sensors.odometry.measurement import YawRateStream
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import Notice, notice, quoted
 from factors.se2 import Array, Integers
 
 JOINTS = "sensor_msgs/msg/JointState"
@@ -32,7 +32,7 @@ TWISTS = {  # path of the twist by type
 }
 IMU = "sensor_msgs/msg/Imu"
 # timestamps (N,) [ns], and velocities (N, 2) or increments (N, 3), after the bag is read; adds to the warnings
-Motion = Callable[[list[str]], tuple[Integers, Array]]
+Motion = Callable[[list[Notice]], tuple[Integers, Array]]
 
 
 class WheelSettings(motions.WheelSizes):
@@ -78,7 +78,7 @@ class JointRows:
         if set(self._wheels.joints) <= set(names):  # other messages contain other joints
             self.rows.append(item, t_ns, [values[names.index(joint)] for joint in self._wheels.joints])
 
-    def pairs(self, warnings: list[str]) -> tuple[Integers, Array]:
+    def pairs(self, warnings: list[Notice]) -> tuple[Integers, Array]:
         """Timestamps (N,), and the numbers (N, W) of the wheels. InputError if no message has all joints."""
         joints = self._wheels.joints
         if not len(self.rows):
@@ -95,7 +95,7 @@ class TwoWheels:
     def __init__(self, left: TopicRows, right: TopicRows) -> None:
         self.rows, self._right = left, right
 
-    def pairs(self, warnings: list[str]) -> tuple[Integers, Array]:
+    def pairs(self, warnings: list[Notice]) -> tuple[Integers, Array]:
         """Timestamps (N,), and the left and the right number (N, 2). InputError if the topics have no time in common."""
         l_ns, left = self.rows.in_order(("wheel",), warnings)
         r_ns, right = self._right.in_order(("wheel",), warnings)
@@ -108,7 +108,8 @@ class TwoWheels:
         if not len(t_ns):
             raise InputError(f"{self.rows.source} and {self._right.source}: no messages are near in time")
         if lost := len(l_ns) - len(keep):
-            warnings.append(f"{self.rows.source}: {lost} messages have none of the right wheel near in time")
+            sentence = "{source}: {messages} messages have none of the right wheel near in time"
+            warnings.append(notice("unpaired_wheels", sentence, self.rows.source, lost))
         alone = np.append(np.diff(t_ns) > 0, True)  # the last one of equal stamps
         return t_ns[alone], np.hstack((left[keep], right[near[keep]]))[alone]
 
@@ -143,7 +144,7 @@ class YawRates:
         self._rows = TopicRows(f"{bag.path} {options.topic}", 3, paths)
         self.add = self._rows.add
 
-    def stream(self, t0_ns: int, warnings: list[str]) -> YawRateStream:
+    def stream(self, t0_ns: int, warnings: list[Notice]) -> YawRateStream:
         """Turn rates about the robot's z axis; only the axes of the IMU that contribute must be finite."""
         turned = self._options.turned()
         if self._options.frame is not None:
@@ -181,7 +182,7 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
     """The motion between consecutive poses in the frame of odometry, or between transforms."""
     poses = poses_of_topic(listeners, options, static)
 
-    def motion(warnings: list[str]) -> tuple[Integers, Array]:
+    def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
         path = poses.path(warnings)
         t_ns = path.stamps()
         moves = motions.between_poses(path.name, t_ns, path.on_floor(warnings, options), warnings)
@@ -211,7 +212,7 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
         left = listeners.listen(options, _wheel(bag, options.topic, wheels.left))
         rows = TwoWheels(left, listeners.listen(of_right, _wheel(bag, wheels.right_topic, wheels.right)))
 
-    def motion(warnings: list[str]) -> tuple[Integers, Array]:
+    def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
         source = rows.rows.source
         size = wheels.metres(source, "odometry.wheels", turns=wheels.unit != "m")
         if isinstance(wheels.unit, float):

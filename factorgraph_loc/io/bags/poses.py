@@ -20,7 +20,7 @@ from factorgraph_loc.io.bags.topics import TF, Listeners, Stamper, TopicRows, To
 from factorgraph_loc.model.log import StartPose
 from factorgraph_loc.model.planar import Turned, rotations_of
 from factorgraph_loc.model.pose_path import PosePath
-from factorgraph_loc.text import error_text, listed, quoted
+from factorgraph_loc.text import Notice, error_text, listed, quoted
 from factors.se2 import Array, Integers
 
 SEVEN = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -74,7 +74,7 @@ class Poses:
         self._rows = TopicRows(f"{bag.path} {name}", len(paths), paths)
         self.add = self._rows.add
 
-    def path(self, warnings: list[str]) -> PosePath:
+    def path(self, warnings: list[Notice]) -> PosePath:
         """The poses, the last one of equal timestamps; InputError names the invalid message."""
         return path_of(self._rows.source, self._rows, warnings, has_rotations=not self._are_points)
 
@@ -94,7 +94,7 @@ class Start:
             variances = np.asarray(stated.covariance, dtype=float)[[0, 7, 35]]
             self._found = (t_ns, np.array([seven(stated.pose)], dtype=float), variances)
 
-    def pose(self, t0_ns: int, warnings: list[str]) -> StartPose:
+    def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
         """The start; InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
         t_ns, values, variances = self._found
@@ -119,7 +119,7 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
     return rotations_of(source, rows, table[:, 3:])
 
 
-def path_of(source: str, rows: TopicRows, warnings: list[str], *, has_rotations: bool = True) -> PosePath:
+def path_of(source: str, rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
     """The poses of rows of positions and quaternions, or of positions alone; the last one of equal timestamps. InputError names the
     invalid message."""
     values = rows.values
@@ -189,7 +189,7 @@ class FrameReference:
             stamp = self._stamper.choose(as_nanoseconds(transform.header.stamp, 1), t_ns)
             edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
 
-    def path(self, warnings: list[str]) -> PosePath:
+    def path(self, warnings: list[Notice]) -> PosePath:
         """The poses at the timestamps of the most frequent transform where all are known; the others are interpolated."""
         edges = [
             self._edge(name, warnings) if name in self._edges else self._static.parents[name][1]
@@ -233,7 +233,7 @@ class FrameReference:
             frame = parents[frame]
         return chain
 
-    def _edge(self, name: str, warnings: list[str]) -> PosePath:
+    def _edge(self, name: str, warnings: list[Notice]) -> PosePath:
         return path_of(f"{self._source} {self._parents[name]} to {name}", self._edges[name], warnings)
 
 
@@ -292,8 +292,8 @@ class Tree:
         return next((name for name in names if name in known), None)
 
 
-def tree_of(bag: Bag, notes: list[str]) -> Tree:
-    """The frames in the transforms of a bag. A topic that cannot be read is reported in ``notes``."""
+def tree_of(bag: Bag, remarks: list[str]) -> Tree:
+    """The frames in the transforms of a bag. A topic that cannot be read is reported in ``remarks``."""
     parents: dict[str, str] = {}
     moving: set[str] = set()
     topic = ""
@@ -304,9 +304,11 @@ def tree_of(bag: Bag, notes: list[str]) -> Tree:
         try:
             edges.update(_edges(bag, candidate.name))
         except InputError as error:
-            notes.append(str(error))
+            remarks.append(str(error))
         except (AttributeError, TypeError, ValueError) as error:
-            notes.append(f"{bag.path}: topic {candidate.name} is defined in the bag unlike in ROS: {error_text(error)}")
+            remarks.append(
+                f"{bag.path}: topic {candidate.name} is defined in the bag unlike in ROS: {error_text(error)}"
+            )
         parents |= edges
         if candidate.name != STATIC:
             moving |= edges.keys()

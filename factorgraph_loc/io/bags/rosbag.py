@@ -45,31 +45,34 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import native_tables
-from factorgraph_loc.text import listed, plain
+from factorgraph_loc.text import Notice, listed, notice, plain
 from factors.camera.model import angles_of_camera
 from factors.se2 import Array
 
 FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 
 
-def camera_of(info: Info, frames: StaticFrames, notes: list[str]) -> CameraSettings:
+def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSettings:
     """The camera of a ``CameraInfo``. Without a mounting in tf_static it is at the robot's origin and points forward."""
     pose = frames.pose(info.frame)
     if pose is None:
-        notes.append(f"tf_static has no mounting of {info.frame} on {frames.base}")
+        notes.append(notice("unmounted", "tf_static has no mounting of {frame} on {base}", info.frame, frames.base))
         return info.settings({})
-    notes.append(f"tf_static has the mounting of {info.frame} on {frames.base}")
+    notes.append(notice("mounted", "tf_static has the mounting of {frame} on {base}", info.frame, frames.base))
     roll, pitch, yaw = angles_of_camera(pose[:3, :3])
     x, y, z = pose[:3, 3].tolist()
     return info.settings({"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw})
 
 
-def antennas_of(names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, notes: list[str]) -> RfidSettings:
+def antennas_of(
+    names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, notes: list[Notice]
+) -> RfidSettings:
     """Antennas with frames ``given``, or frames of their names; the frame's x axis is the boresight. Others are at the origin."""
     poses = {name: frames.pose(given.get(name, name)) for name in sorted(names)}
     for verb, known in (("has the", True), ("has no", False)):
         if which := [name for name, pose in poses.items() if (pose is not None) == known]:
-            notes.append(f"tf_static {verb} mounting of antennas {', '.join(which)} on {frames.base}")
+            sentence = f"tf_static {verb} mounting of antennas {{antennas}} on {{base}}"
+            notes.append(notice("mounted" if known else "unmounted", sentence, ", ".join(which), frames.base))
     return RfidSettings(
         antennas={name: AntennaSettings() if p is None else _antenna(name, p) for name, p in poses.items()}
     )
@@ -138,7 +141,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         has_heading = of_reference.has_heading and path.has_rotations
         t = checks.seconds(path.stamps(), t0_ns)
         reference = Trajectory(t, path.on_floor(warnings, of_reference), has_heading=has_heading)
-    notes: list[str] = []  # on the bag's own rig
+    notes: list[Notice] = []  # on the bag's own rig
     rig = _rig(streams, info, options, frames, notes)
     name = bag.path.resolve().stem
     return Log(
@@ -151,7 +154,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         t0_ns=t0_ns,
         warnings=tuple(warnings),
         metadata={"clock": clock}
-        | ({RIG_NOTES: "; ".join(notes)} if notes else {})
+        | ({RIG_NOTES: "; ".join(map(str, notes))} if notes else {})
         | ({NOT_READ: left_out} if (left_out := _left_out(bag, listeners)) else {}),
     )
 
@@ -192,7 +195,7 @@ def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Ima
 
 
 def _rig(
-    streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[str]
+    streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[Notice]
 ) -> Rig:
     """The rig from the bag with the default noise; a rig in the manifest replaces it."""
     camera = camera_of(info, frames, notes) if info else None
@@ -216,7 +219,7 @@ def read_trajectory(path: Path, topic: str) -> PosePath:
             known = [candidate.name for candidate in bag.topics.values() if candidate.type in (*POSES, POINT, *TF)]
             names = listed(known) or "none has poses"
             raise InputError(f"{path}: is a bag, expected {path}:TOPIC, with one of its topics: {names}")
-        listeners, warnings = Listeners(bag, "header"), list[str]()
+        listeners, warnings = Listeners(bag, "header"), list[Notice]()
         parent, _, child = frames.partition(WITHIN)
         if bag.topic(name).type in TF and not (parent and child):
             raise InputError(f"{path}: {name} holds transforms, expected two frames too: {path}:{name}:map.base_link")

@@ -29,7 +29,7 @@ from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.rfid import tables as native_rfid
 from factorgraph_loc.sensors.rfid.stream import RFID, RfidStream
 from factorgraph_loc.sensors.tables import stream_of
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import Notice, listed
 
 LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
 CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: centre and four corners
@@ -109,7 +109,7 @@ class RowsOfTopic:
         read = Cells(Path(self._rows.source), self._rows.rows, cells, units=self._units)
         return TableRows.of(read, self._columns, self._rows.t_ns)
 
-    def stream(self, t0_ns: int, warnings: list[str]) -> Stream:
+    def stream(self, t0_ns: int, warnings: list[Notice]) -> Stream:
         """The rows as a stream; problems are an InputError or a warning."""
         return stream_of(self._table, self.rows_of(), t0_ns, warnings)
 
@@ -170,7 +170,7 @@ class Reads(RowsOfTopic):
         self._number += [numbers[name] for name in of_reads]
         self._rounds += [(t_ns, reads, name) for name in antennas]
 
-    def stream(self, t0_ns: int, warnings: list[str]) -> RfidStream:
+    def stream(self, t0_ns: int, warnings: list[Notice]) -> RfidStream:
         """All reads in their rounds. InputError names the invalid message."""
         table = self.rows_of()
         table = replace(table, names=table.names | {"epc": in_case(table.names["epc"], self._options.epc_case)})

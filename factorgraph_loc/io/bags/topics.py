@@ -19,7 +19,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
-from factorgraph_loc.text import error_text, listed, quoted
+from factorgraph_loc.text import Notice, error_text, listed, notice, quoted
 from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ class TopicRows:
         """The numbers (N, width)."""
         return np.array(self._values, dtype=float).reshape(-1, self._width)
 
-    def in_order(self, names: Sequence[str], warnings: list[str]) -> tuple[Integers, Array]:
+    def in_order(self, names: Sequence[str], warnings: list[Notice]) -> tuple[Integers, Array]:
         """Timestamps (M,) and numbers (M, width) in order of time, all finite; InputError names the invalid message."""
         checks.require_finite(self.source, self.rows, names, self.values)
         keep = checks.in_order(self.source, self.rows, self.t_ns, warnings)
@@ -280,7 +280,7 @@ class Stamper:
         return float(np.median(np.frombuffer(self._delays, dtype=np.int64))) / 1e9
 
 
-def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
+def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[Notice]]:
     """A line on the clock used and the delays found, and warnings."""
     delays = {s.topic.name: delay for s in stampers if (delay := s.delay()) is not None}
     line = "header stamps" if clock == "header" else "time of receipt"
@@ -295,8 +295,9 @@ def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[str]]:
     known = {name: delay for name, delay in compared.items() if delay is not None}
     if known and max(known.values()) - min(known.values()) > MAX_DELAY:
         low, high = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
-        warnings.append(
-            f"the clocks of {low} and {high} differ by {known[high] - known[low]:.3f} s: "
+        sentence = (
+            "the clocks of {low} and {high} differ by {delay:.3f} s: "
             "choose clock in the manifest, or set time_offset in the rig"
         )
+        warnings.append(notice("clocks_differ", sentence, low, high, known[high] - known[low]))
     return line, warnings

@@ -27,7 +27,7 @@ from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.registry import Channel, channel
 from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_tables
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import Notice, listed, notice
 
 REFERENCE = "reference.tum"
 SUFFIXES = (".csv", ".parquet")
@@ -57,7 +57,7 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
         raise InputError(f"{path}: has no {RUN_FILE}, expected a folder in the native format")
     run_path = path / RUN_FILE
     run = parse_model(RunFile, read_toml(run_path), run_path)
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     tables = read_tables(path, warnings)
     if "odometry" not in tables:
         if not run_path.read_text(encoding="utf-8").strip():
@@ -95,7 +95,7 @@ def world_of(run: RunFile, source: Path) -> World:
     return parse_world(run.world, f"{source} [world]", source.parent)
 
 
-def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
+def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
     """The non-empty tables by name. A table of an unknown sensor gives a warning."""
     tables = {}
     for name, (_, descriptions) in native_tables().items():
@@ -105,11 +105,11 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
         for file in files:
             rows = read_table(inside(folder, file.name, folder), descriptions)
             if rows.left_out:
-                warnings.append(f"{file}: columns that are not read: {listed(rows.left_out)}")
+                warnings.append(checks.unread_columns(file, rows.left_out))
             if len(rows.rows):
                 tables[name] = rows
             else:
-                warnings.append(f"{file}: contains no rows")
+                warnings.append(notice("no_rows", "{source}: contains no rows", file))
     suffixes = (POINTS_SUFFIX, *(layer.suffix for layer in layers().values() if layer.suffix))
     unread = sorted(
         file.name
@@ -117,7 +117,7 @@ def read_tables(folder: Path, warnings: list[str]) -> dict[str, TableRows]:
         if file.suffix in SUFFIXES and file.stem not in native_tables() and not file.name.endswith(suffixes)
     )
     if unread:
-        warnings.append(f"{folder}: this version does not read {listed(unread)}")
+        warnings.append(notice("unread_files", "{source}: this version does not read {files}", folder, listed(unread)))
     return tables
 
 
@@ -129,7 +129,7 @@ def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, S
     return {channel.name: assemble(channel, table, reading) for channel, table in rows.items()}
 
 
-def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[str]) -> Trajectory | None:
+def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[Notice]) -> Trajectory | None:
     if not path.is_file():
         return None
     poses = read_pose_file(inside(path.parent, path.name, path.parent), "tum")

@@ -24,7 +24,7 @@ from factorgraph_loc.model.log import RIG_NOTES, Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import READERS
-from factorgraph_loc.text import listed, one_line, quoted
+from factorgraph_loc.text import listed, notice, quoted
 
 LogLike = Log | str | Path
 RigLike = Rig | str | Path
@@ -221,8 +221,10 @@ def _read(source: _Source, rig: Rig | None, world: World | None, options: Mappin
         if log.rig is DEFAULT_RIG:
             log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
         else:
-            warnings.append("the gyro is not used, because the rig's sensors do not include imu")
+            sentence = "the gyro is not used, because the rig's sensors do not include imu"
+            warnings.append(notice("unused_gyro", sentence))
     if log.rig.name == DEFAULT_RIG.name:
-        warnings.append("no rig is given: the default rig does not have this robot's noise and mounting")
+        sentence = "no rig is given: the default rig does not have this robot's noise and mounting"
+        warnings.append(notice("default_rig", sentence))
     log = replace(log, rig=with_wheels_in(log.rig, options))
-    return replace(log, warnings=tuple(map(one_line, (*warnings, *look_over(log)))))
+    return replace(log, warnings=(*warnings, *look_over(log)))

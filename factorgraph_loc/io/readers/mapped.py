@@ -31,7 +31,7 @@ from factorgraph_loc.sensors.odometry.measurement import IMU, INCREMENTS, VELOCI
 from factorgraph_loc.sensors.odometry.measurement import WHEELS as WHEEL_COLUMNS
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, read_rounds
 from factorgraph_loc.sensors.tables import Reading, native_tables
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import Notice, listed, notice
 from factors import se2
 from factors.se2 import Array, Integers
 
@@ -160,10 +160,12 @@ def read(path: Path | None, options: Options) -> Log:
     if (of_reference := options.reference) is not None:
         reference = read_reference(folder, of_reference, t0_ns)
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
-            warnings.append(
-                f"{of_reference.file}: the reference and the odometry do not overlap: t = {reference.t[0]:.3f} s and "
-                f"{(stamps[0][0] - t0_ns) / 1e9:.3f} s begin them; check units.t and clock_offset"
+            sentence = (
+                "{source}: the reference and the odometry do not overlap: t = {reference:.3f} s and {odometry:.3f} s begin them; "
+                "check units.t and clock_offset"
             )
+            begins = reference.t[0], (stamps[0][0] - t0_ns) / 1e9
+            warnings.append(notice("no_overlap", sentence, of_reference.file, *begins))
     name = path.resolve().name
     return Log(
         name=name,
@@ -209,8 +211,8 @@ def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRo
     if not len(kept):
         raise InputError(f"{table.path}: no row has a {column} that {path.name} names, such as {listed(known)}")
     if skipped := len(names) - len(kept):
-        among = f"a {column} that is not among the names taken from {path.name}"
-        folder.warnings.append(f"{table.path}: {skipped} rows have {among}: skipped")
+        sentence = "{source}: {rows} rows have a {column} that is not among the names taken from {names}: skipped"
+        folder.warnings.append(notice("unknown_names", sentence, table.path, skipped, column, path.name))
     selected = table.rows_at(kept)
     return replace(selected, names={column: [known[name] for name in selected.names[column]]})
 
@@ -353,7 +355,7 @@ def _columns(mapped: Cells, offset: float) -> tuple[Integers, dict[str, Array]]:
     return mapped.stamps("t", offset), {n: mapped.numbers(n, COLUMNS[n]) for n in mapped.columns if n != "t"}
 
 
-def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[str]) -> Array:
+def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[Notice]) -> Array:
     if "qw" in columns:
         rotations = rotations_of(path, rows, np.column_stack([columns[name] for name in QUATERNION]))
         places = np.column_stack((columns["x"], columns["y"], columns.get("z", np.zeros(len(rows)))))

@@ -28,7 +28,7 @@ from factorgraph_loc.files.models import FileModel, InUnit, read_toml
 from factorgraph_loc.files.tables import Cells, TableRows
 from factorgraph_loc.sensors.rfid.stream import RFID
 from factorgraph_loc.sensors.rfid.tables import SIGNALS
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.se2 import Array
 
 NAME = "the * of "  # and the pattern: the column of the names
@@ -215,13 +215,12 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
     return np.asarray(table[np.where(np.isnan(number), len(table), number).astype(np.int64) - 1])
 
 
-def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[str]) -> TableRows:
+def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[Notice]) -> TableRows:
     """Add a second read, with a time only, for each row that summarizes several."""
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
-            warnings.append(
-                f"{table.path}: {many} rows summarize several reads with one timestamp, which count as one read each"
-            )
+            sentence = "{source}: {rows} rows summarize several reads with one timestamp, which count as one read each"
+            warnings.append(notice("summarized_reads", sentence, table.path, many))
         return table
     last_ns = mapped.stamps("last", options.clock_offset)
     wrong = np.flatnonzero(last_ns < table.t_ns)
@@ -232,7 +231,8 @@ def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: lis
         count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)
         several &= count > 1.0
         if more := int(np.sum(np.maximum(count - np.where(several, 2.0, 1.0), 0.0))):
-            warnings.append(f"{table.path}: {more} reads between the first and the last of their row are skipped")
+            sentence = "{source}: {reads} reads between the first and the last of their row are skipped"
+            warnings.append(notice("summarized_reads", sentence, table.path, more))
     repeated = table.rows_at(np.flatnonzero(several))
     unknown = {name: np.full(len(repeated.rows), np.nan) for name in repeated.numbers}
     return _concatenated(table.path, (table, replace(repeated, t_ns=last_ns[several], numbers=unknown)))

@@ -22,7 +22,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
 from factorgraph_loc.sensors.tables import stream_of
-from factorgraph_loc.text import listed
+from factorgraph_loc.text import Notice, listed, notice
 from factors import se2
 from factors.se2 import Array
 
@@ -46,7 +46,7 @@ def read(path: Path | None, options: Options) -> Log:
     names file, field and row (counted from 1 within the field)."""
     file = path or shipped(options.run)
     fields, unread = read_matlab(file, FIELDS)
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     truth, driven, observed = (
         _rows(f"{file}:{name}", fields[name], columns)
         for name, columns in (("GT", "t x y heading"), ("DR", "t dx dtheta"), ("TD", "t unused beacon range"))
@@ -123,7 +123,7 @@ def beacons(source: str, table: Array) -> World:
     return World(name="plaza", landmarks=landmarks)
 
 
-def increments(driven: TableRows, t0_ns: int, warnings: list[str]) -> IncrementStream:
+def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> IncrementStream:
     """The odometry, preceded by a row without motion at ``t0_ns``, which defines the duration of the first one."""
     moves = np.column_stack((driven.numbers["dx"], np.zeros(len(driven.rows)), driven.numbers["dtheta"]))
     t_ns, moves = checks.increments_in_order(driven.path, driven.rows, driven.t_ns, moves, warnings)
@@ -133,12 +133,13 @@ def increments(driven: TableRows, t0_ns: int, warnings: list[str]) -> IncrementS
     return IncrementStream(checks.seconds(t_ns, t0_ns), *np.ascontiguousarray(moves.T))
 
 
-def ranges(observed: TableRows, t0_ns: int, warnings: list[str]) -> Stream:
+def ranges(observed: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
     """The ranges sorted by time: the file joins overlapping recordings, so its order is not that of arrival."""
     distance = observed.numbers["range"]
     require(distance > 0.0, observed.path, observed.rows, "range", distance, "more than 0")
     if moved := int(np.count_nonzero(observed.t_ns < np.maximum.accumulate(observed.t_ns))):
-        warnings.append(f"{observed.path}: {moved} rows are older than one before them: sorted by time")
+        sentence = "{source}: {rows} rows are older than one before them: sorted by time"
+        warnings.append(notice("sorted_rows", sentence, observed.path, moved))
     names = {"landmark": [f"{number:g}" for number in observed.numbers["beacon"]]}
     numbers = {"range": distance, "bearing": np.full(len(distance), np.nan)}
     order = np.argsort(observed.t_ns, kind="stable")

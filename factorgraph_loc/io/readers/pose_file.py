@@ -19,6 +19,7 @@ from factorgraph_loc.files.models import FARTHEST, read_text
 from factorgraph_loc.files.tables import Cells
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.pose_path import PosePath
+from factorgraph_loc.text import Notice
 from factors.camera import model as reprojection
 from factors.se2 import Array, Integers
 
@@ -90,7 +91,7 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
     if detected == "kitti":
         matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
-    warnings: list[str] = []
+    warnings: list[Notice] = []
     cells = _read(path, EUROC, ",", "ns") if detected == "euroc" else _read(path, TUM, " ", "s")
     cells = replace(cells, labels={})  # names of columns say more than numbers
     table = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[1:]])

@@ -24,6 +24,7 @@ from factorgraph_loc.maps.markers import MarkerFamily, corner_names
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.text import Notice, notice
 from factorgraph_loc.vision.feature_cache import FeatureCache, ImageFeatures, cache_folder, decode, encode
 from factorgraph_loc.vision.features import Extractor, extractor
 from factorgraph_loc.vision.fiducials import find_markers
@@ -65,8 +66,8 @@ class _ImageFile:
 
 def with_features(
     log: Log, settings: FrontendSettings, progress: Callable[[float], None] | None = None
-) -> tuple[Log, tuple[str, ...]]:
-    """Replace the images of a log by features and tracks. Returns the log and warnings, one line each.
+) -> tuple[Log, tuple[Notice, ...]]:
+    """Replace the images of a log by features and tracks. Returns the log and warnings.
 
     An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without features.
     ``progress`` is called with the completed share. A log without images is returned unchanged.
@@ -89,7 +90,7 @@ def with_features(
         for t, f, numbers in zip(stream.t.tolist(), features, tracks, strict=True)
     ]
     streams = dict(log.streams) | {"camera": FeatureStream(stream.t, frames)}
-    unkept = (f"features are not cached, {kept.fault}",) if kept.fault else ()
+    unkept = (notice("no_cache", "features are not cached, {error}", kept.fault),) if kept.fault else ()
     return replace(log, streams=streams), (*_doubts(log, images), *unkept)
 
 
@@ -202,18 +203,24 @@ def _require_calibrated(log: Log, images: list[_ImageFile], camera: CameraModel)
         )
 
 
-def _doubts(log: Log, images: list[_ImageFile]) -> tuple[str, ...]:
+def _doubts(log: Log, images: list[_ImageFile]) -> tuple[Notice, ...]:
     doubts = []
-    for what, faults in (
-        ("cannot be read", [image.fault for image in images if image.fault and image.other_size is None]),
-        ("have another size", [image.fault for image in images if image.other_size is not None]),
+    for kind, what, faults in (
+        (
+            "unreadable_images",
+            "cannot be read",
+            [image.fault for image in images if image.fault and image.other_size is None],
+        ),
+        ("image_sizes", "have another size", [image.fault for image in images if image.other_size is not None]),
     ):
         if faults:
-            doubts.append(
-                f"{log.name}: {len(faults)} of {len(images)} images {what} and are without features, the first is {faults[0]}"
+            sentence = (
+                f"{{log}}: {{faults}} of {{images}} images {what} and are without features, the first is {{first}}"
             )
+            doubts.append(notice(kind, sentence, log.name, len(faults), len(images), faults[0]))
     if blank := sum(image.found is not None and len(image.found.pixels) == 0 for image in images):
-        doubts.append(f"{log.name}: {blank} of {len(images)} images show no features")
+        sentence = "{log}: {blank} of {images} images show no features"
+        doubts.append(notice("no_features", sentence, log.name, blank, len(images)))
     return tuple(doubts)
 
 
@@ -257,9 +264,13 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
             pixels += corners
             t += [stamp] * len(corners)
     kept.trim()
-    warnings = [f"markers: {len(faults)} images cannot be used, the first: {faults[0]}"] if faults else []
+    warnings = []
+    if faults:
+        sentence = "markers: {images} images cannot be used, the first: {first}"
+        warnings.append(notice("unreadable_images", sentence, len(faults), faults[0]))
     if not names:
-        warnings.append(f"markers: no marker of {family} was found in {len(stream.t)} images")
+        sentence = "markers: no marker of {family} was found in {images} images"
+        warnings.append(notice("no_markers", sentence, family, len(stream.t)))
         return replace(log, warnings=(*log.warnings, *warnings))
     u, v = np.array(pixels).T
     return replace(

@@ -16,6 +16,7 @@ from factorgraph_loc.files.columns import LARGEST_PIXEL, PIXELS, PURE, STAMP, Co
 from factorgraph_loc.files.models import inside
 from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
+from factorgraph_loc.text import Notice, notice
 from factorgraph_loc.vision.frame import CameraFrame
 from factors.se2 import Array
 
@@ -135,7 +136,7 @@ FEATURES = Table(
 FOLDER = "camera"
 
 
-def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path | None = None) -> ImageStream:
+def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Path | None = None) -> ImageStream:
     """The existing images in order of arrival; of several with one timestamp the last. They are in ``folder``, which must be
     validated, by default that of the native format.
 
@@ -148,9 +149,8 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[str], folder: Path 
     keep = [i for i in latest if paths[i] is not None]
     if missing := [i for i in latest if paths[i] is None]:
         first = f"{table.names['file'][missing[0]]} of row {table.rows[missing[0]]}"
-        warnings.append(
-            f"{table.path}: {len(missing)} of {len(latest)} images are missing and skipped, the first is {first}"
-        )
+        sentence = "{source}: {missing} of {images} images are missing and skipped, the first is {first}"
+        warnings.append(notice("missing_images", sentence, table.path, len(missing), len(latest), first))
     t = checks.seconds(table.t_ns[keep], t0_ns)
     return ImageStream(t, [path for path in (paths[i] for i in keep) if path is not None])
 

@@ -21,6 +21,7 @@ from factorgraph_loc.sensors.camera.measurement import ImageStream, PixelSightin
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.sensors.interfaces import Marks, Paragraph, Summary
+from factorgraph_loc.text import Notice, listed, notice
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.images import decoded, read_image
 from factorgraph_loc.vision.matching import match
@@ -119,41 +120,44 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
     )
 
 
-def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[str]:
+def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[Notice]:
     """Warnings about images and named points."""
-    out = []
+    out = list[Notice]()
     if log.rig.find(CameraSettings) is None:
         streams = [name for name, summary in (("images", images), ("identified pixels", pixels)) if summary is not None]
-        out += [f"the log has {name}, but its rig has no [camera]: they are not used" for name in streams]
+        sentence = "the log has {stream}, but its rig has no [camera]: they are not used"
+        out += [notice("unused_camera", sentence, name) for name in streams]
     if images is not None:
         if images.fault is not None:
             lost = images.looked_at - images.readable
-            out.append(f"{lost} of the {images.looked_at} examined images cannot be read: {images.fault}")
+            sentence = "{unreadable} of the {images} examined images cannot be read: {error}"
+            out.append(notice("unreadable_images", sentence, lost, images.looked_at, images.fault))
         if len(images.sizes) > 1:
-            out.append(f"images have several sizes: {', '.join(images.sizes)}")
+            out.append(notice("image_sizes", "images have several sizes: {sizes}", ", ".join(images.sizes)))
         out += _calibration(log, images)
         if images.readable and images.features == 0.0:
-            out.append(f"half of the examined images, or more, show no {images.feature} features")
+            sentence = "half of the examined images, or more, show no {feature} features"
+            out.append(notice("no_features", sentence, images.feature))
     if pixels is not None:
         if pixels.unknown:
             rows, names = sum(pixels.unknown.values()), list(pixels.unknown)
-            more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-            out.append(
-                f"{rows} sightings are of {len(names)} points that the map lacks: {', '.join(names[:SHOWN])}{more}"
-            )
+            sentence = "{rows} sightings are of {points} points that the map lacks: {names}"
+            out.append(notice("unknown_points", sentence, rows, len(names), listed(names, SHOWN)))
         if pixels.outside:
-            out.append(f"{pixels.outside} of {pixels.rows} sightings lie outside of the camera's image")
+            sentence = "{outside} of {rows} sightings lie outside of the camera's image"
+            out.append(notice("outside_image", sentence, pixels.outside, pixels.rows))
     return out
 
 
-def _calibration(log: Log, images: ImageSummary) -> list[str]:
+def _calibration(log: Log, images: ImageSummary) -> list[Notice]:
     camera = log.rig.find(CameraSettings)
     if camera is None or not images.sizes:
         return []
     size = f"{camera.width}x{camera.height}"
     sizes = [s for s in images.sizes if s != size]
     if len(sizes) == len(images.sizes):
-        return [f"the camera is calibrated for images of {size} px, those of the log have {sizes[0]} px"]
+        sentence = "the camera is calibrated for images of {expected} px, those of the log have {size} px"
+        return [notice("image_size", sentence, size, sizes[0])]
     return []
 
 
@@ -163,7 +167,7 @@ FEATURE, COUNT, FEWEST_MATCHES = "orb", 400, 12
 APART = 0.5  # least reported difference of the vertical parts of the optical axis
 
 
-def mounting_problems(log: Log) -> list[str]:
+def mounting_problems(log: Log) -> list[Notice]:
     """One line if the rotation of the images contradicts the mounting of the camera in the rig, else none. The check needs a
     camera in the rig, a reference with headings, and enough usable images; otherwise there is no line."""
     stream, camera = log.streams.get("camera"), log.rig.find(CameraSettings)
@@ -178,10 +182,11 @@ def mounting_problems(log: Log) -> list[str]:
     if abs(share - expected) <= APART:
         return []
     where = "at the floor" if share > APART else "at the ceiling" if share < -APART else "ahead"
-    return [
-        f"images turn {share:.2f} times as much as the robot, as of a camera that looks {where}, by the rig's mounting "
-        f"{expected:.2f} times: is its pitch about {math.asin(share):.1f}, not {camera.pitch:.1f}?"
-    ]
+    sentence = (
+        "images turn {ratio:.2f} times as much as the robot, as of a camera that looks {where}, by the rig's mounting "
+        "{expected:.2f} times: is its pitch about {pitch:.1f}, not {stated:.1f}?"
+    )
+    return [notice("camera_mounting", sentence, share, where, expected, math.asin(share), camera.pitch)]
 
 
 def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:

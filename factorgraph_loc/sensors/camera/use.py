@@ -21,7 +21,7 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.interfaces import Ending, Review, Use
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.tables import Intake
-from factorgraph_loc.text import plain
+from factorgraph_loc.text import Notice, notice, plain
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
@@ -41,8 +41,9 @@ def check(use: Use) -> Use:
     if "landmarks" in use.given or not unmapped or any(name not in (*NAMES, *motion) for name in use.sensors):
         return use
     settings = use.settings.model_copy(update={"landmarks": "unknown"})
-    warning = f"the map has nothing that the camera could find: it is estimated ({use.estimator}.landmarks=unknown)"
-    return replace(use, settings=settings, warnings=(*use.warnings, f"{use.log.name}: {warning}"))
+    sentence = "{log}: the map has nothing that the camera could find: it is estimated ({estimator}.landmarks=unknown)"
+    warning = notice("map_estimated", sentence, use.log.name, use.estimator)
+    return replace(use, settings=settings, warnings=(*use.warnings, warning))
 
 
 def review(use: Use, _ending: Ending) -> Review:
@@ -50,15 +51,17 @@ def review(use: Use, _ending: Ending) -> Review:
     return Review(tuple(_doubts(use)))
 
 
-def _doubts(use: Use) -> Iterator[str]:
+def _doubts(use: Use) -> Iterator[Notice]:
     """A map without points that the camera could find, where the estimator needs them; a known map that was not wanted."""
     landmarks = getattr(use.settings, "landmarks", "known")
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:
-            yield f"{use.log.name}: {use.estimator} does not estimate points: those of the map are used unchanged"
+            sentence = "{log}: {estimator} does not estimate points: those of the map are used unchanged"
+            yield notice("fixed_points", sentence, use.log.name, use.estimator)
     elif _uses_camera(use) and not (use.estimates_points and landmarks != "known"):
         alternative = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
-        yield f"{use.log.name}: the map has no points that a camera could find: give --world{alternative}"
+        sentence = "{log}: the map has no points that a camera could find: give --world{alternative}"
+        yield notice("no_points", sentence, use.log.name, alternative)
 
 
 def _uses_camera(use: Use) -> bool:
@@ -79,7 +82,7 @@ class PreparedLog:
     loaded from the cache, in ``seconds``."""
 
     log: Log
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     images: int = 0
     seconds: float = 0.0
 
@@ -122,7 +125,8 @@ def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
     """Frames without features; their timestamps still define the start and end of the run."""
     nothing = CameraFrame(0.0, "", np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64))
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
-    warning = (f"{log.name}: {estimator} does not use images: all {len(stream.t)} are ignored",)
+    sentence = "{log}: {estimator} does not use images: all {images} are ignored"
+    warning = (notice("unused_images", sentence, log.name, estimator, len(stream.t)),)
     by_name = estimator == "dead_reckoning"  # obvious from its name
     return PreparedLog(replace(log, streams={**log.streams, "camera": frames}), () if by_name else warning)
 

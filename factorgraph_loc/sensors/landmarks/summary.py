@@ -33,10 +33,12 @@ from factorgraph_loc.sensors.interfaces import (
     in_other_case,
 )
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream
+from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
+UNKNOWN_LANDMARK = "landmark {landmark} is not in the map: {sightings} sightings"
 MIN_SIGHTINGS = 10  # minimum for a statement about a landmark
 MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
 MIN_PASSES = 3
@@ -56,12 +58,13 @@ class Suspect:
     sightings: int
     swapped_with: str | None = None
 
-    def __str__(self) -> str:
-        distance = float(np.hypot(*self.offset))
-        text = (
-            f"landmark {self.landmark}: {self.sightings} sightings put it {distance:.2f} m from its position in the map"
-        )
-        return f"{text}; swapped with {self.swapped_with}?" if self.swapped_with else text
+    def warning(self) -> Notice:
+        """The warning about it."""
+        sentence = "landmark {landmark}: {sightings} sightings put it {distance:.2f} m from its position in the map"
+        values = self.landmark, self.sightings, np.hypot(*self.offset)
+        if self.swapped_with:
+            return notice("misplaced_landmark", sentence + "; swapped with {other}?", *values, self.swapped_with)
+        return notice("misplaced_landmark", sentence, *values)
 
 
 def summarize(log: Log) -> Summary:
@@ -69,12 +72,13 @@ def summarize(log: Log) -> Summary:
     with a wrong position in the map (``suspects``)."""
     unseen, unknown = _unmatched(log)
     suspects = find_suspects(log)
+    other_case = "landmark {landmark} is in the map with other capital letters"
     problems = [
         *_shifted(log),
-        *(f"landmark {name} of the map is never seen" for name in unseen),
-        *(f"landmark {name} is not in the map: {count} sightings" for name, count in unknown.items()),
-        *(f"landmark {name} is in the map with other capital letters" for name in in_other_case(unknown, unseen)),
-        *map(str, suspects),
+        *(notice("unseen_landmark", "landmark {landmark} of the map is never seen", name) for name in unseen),
+        *(notice("unknown_landmarks", UNKNOWN_LANDMARK, name, count) for name, count in unknown.items()),
+        *(notice("other_case", other_case, name) for name in in_other_case(unknown, unseen)),
+        *(suspect.warning() for suspect in suspects),
     ]
     entries = {"unseen": unseen, "unknown": unknown, "suspects": suspects}
     return Summary(entries, {"landmarks": len(log.world.landmarks)}, problems)
@@ -194,7 +198,7 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
     return unseen, {name: count for name, count in sorted(counts.items()) if name not in log.world.landmarks}
 
 
-def _shifted(log: Log) -> list[str]:
+def _shifted(log: Log) -> list[Notice]:
     """A warning if sightings of mapped landmarks fit the reference better at another time than with another mounting or height."""
     stream, reference = log.streams.get("bearing_range"), log.reference
     if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:

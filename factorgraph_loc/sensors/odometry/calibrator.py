@@ -27,6 +27,7 @@ from factorgraph_loc.sensors.odometry.settings import (
     OdometrySettings,
 )
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Traced
+from factorgraph_loc.text import Notice, notice
 from factors import chi_squared, se2
 from factors.motion import ChainState
 from factors.odometry.model import (
@@ -287,19 +288,18 @@ def _residuals(windows: Windows, model: OdometryModel) -> Residuals:
     return Residuals(windows.log.name, ERRORS, windows.t, end[:, 4] - start[:, 4], windows.errors(model), sigmas)
 
 
-def _warnings(noise: NoiseFit) -> list[str]:
+def _warnings(noise: NoiseFit) -> list[Notice]:
     """Warnings about outliers and implausibly low noise."""
     notes = []
     if noise.outliers > MOST_OUTLIERS:
-        notes.append(
-            f"{100.0 * noise.outliers:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in "
-            "the reference."
-        )
+        sentence = "{percent:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in the reference."
+        notes.append(notice("outliers", sentence, 100.0 * noise.outliers))
     if noise.floored:
-        notes.append(
-            f"The fitted noise of the odometry ({', '.join(noise.floored)}) is lower than wheels can achieve and was raised: "
+        sentence = (
+            "The fitted noise of the odometry ({errors}) is lower than wheels can achieve and was raised: "
             "the reference is probably not independent of the odometry."
         )
+        notes.append(notice("low_noise", sentence, ", ".join(noise.floored)))
     return notes
 
 

@@ -14,6 +14,7 @@ from factorgraph_loc.sensors import interfaces
 from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Paragraph, Summary
 from factorgraph_loc.sensors.motion import integrated, odometry_model
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
+from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array
 
@@ -51,7 +52,7 @@ def summarize(log: Log) -> Summary:
     return Summary(found=entries, problems=[*covered, *(problems or _doubtful(ratios))], text=text)
 
 
-def against_reference(log: Log) -> tuple[dict[str, float], list[str]]:
+def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
     """How much more the reference ``travels`` and ``turns`` than the odometry, as the rig corrects it, by least squares over
     intervals of :data:`CHORD`; and a warning if the reference stands still meanwhile. Nothing without motion.
     """
@@ -78,24 +79,26 @@ def _ratio(theirs: Array, ours: Array) -> float | None:
     return float(ours[known] @ theirs[known]) / moved if moved > 1.0 else None
 
 
-def _doubtful(ratios: Mapping[str, float]) -> list[str]:
+def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
     """Warnings about scales that differ; signs and units of turns are compared by their rates."""
     keys = {"travels": "scale_distance", "turns": "scale_rotation"}
+    sentence = "the reference {moves} {ratio:.2f} times as much as the odometry ({setting}, or fgloc calibrate)"
     return [
-        f"the reference {what} {ratio:.2f} times as much as the odometry ({keys[what]}, or fgloc calibrate)"
+        notice("odometry_scale", sentence, what, ratio, keys[what])
         for what, ratio in ratios.items()
         if abs(ratio - 1.0) > SCALED and (what == "travels" or -0.5 < ratio < 2.0)
     ]
 
 
-def _standstill(t: Array, ours: Array, theirs: Array) -> list[str]:
+def _standstill(t: Array, ours: Array, theirs: Array) -> list[Notice]:
     """A warning if the reference stands still while the odometry drives, at places (N, 2) each."""
     steps = round(STILL / (CHORD / 4.0))
     stuck = np.flatnonzero((_chords(theirs, steps) < STANDS) & (_chords(ours, steps) > DRIVES))
     if not len(stuck):
         return []
     first, far = float(t[stuck[0]]), float(np.max(_chords(ours, steps)[stuck]))
-    return [f"the reference stands still at {first:.1f} s, where the odometry drives {far:.1f} m in {STILL:g} s"]
+    sentence = "the reference stands still at {t:.1f} s, where the odometry drives {distance:.1f} m in {duration:g} s"
+    return [notice("reference_stands", sentence, first, far, STILL)]
 
 
 def _chords(places: Array, steps: int) -> Array:
@@ -103,13 +106,13 @@ def _chords(places: Array, steps: int) -> Array:
     return np.asarray(np.hypot(*(places[steps:] - places[:-steps]).T))
 
 
-def motion_problems(log: Log) -> list[str]:
+def motion_problems(log: Log) -> list[Notice]:
     """Warnings about a gyro and a reference that contradict the odometry. In a log with long gaps the longest part between them is
     compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return []
-    lines = list[str]()
+    lines = list[Notice]()
     begin, end = _longest(stream.t)
     t = np.arange(begin, end, STEP) + log.rig.time_offset("odometry")
     states = integrated(log, odometry_model(log.rig)).states(t)
@@ -173,20 +176,23 @@ def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]
     return (ab / np.sqrt(aa * bb), ab / aa) if bb > 0.0 else (0.0, 0.0)
 
 
-def _compared(sensor: str, name: str, found: RateMatch | None) -> list[str]:
+def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
     """Warnings about a wrong clock, sign or unit; ``sensor``: the one whose time_offset would correct it."""
     if found is None:
         return []
     lines = []
     if found.slope < 0.0:
-        lines.append(
-            f"{name} turns in the opposite direction of the odometry: angles are counter-clockwise, seen from above"
+        sentence = (
+            "{source} turns in the opposite direction of the odometry: angles are counter-clockwise, seen from above"
         )
+        lines.append(notice("opposite_turns", sentence, name))
     size = abs(found.slope)
     if DEGREES[0] < size < DEGREES[1]:
-        lines.append(f"{name} turns {size:.0f} times as much as the odometry: is it in degrees?")
+        sentence = "{source} turns {ratio:.0f} times as much as the odometry: is it in degrees?"
+        lines.append(notice("degrees", sentence, name, size))
     elif DEGREES[0] < 1.0 / size < DEGREES[1]:
-        lines.append(f"the odometry turns {1.0 / size:.0f} times as much as {name}: is it in degrees?")
+        sentence = "the odometry turns {ratio:.0f} times as much as {source}: is it in degrees?"
+        lines.append(notice("degrees", sentence, 1.0 / size, name))
     if found.shift:
         # a late timestamp needs a negative offset; the odometry is early if the other one is late
         offset = -found.shift if sensor == "imu" else found.shift
@@ -208,7 +214,7 @@ def _speeds(places: Array, window: float) -> Array:
     return np.asarray(np.hypot(_rates(places[:, 0], window), _rates(places[:, 1], window)))
 
 
-def _coverage(log: Log) -> list[str]:
+def _coverage(log: Log) -> list[Notice]:
     stream = log.streams.get("odometry")
     if log.reference is None or stream is None or len(stream.t) < 2:
         return []
@@ -217,5 +223,6 @@ def _coverage(log: Log) -> list[str]:
     if end - begin >= COVERED * (last - first):
         return []
     if end <= begin:
-        return ["the reference has no pose while there is odometry"]
-    return [f"the reference covers {begin:.1f} to {end:.1f} s of the odometry's {first:.1f} to {last:.1f} s"]
+        return [notice("no_overlap", "the reference has no pose while there is odometry")]
+    sentence = "the reference covers {begin:.1f} to {end:.1f} s of the odometry's {first:.1f} to {last:.1f} s"
+    return [notice("short_reference", sentence, begin, end, first, last)]

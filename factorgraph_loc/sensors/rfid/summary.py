@@ -25,7 +25,7 @@ from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST,
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.rfid import kernels
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.rfid.parameters import MOST_CERTAIN, rate_of
@@ -34,6 +34,7 @@ from factors.se2 import Array, Integers, wrap_scalar
 STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
 CLOCK_STEP = 1.0  # s
 SHOWN = 5  # names in a line or a warning
+UNKNOWN_ANTENNA = "antenna {antenna} is not on the rig: {reads} reads, {rounds} rounds"
 
 
 @dataclass(frozen=True)
@@ -123,45 +124,47 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
     )
 
 
-def rfid_problems(log: Log, found: RfidSummary) -> list[str]:
+def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
     """Warnings about the reads."""
-    out = []
+    out = list[Notice]()
     if found.unread:
-        out.append(
-            f"{len(found.unread)} of {len(log.world.tags)} tags of the map are never read: {listed(found.unread, SHOWN)}"
-        )
+        sentence = "{unread} of {tags} tags of the map are never read: {names}"
+        names = listed(found.unread, SHOWN)
+        out.append(notice("unread_tags", sentence, len(found.unread), len(log.world.tags), names))
     if found.unknown:
         reads = sum(found.unknown.values())
-        out.append(f"{reads} reads are of {len(found.unknown)} tags that the map lacks: {listed(found.unknown, SHOWN)}")
+        sentence, names = "{reads} reads are of {tags} tags that the map lacks: {names}", listed(found.unknown, SHOWN)
+        out.append(notice("unknown_tags", sentence, reads, len(found.unknown), names))
     if misspelt := in_other_case(found.unknown, found.unread):
-        out.append(
-            f"tags are in the map with other capital letters: {listed(misspelt, SHOWN)}: set epc_case for reads or map"
-        )
+        sentence = "tags are in the map with other capital letters: {names}: set epc_case for reads or map"
+        out.append(notice("other_case", sentence, listed(misspelt, SHOWN)))
     carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
-        f"antenna {name} is not on the rig: {antenna.reads} reads, {antenna.rounds} rounds"
+        notice("unknown_antenna", UNKNOWN_ANTENNA, name, antenna.reads, antenna.rounds)
         for name, antenna in found.antennas.items()
         if name not in carried
     ]
-    out += [f"antenna {name} of the rig is never active" for name in carried if name not in found.antennas]
+    idle = "antenna {antenna} of the rig is never active"
+    out += [notice("idle_antenna", idle, name) for name in carried if name not in found.antennas]
     last = max((antenna.last for antenna in found.antennas.values()), default=0.0)
     for name, antenna in found.antennas.items():
         if antenna.last < last - STOPPED:
-            out.append(f"antenna {name} stops at {antenna.last:.1f} s, {last - antenna.last:.1f} s before the others")
+            stops = "antenna {antenna} stops at {t:.1f} s, {before:.1f} s before the others"
+            out.append(notice("antenna_stops", stops, name, antenna.last, last - antenna.last))
         elif antenna.last_read is None:
-            out.append(f"antenna {name} reads nothing")
+            out.append(notice("silent_antenna", "antenna {antenna} reads nothing", name))
         elif antenna.last_read < last - STOPPED:
-            out.append(f"antenna {name} reads nothing after {antenna.last_read:.1f} s")
+            silent = "antenna {antenna} reads nothing after {t:.1f} s"
+            out.append(notice("silent_antenna", silent, name, antenna.last_read))
     return out + _clock_trouble(log, found)
 
 
-def _clock_trouble(log: Log, found: RfidSummary) -> list[str]:
+def _clock_trouble(log: Log, found: RfidSummary) -> list[Notice]:
     out = []
     count, step = found.late
     if step > CLOCK_STEP:
-        out.append(
-            f"{count} rounds have stamps up to {step:.1f} s before an earlier one: did the clock of the reader jump?"
-        )
+        jump = "{rounds} rounds have stamps up to {step:.1f} s before an earlier one: did the clock of the reader jump?"
+        out.append(notice("late_rounds", jump, count, step))
     odometry = log.streams.get("odometry")
     if odometry is None or not len(odometry.t) or not found.rounds:
         return out
@@ -169,7 +172,8 @@ def _clock_trouble(log: Log, found: RfidSummary) -> list[str]:
     wheels = odometry.t + log.rig.time_offset("odometry")
     for side, excess in (("before", wheels.min() - t.min()), ("after", t.max() - wheels.max())):
         if excess > CLOCK_STEP:
-            out.append(f"the reads reach {excess:.1f} s {side} the odometry: do their clocks agree?")
+            apart = "the reads reach {excess:.1f} s {side} the odometry: do their clocks agree?"
+            out.append(notice("clocks_differ", apart, excess, side))
     return out
 
 
@@ -184,18 +188,21 @@ def review(use: Use, ending: Ending) -> Review:
     return Review(tuple(doubts(use, ending.diagnostics, ending.learnt)), reliable)
 
 
-def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
+def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
     """That an estimator takes no tags, that no tag of a map is read, which are believed dead or moved at the end, the surest first,
     and how the antennas differ from the rig's models."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
     if rounds and use.estimator != "dead_reckoning":  # obvious from its name
-        yield f"{log.name}: {use.estimator} does not use RFID: all {rounds} inventory rounds are ignored"
+        ignored = "{log}: {estimator} does not use RFID: all {rounds} inventory rounds are ignored"
+        yield notice("unused_rfid", ignored, log.name, use.estimator, rounds)
     if "rfid" not in use.sensors:
         return
     stream, tags = log.streams.get("rfid"), log.world.tags
     if isinstance(stream, RfidStream) and not any(epc in tags for epc in stream.epc):
-        what = f"none of the {len(tags)} tags of the map is read" if tags else "reads are of no use without a map"
-        yield f"{log.name}: {what}"
+        if tags:
+            yield notice("unread_map", "{log}: none of the {tags} tags of the map is read", log.name, len(tags))
+        else:
+            yield notice("no_map", "{log}: reads are of no use without a map", log.name)
         return
     for kind, why in (
         ("dead_tags", "are believed dead, as they were not read from where they should have been"),
@@ -203,10 +210,11 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[str]:
         ("moved_tags", "are believed to have moved, as they were read from elsewhere than they should have been"),
     ):
         if suspects := diagnostics.doubted.get(kind):
-            yield f"{log.name}: {len(suspects)} of {len(tags)} tags of the map {why}: {suspected(suspects)}"
+            sentence = f"{{log}}: {{count}} of {{tags}} tags of the map {why}: {{suspects}}"
+            yield notice(kind, sentence, log.name, len(suspects), len(tags), suspected(suspects))
     settings = log.rig.find(RfidSettings)
     if settings is not None:
-        yield from (f"{log.name}: {what}" for what in _differences(settings, learnt))
+        yield from (what.about(log.name) for what in _differences(settings, learnt))
 
 
 def suspected(tags: Mapping[str, float]) -> str:
@@ -216,7 +224,7 @@ def suspected(tags: Mapping[str, float]) -> str:
     return names + (f" and {len(ranked) - SHOWN} more" if len(ranked) > SHOWN else "")
 
 
-def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
+def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
     """The learnt parameters of the antennas' models that clearly differ from the rig."""
     names = settings.parameter_names()
     for name, parameters in names.items():
@@ -225,15 +233,17 @@ def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
         ranges, rate = (learnt.values.get(f"rfid.{parameter}", (0.0, 0.0)) for parameter in parameters)
         factor = math.exp(ranges[0])
         if abs(ranges[0]) > CLEARLY * ranges[1] and abs(factor - 1.0) > CHANGED:
-            more = f"{100.0 * abs(factor - 1.0):.0f} % {'farther' if factor > 1.0 else 'less far'}"
-            yield f"{of} reach {more} than the rig says"
+            sentence = "{antennas} reach {percent:.0f} % {direction} than the rig says"
+            direction = "farther" if factor > 1.0 else "less far"
+            yield notice("range", sentence, of, 100.0 * abs(factor - 1.0), direction)
         share = peak * rate_of(peak, rate[0])
         if abs(rate[0]) > CLEARLY * rate[1] and abs(share - peak) > CHANGED:
-            yield f"{of} read {100.0 * share:.0f} % of the tags next to them, where the rig says {100.0 * peak:.0f} %"
+            sentence = "{antennas} read {percent:.0f} % of the tags next to them, where the rig says {expected:.0f} %"
+            yield notice("read_rate", sentence, of, 100.0 * share, 100.0 * peak)
     yield from _mounting(settings, learnt)
 
 
-def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
+def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
     """The yaw of antennas and the time offset that were estimated and are clearly not what the rig says, with the lines for it."""
     common, turned = learnt.values.get("rfid.yaw", (0.0, 0.0)), dict[str, float]()
     for name in settings.all_antennas():
@@ -245,7 +255,8 @@ def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[str]:
         turns = ", ".join(f"{name} by {math.degrees(turn):+.1f} degrees" for name, turn in turned.items())
         yaws = {name: wrap_scalar(settings.all_antennas()[name].yaw + turn) for name, turn in turned.items()}
         lines = ", ".join(f"rfid.antennas.{name}.yaw = {yaw:.3f}" for name, yaw in yaws.items())
-        yield f"antennas are turned from the yaw in the rig ({turns}): set {lines} in the rig"
+        sentence = "antennas are turned from the yaw in the rig ({turns}): set {settings} in the rig"
+        yield notice("antenna_yaw", sentence, turns, lines)
     later, sigma = learnt.values.get("rfid.time_offset", (0.0, 0.0))
     if abs(later) > max(CLEARLY * sigma, LATE):
         yield line("rfid", -later, "the odometry", "rfid", settings.time_offset + later)
@@ -335,12 +346,14 @@ def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> 
     doubts = []
     if np.any(off):
         shares = groups.shares(chosen[off])
-        doubts.append(f"{log}: reads over those that the detection models predict, by distance and antenna: {shares}")
+        sentence = "{log}: reads over those that the detection models predict, by distance and antenna: {shares}"
+        doubts.append(notice("detection_model", sentence, log, shares))
     if ratio * tempering > TOGETHER:
-        doubts.append(
-            f"{log}: reads and misses come in bursts, {ratio:.0f} rounds inform as much as one: set rfid.tempering = "
-            f"{1.0 / ratio:.2g} in the rig, which has {tempering:g}"
+        sentence = (
+            "{log}: reads and misses come in bursts, {rounds:.0f} rounds inform as much as one: set rfid.tempering = "
+            "{tempering:.2g} in the rig, which has {present:g}"
         )
+        doubts.append(notice("bursts", sentence, log, ratio, 1.0 / ratio, tempering))
     return Reliability("reads", groups.names(chosen), observed, predicted, sigma, ratio, tuple(doubts))
 
 

@@ -16,6 +16,7 @@ from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
 from factorgraph_loc.sensors.tables import Columns, Reading, Writing
+from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
 OUTSIDE = -1
@@ -121,7 +122,7 @@ def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
 
 
 def read_rounds(
-    reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[str]
+    reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[Notice]
 ) -> ReadsByRound:
     """The reads in their rounds; ``gap`` [s] separates rounds if there are no ``inventories``.
 
@@ -140,7 +141,7 @@ def read_rounds(
     return _rounds(reads, order, number, end_ns, [antenna[i] for i in first.tolist()])
 
 
-def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[str]) -> ReadsByRound:
+def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[Notice]) -> ReadsByRound:
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
     # a jump of the reader's clock is a fault of the recording: estimators drop the late scans
@@ -156,7 +157,8 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
         number = rounds_from_inventories(reads.t_ns, reads.names["antenna"], end_ns, antenna, duration_ns)
     keep = np.flatnonzero(number != OUTSIDE)
     if left := len(number) - len(keep):
-        warnings.append(f"{reads.path}: {left} of {len(number)} reads lie outside of every inventory and are skipped")
+        sentence = "{source}: {outside} of {reads} reads lie outside of every inventory and are skipped"
+        warnings.append(notice("outside_inventories", sentence, reads.path, left, len(number)))
     return _rounds(reads, keep, number[keep], end_ns, antenna)
 
 

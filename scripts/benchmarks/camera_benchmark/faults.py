@@ -115,7 +115,8 @@ def said(one: Attempt, right: Attempt) -> str:
     """Messages that do not occur without the fault."""
     if one.failure:
         return short(one.failure)
-    parts = [short(text.partition(": ")[2]) for text in one.warnings if text not in right.warnings]
+    new = [warning for warning in one.warnings if warning not in right.warnings]
+    parts = [short(str(replace(warning, sentence=warning.sentence.removeprefix("{log}: ")))) for warning in new]
     events = Counter(text for text in one.events if text not in right.events)
     parts += [short(text) + (f" ({times} times)" if times > 1 else "") for text, times in events.items()]
     for name, key in (("NIS", "nis.camera.median_ratio"), ("rejected", "rejected.total"), ("late", "late.total")):

@@ -14,6 +14,7 @@ from factorgraph_loc.errors import FglocError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.text import Notice
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Attempt:
 
     errors: RunErrors | None
     figures: Mapping[str, Any]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
     events: tuple[str, ...] = ()
     failure: str = ""
 

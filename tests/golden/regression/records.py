@@ -162,7 +162,9 @@ def _of_result(result: RunResult) -> tuple[dict[str, Any], dict[str, Array]]:
         "ticks": len(result.t),
         "status": [[i, result.status[i]] for i in changes],
         "final": len(result.final),
-        "warnings": [re.sub(r"(?<!\S)/\S*/", "", warning) for warning in result.warnings],  # wherever the data lies
+        "warnings": [
+            re.sub(r"(?<!\S)/\S*/", "", str(warning)) for warning in result.warnings
+        ],  # wherever the data lies
     }
     numbers = _of_trajectory("causal", Trajectory(result.t, result.poses, result.covariances), CAUSAL)
     numbers |= _of_trajectory("final", result.final, FINAL)

@@ -51,7 +51,7 @@ from factorgraph_loc.sensors.smoothed import (
     possible_poses,
     recordings,
 )
-from factorgraph_loc.text import quoted
+from factorgraph_loc.text import Notice, notice, quoted
 from factors import se2
 from factors.rfid.model import FEATURES, BeamModel, DetectionModel, GridModel, LogisticModel
 from factors.rfid.parameters import OF_MODEL
@@ -126,15 +126,15 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
     floor = floor_of(initial)
     pairs = pairs_of([_possible(trace, settings) for trace in traced], settings, rig.survey)
     names, of_antenna = list(settings.models), [a.model for a in settings.all_antennas().values()]
-    models, constants, notes = dict(settings.models), list[FittedConstant](), list[str]()
+    models, constants, notes = dict(settings.models), list[FittedConstant](), list[Notice]()
     for name, labels in settings.parameter_names().items():
         part = pairs.part(np.isin(pairs.antenna, [i for i, model in enumerate(of_antenna) if model == name]))
         if part.hits.sum() < MIN_READS:
-            notes.append(
-                f"The antennas of model {quoted(name)} read {part.hits.sum():.0f} tags, expected {MIN_READS:.0f}: it stays."
-            )
+            sentence = "The antennas of model {model} read {reads:.0f} tags, expected {expected:.0f}: it stays."
+            notes.append(notice("few_reads", sentence, quoted(name), part.hits.sum(), MIN_READS))
         elif (fitted := _refitted(part, initial.models[name].model(), name, floor)) is None:
-            notes.append(f"The logs hardly determine the model {quoted(name)} of the antennas: it stays.")
+            sentence = "The logs hardly determine the model {model} of the antennas: it stays."
+            notes.append(notice("undetermined_model", sentence, quoted(name)))
         else:
             constants += fitted[1]
             models[name] = written(fitted[0], name, grids).model_copy(update={"prior": _prior(traced, labels)})
