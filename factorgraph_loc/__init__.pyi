@@ -32,7 +32,7 @@ from factorgraph_loc.experiments.compare import compare as compare
 from factorgraph_loc.experiments.experiment import experiment as experiment, status as status
 from factorgraph_loc.experiments.reporting import report as report
 from factorgraph_loc.experiments.result_table import load_results as load_results
-from factorgraph_loc.exports.trajectories import write_trajectory as write_trajectory
+from factorgraph_loc.io.trajectories import write_trajectory as write_trajectory
 from factorgraph_loc.io.native.native import write_native as write_native
 from factorgraph_loc.io.native.rig_file import read_rig as read_rig, write_rig as write_rig
 from factorgraph_loc.io.native.world_file import read_world as read_world, write_world as write_world

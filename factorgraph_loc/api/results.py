@@ -12,11 +12,10 @@ from factorgraph_loc.evaluation.trajectories.score import TrajectoryScore, score
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK
 from factorgraph_loc.exports.ros import write_mcap
 from factorgraph_loc.exports.runs import StoredRun, find_runs, is_results, read_runs
-from factorgraph_loc.exports.trajectories import write_trajectory
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.files.temporary import require_free
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
-from factorgraph_loc.io.trajectories import read_trajectory
+from factorgraph_loc.io.trajectories import read_trajectory, write_trajectory
 from factorgraph_loc.maps.points import write_ply
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.pose_path import PosePath

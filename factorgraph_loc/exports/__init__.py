@@ -1,3 +1,3 @@
-"""Results for other programs: viewers (Rerun, Foxglove, RViz) and trajectories (TUM, KITTI)."""
+"""Results for viewers: Rerun, Foxglove, RViz."""
 
-__all__ = ["rerun_scene", "rerun_viewer", "ros", "runs", "trajectories"]
+__all__ = ["rerun_scene", "rerun_viewer", "ros", "runs"]

@@ -10,13 +10,14 @@ from __future__ import annotations
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from factorgraph_loc.drawing.figures import ellipses
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.rerun_viewer import LOOPBACK, open_viewer
@@ -122,7 +123,8 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
     _lines_over_time(recording, f"{at}/ellipse", t, outlines, colour)
     if run.landmarks:
         centres = np.array([point.position for point in run.landmarks.values()])
-        rims = scene.outlines(centres, np.array([point.covariance for point in run.landmarks.values()]))
+        covariances = np.array([point.covariance for point in run.landmarks.values()])
+        rims = ellipses(centres, covariances, scene.SCALE_95)
         learnt = rr.Points3D(
             _on_floor(centres), radii=POINT, colors=colour, labels=list(run.landmarks), show_labels=False
         )
@@ -192,7 +194,8 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
         image_plane_distance=FRUSTUM,
     )
     recording.log(at, lens, static=True)
-    for some in _batches(pictures_of.images(log)):
+    pictures = pictures_of.images(log)
+    while some := list(itertools.islice(pictures, BATCH)):
         _pictures(recording, f"{at}/image", some)
         if log.world.points is not None and poses is not None:
             t = np.array([t for t, _ in some])
@@ -206,11 +209,6 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
         _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in sightings], labels)
         style = rr.Points2D.from_fields(radii=3.0, colors=SIGHTING, show_labels=False)
         recording.log(f"{at}/image/landmarks", style, static=True)
-
-
-def _batches(pictures: Iterator[tuple[float, bytes]]) -> Iterator[list[tuple[float, bytes]]]:
-    while some := list(itertools.islice(pictures, BATCH)):
-        yield some
 
 
 def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[float, bytes]]) -> None:

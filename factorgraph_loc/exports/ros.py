@@ -71,17 +71,15 @@ def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[It
         moving.append((REFERENCE, f"{REFERENCE}/{BASE}", log.reference, log.reference))
     firsts = [float(t.t[0]) for _, _, played, final in moving for t in (played, final) if len(t)]
     start_ns = int(absolute(np.array([min([log.span()[0], *firsts])]), log.t0_ns)[0])
-    yield iter([(start_ns, "/markers", *make.markers(start_ns, _map(log, make)))])
+    yield iter([make.markers(start_ns, "/markers", _map(log, make))])
     for name, frame, played, final in moving:
         yield _poses(f"/{name}/odometry", frame, played, log.t0_ns, make)
-        yield iter([(start_ns, f"/{name}/path", *make.path(start_ns, final, log.t0_ns))])
+        yield iter([make.path(start_ns, f"/{name}/path", final, log.t0_ns)])
     for run, colour in zip(runs, colours(), strict=False):
         learnt = {name: np.array((*point.position, 0.0)) for name, point in run.landmarks.items()}
         known = {name: position for name, position in learnt.items() if np.isfinite(position).all()}
         if known:
-            yield iter(
-                [(start_ns, f"/{run.name}/markers", *make.markers(start_ns, make.dots("learnt", known, colour)))]
-            )
+            yield iter([make.markers(start_ns, f"/{run.name}/markers", make.dots("learnt", known, colour))])
     yield _images(log, make)
 
 
@@ -111,13 +109,10 @@ def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_M
         place = make.pose(x, y, 0.0, heading)
         move = make("geometry_msgs/Transform", translation=make.vector(x, y, 0.0), rotation=place.orientation)
         transform = make("geometry_msgs/TransformStamped", header=header, child_frame_id=frame, transform=move)
-        yield t_ns, "/tf", *make.typed("tf2_msgs/TFMessage", transforms=[transform])
+        yield make.message(t_ns, "/tf", "tf2_msgs/TFMessage", transforms=[transform])
         pose = make("geometry_msgs/PoseWithCovariance", pose=place, covariance=covariance.ravel())
-        yield (
-            t_ns,
-            topic,
-            *make.typed("nav_msgs/Odometry", header=header, child_frame_id=frame, pose=pose, twist=no_twist),
-        )
+        fields = {"header": header, "child_frame_id": frame, "pose": pose, "twist": no_twist}
+        yield make.message(t_ns, topic, "nav_msgs/Odometry", **fields)
 
 
 def _planar(trajectory: Trajectory) -> list[list[float]]:
@@ -129,11 +124,8 @@ def _images(log: Log, make: "_Maker") -> Iterator[Message]:
     for t, jpeg in pictures_of.images(log):
         t_ns = log.t0_ns + round(t * 1e9)
         content = {"format": "jpeg", "data": np.frombuffer(jpeg, dtype=np.uint8)}
-        yield (
-            t_ns,
-            "/camera/image/compressed",
-            *make.typed("sensor_msgs/CompressedImage", header=make.header(t_ns, CAMERA), **content),
-        )
+        content["header"] = make.header(t_ns, CAMERA)
+        yield make.message(t_ns, "/camera/image/compressed", "sensor_msgs/CompressedImage", **content)
 
 
 class _Maker:
@@ -143,12 +135,11 @@ class _Maker:
         self._types = types
 
     def __call__(self, kind: str, **fields: Any) -> Any:
-        return self.typed(kind, **fields)[1]
+        return self._types[kind.replace("/", "/msg/")](**fields)
 
-    def typed(self, kind: str, **fields: Any) -> tuple[str, Any]:
-        """The full name of the type, and the message."""
-        name = kind.replace("/", "/msg/")
-        return name, self._types[name](**fields)
+    def message(self, t_ns: int, topic: str, kind: str, **fields: Any) -> Message:
+        """A message of a topic."""
+        return t_ns, topic, kind.replace("/", "/msg/"), self(kind, **fields)
 
     def header(self, t_ns: int, frame: str) -> Any:
         stamp = self("builtin_interfaces/Time", sec=t_ns // 10**9, nanosec=t_ns % 10**9)
@@ -165,14 +156,14 @@ class _Maker:
         turn = self("geometry_msgs/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
         return self("geometry_msgs/Pose", position=self.point(x, y, z), orientation=turn)
 
-    def path(self, start_ns: int, trajectory: Trajectory, t0_ns: int) -> tuple[str, Any]:
+    def path(self, start_ns: int, topic: str, trajectory: Trajectory, t0_ns: int) -> Message:
         poses = [
             self("geometry_msgs/PoseStamped", header=self.header(t_ns, MAP), pose=self.pose(x, y, 0.0, heading))
             for t_ns, (x, y, heading) in zip(absolute(trajectory.t, t0_ns).tolist(), _planar(trajectory), strict=True)
         ]
-        return self.typed("nav_msgs/Path", header=self.header(start_ns, MAP), poses=poses)
+        return self.message(start_ns, topic, "nav_msgs/Path", header=self.header(start_ns, MAP), poses=poses)
 
-    def markers(self, t_ns: int, shapes: Sequence[Mapping[str, Any]]) -> tuple[str, Any]:
+    def markers(self, t_ns: int, topic: str, shapes: Sequence[Mapping[str, Any]]) -> Message:
         """An array of the shapes that :meth:`shape` and :meth:`dots` give, numbered."""
         empty = {
             "header": self.header(t_ns, MAP),
@@ -190,7 +181,7 @@ class _Maker:
             "mesh_use_embedded_materials": False,
         }
         made = [self("visualization_msgs/Marker", id=i, **empty, **shape) for i, shape in enumerate(shapes)]
-        return self.typed("visualization_msgs/MarkerArray", markers=made)
+        return self.message(t_ns, topic, "visualization_msgs/MarkerArray", markers=made)
 
     def dots(self, name: str, positions: Mapping[str, Array], colour: Colour) -> list[dict[str, Any]]:
         """Spheres at positions (3,), with their names above."""

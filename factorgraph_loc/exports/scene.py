@@ -30,9 +30,8 @@ class Lights:
 
 def colours() -> Iterator[Colour]:
     """The colour of the first, second, ... run, as in the plots."""
-    for colour in itertools.cycle(
-        drawing_figures.COLOURS[:-1]
-    ):  # without the last, black, which viewers have as background
+    # without the last, black, which viewers have as background
+    for colour in itertools.cycle(drawing_figures.COLOURS[:-1]):
         red, green, blue = bytes.fromhex(colour[1:])
         yield red, green, blue
 
@@ -54,12 +53,7 @@ def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
         return np.empty(0), np.empty((0, drawing_figures.CORNERS + 1, 2))
     covariances = trajectory.covariances[:, :2, :2]
     known = np.isfinite(covariances).all(axis=(1, 2))
-    return trajectory.t[known], outlines(trajectory.poses[known, :2], covariances[known])
-
-
-def outlines(centres: Array, covariances: Array) -> Array:
-    """Closed outlines (K, L, 2) of the 95 % ellipses of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2, 2)."""
-    return drawing_figures.ellipses(centres, covariances, SCALE_95)
+    return trajectory.t[known], drawing_figures.ellipses(trajectory.poses[known, :2], covariances[known], SCALE_95)
 
 
 def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:

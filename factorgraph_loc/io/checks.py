@@ -94,8 +94,7 @@ def look_over(log: Log) -> list[Notice]:
     warnings = gap_warnings("odometry", long_gaps(odometry.t))
     for name, stream in log.streams.items():
         if name != "odometry" and (early := int(np.count_nonzero(stream.t < odometry.t[0]))):
-            sentence = "{stream}: {rows} rows come before the first odometry"
-            warnings.append(notice("before_odometry", sentence, name, early))
+            warnings.append(notice("early_rows", "{stream}: {rows} rows come before the first odometry", name, early))
     sightings = log.streams.get("bearing_range")
     if isinstance(sightings, BearingRangeStream):
         unknown = [name for name in sightings.landmark if name not in log.world.landmarks]

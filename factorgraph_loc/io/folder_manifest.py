@@ -14,8 +14,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import YAML
 from factorgraph_loc.files.column_mapping import TableFolder
 from factorgraph_loc.files.models import parse_model, read_text
-from factorgraph_loc.io.field_names import TRUTH
-from factorgraph_loc.io.guesses import Guess, guess, sample_of
+from factorgraph_loc.io.guesses import TRUTH, Guess, guess, sample_of
 from factorgraph_loc.io.motions import wheel_steps
 from factorgraph_loc.io.proposals import Proposal, proposal_of, toml_of
 from factorgraph_loc.io.readers.mapped import ReferenceFile, read_reference

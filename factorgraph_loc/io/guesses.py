@@ -16,10 +16,25 @@ from factorgraph_loc.files.column_mapping import parsed, split_comments
 from factorgraph_loc.files.columns import LENGTH, RATE, SPEED, STAMPS
 from factorgraph_loc.files.models import read_text
 from factorgraph_loc.files.tables import iso_nanoseconds
-from factorgraph_loc.io.field_names import LANDMARK, RANGE, READ, plain, rank
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
+TRUTH = re.compile(
+    r"truth|(^|[/_.])gt($|[/_.])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
+)
+# of the last part of a field's path, without separators and without a unit at the end
+READ: dict[str, tuple[str, ...]] = {
+    "epc": ("epc", "epchex", "tagepc", "tagid", "epcid", "uid", "tag", "serial", "tagserial"),
+    "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
+    "rssi": ("rssi", "peakrssi", "signalstrength", "power"),
+    "phase": ("phase", "phaseangle", "rfphase", "rfphaseangle"),
+    "frequency": ("frequency", "freq", "carrier", "channelfrequency", "channelmhz", "channelkhz"),
+    "stamp": ("firstseen", "firstseentimestamp", "firstseentimestamputc", "readtime", "timestamp"),
+}
+# of a range to a radio or another landmark, the likeliest first
+LANDMARK = ("anchorid", "anchor", "anchorname", "responderid", "beaconid", "beacon", "landmarkid", "nodeid", "id")
+RANGE = ("range", "distance", "dist", "dis", "rangem", "distancem")
+UNIT = re.compile(r"(deg(rees)?|rad(ians)?|[mk]?hz|[mun]s|dbm)$")
 SEPARATORS = ("\t", ";", ",", " ")
 LOOKED_AT = 50  # lines that separator and header are guessed from
 TIME = re.compile(r"^(t|time.*|.*time|.*stamp|when|date.*|millis|uptime|clock|secs?|seconds|finished|end(ed)?|begin)$")
@@ -47,7 +62,7 @@ NAMES: dict[str, Sequence[str]] = {**{k: v for k, v in READ.items() if k != "sta
 # names of units at the end of a column's name, by kind of field
 SECONDS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "millis": "ms", "micros": "us", "nanos": "ns"}
 LENGTHS = {unit: unit for unit in LENGTH}
-ANGLES = {"deg": "deg", "degrees": "deg", "rad": "rad"}
+ANGLES = {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"}
 SPEEDS = {unit: unit for unit in SPEED} | {"mps": "m/s", "kmh": "km/h"}
 RATES = {unit: unit for unit in RATE} | {"dps": "deg/s"}
 ENDS: dict[str, Mapping[str, str]] = {
@@ -59,14 +74,17 @@ ENDS: dict[str, Mapping[str, str]] = {
     "frequency": {"hz": "Hz", "khz": "kHz", "mhz": "MHz"},
 }
 TEXTS = ("epc", "antenna", "landmark")  # fields that need no numbers
-DEGREES, FASTEST, TURNING = 6.4, 15.0, 12.0  # larger angles are in degrees; m/s and rad/s that no robot has
+FASTEST = 15.0  # m/s that no robot has
 # units of values of at most this size
-LARGER = {
+LARGER: dict[str, tuple[tuple[str, float], ...]] = {
+    **dict.fromkeys(("heading", "bearing", "facing"), (("rad", 6.4), ("deg", np.inf))),
+    "w": (("rad/s", 12.0), ("deg/s", np.inf)),
+    "v": (("m/s", FASTEST), ("mm/s", np.inf)),
     "phase": (("rad", 6.4), ("deg", 360.0), ("turn/4096", 4096.0)),
     "frequency": (("MHz", 1e4), ("kHz", 1e7)),
     "rssi": (("dBm", 200.0), ("cdBm", 2e4)),
 }
-OURS = ("rad", "dBm")
+OURS = ("rad", "rad/s", "m/s", "dBm")
 REAR = {"rear", "back", "rl", "rr", "bl", "br"}  # words in names of rear wheels, if there are front ones
 EPC = re.compile(r"(0x)?[0-9A-Fa-f]{8,}$")
 
@@ -139,6 +157,16 @@ class Guess:
         if units := {name: self.units[name] for name in out["columns"] if name in self.units}:
             out["units"] = units
         return out
+
+
+def plain(name: str) -> str:
+    """A name in lower case, without separators."""
+    return re.sub(r"[\s_\-.]", "", name).lower()
+
+
+def rank(name: str, known: Sequence[str]) -> int | None:
+    """The index of a plain name in ``known``, with its unit or without; None if it is unknown."""
+    return next((known.index(text) for text in (name, UNIT.sub("", name)) if text in known), None)
 
 
 def sample_of(path: Path) -> Sample | None:
@@ -306,19 +334,12 @@ def _add_wheels(out: Guess) -> None:
 
 def _add_units(out: Guess) -> None:
     """Units that values show: angles above a turn, and speeds and positions that no robot has in metres."""
-    for name in ("heading", "bearing", "facing"):
-        if out.has(name) and name not in out.units and np.nanmax(np.abs(out.values(name)), initial=0.0) > DEGREES:
-            _set_unit(out, name, "deg", f"has values up to {np.nanmax(np.abs(out.values(name))):.0f}")
-    if out.has("w") and "w" not in out.units and np.nanmax(np.abs(out.values("w")), initial=0.0) > TURNING:
-        _set_unit(out, "w", "deg/s", f"has values up to {np.nanmax(np.abs(out.values('w'))):.0f}")
-    if out.has("v") and "v" not in out.units and np.nanmax(np.abs(out.values("v")), initial=0.0) > FASTEST:
-        _set_unit(out, "v", "mm/s", f"has values up to {np.nanmax(np.abs(out.values('v'))):.0f}")
     for name, sizes in LARGER.items():
         size = np.nanmax(np.abs(out.values(name)), initial=0.0) if out.has(name) else 0.0
         if size > 0.0 and name not in out.units:
             unit = next((unit for unit, most in sizes if size <= most), None)
             if unit is not None and unit not in OURS:
-                _set_unit(out, name, unit, f"has values up to {size:g}")
+                _set_unit(out, name, unit, f"has values up to {size:.0f}")
     t = out.times()
     if out.has("x", "y") and len(t) > 1 and not {"x", "y"} & set(out.units):
         steps = np.hypot(np.diff(out.values("x")), np.diff(out.values("y")))

@@ -1,4 +1,4 @@
-"""Trajectories by name, from files of poses, topics of bags, results of runs, or references of logs.
+"""Trajectories by name, from files of poses, topics of bags, results of runs, or references of logs, and their export.
 
 Conversion to and from those of evo (https://github.com/MichaelGrupp/evo) and ROS messages. Both libraries are imported only by
 these functions.
@@ -14,6 +14,8 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
+from factorgraph_loc.files.models import write_text
+from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.io.bags import rosbag
 from factorgraph_loc.io.bags.file import is_bag, require_rosbags
 from factorgraph_loc.io.bags.poses import checked_rotations, seven
@@ -21,7 +23,7 @@ from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.results import FINAL
 from factorgraph_loc.model.pose_path import PosePath, require_poses
-from factorgraph_loc.model.trajectory import Trajectory
+from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
@@ -63,6 +65,27 @@ def _reference(log: str) -> PosePath:
     if loaded.reference is None:
         raise InputError(f"{log}: is a log without a reference, expected one with a reference, or a trajectory")
     return loaded.reference.path(log, loaded.t0_ns)
+
+
+def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
+    """Write a trajectory in TUM format, or in KITTI format if the name ends with .kitti; return the files. ``t0_ns``: time zero of
+    a planar one.
+
+    In KITTI format times [s], of a planar trajectory from the log's start, go to ``NAME.times.txt``. Poses are of the robot's frame
+    (x forward, z up), not of a camera, and not relative to the first one.
+    """
+    path = Path(path)
+    if path.suffix != ".kitti":
+        write_tum(trajectory, path, t0_ns)
+        return [path]
+    poses = trajectory.path("trajectory") if isinstance(trajectory, Trajectory) else trajectory
+    rows = np.concatenate((poses.rotations, poses.positions[:, :, None]), axis=2).reshape(-1, 12)
+    t = trajectory.t if isinstance(trajectory, Trajectory) else trajectory.seconds()
+    times = path.with_name(path.stem + ".times.txt")
+    with writing(path):
+        write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows.tolist()))
+        write_text(times, "".join(f"{seconds:.9f}\n" for seconds in t.tolist()))
+    return [path, times]
 
 
 def to_evo(trajectory: Trajectory | PosePath, t0_ns: int = 0) -> Any:

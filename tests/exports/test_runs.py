@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from factorgraph_loc import ImageStream, Trajectory
+from factorgraph_loc.drawing.figures import ellipses
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
-from factorgraph_loc.exports.trajectories import write_trajectory
 from factorgraph_loc.io.readers.pose_file import read_matrices
+from factorgraph_loc.io.trajectories import write_trajectory
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.sensors.camera import summary as pictures_of
 
@@ -86,7 +87,7 @@ def test_lights_are_those_of_the_last_half_second(seen):
 
 def test_an_ellipse_holds_95_percent():
     covariance = np.array(((0.04, 0.03), (0.03, 0.09)))
-    (outline,) = scene.outlines(np.array([(1.0, 2.0)]), covariance[None])
+    (outline,) = ellipses(np.array([(1.0, 2.0)]), covariance[None], scene.SCALE_95)
     offsets = outline - (1.0, 2.0)
     distance = np.einsum("ki,ij,kj->k", offsets, np.linalg.inv(covariance), offsets)
     assert np.allclose(distance, 5.991, atol=1e-3)  # of chi squared with two degrees of freedom

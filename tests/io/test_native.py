@@ -284,7 +284,7 @@ def test_what_is_written_comes_back(tmp_path_factory, log, format):
     (back,) = load(str(folder))
     assert (back.name, back.rig, back.world, back.t0_ns) == (log.name, log.rig, log.world, log.t0_ns)
     assert back.metadata == log.metadata
-    assert all(w.kind in ("gaps", "before_odometry") for w in back.warnings)
+    assert all(w.kind in ("gaps", "early_rows") for w in back.warnings)
     assert set(back.streams) == set(log.streams)
     for name, stream in log.streams.items():
         assert type(back.streams[name]) is type(stream)

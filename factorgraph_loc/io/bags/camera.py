@@ -31,9 +31,8 @@ INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
 LOCK = ".lock"  # held while a folder of images is moved into place
 Pixels = NDArray[Any]
-_Row = tuple[
-    int, int, int, str
-]  # number, timestamp of the header [ns], time of receipt [ns]; file, whose name has these
+# number, timestamp of the header [ns], time of receipt [ns]; file, whose name has these
+_Row = tuple[int, int, int, str]
 
 
 # conversion of channels to red, green, blue
@@ -71,7 +70,6 @@ class Images:
         self._compressed, self._count = topic.type == COMPRESSED, topic.count
         self._folder = cache_folder() / "bags" / _key(bag.path, name)
         self._stamper = stamper
-        self._t_ns: list[int] = []
         self._written: Path | None = None  # folder of newly extracted images
         self._stack = stack
         sweep(self._folder.parent)

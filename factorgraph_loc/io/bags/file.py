@@ -228,9 +228,8 @@ def open_bag(path: Path) -> Iterator[Bag]:
     if not is_bag(path):
         expected = f"a file {', '.join(SUFFIXES)}, or a folder with {METADATA}"
         raise InputError(f"{path}: is not a ROS bag, expected {expected}")
-    files = (
-        [inside(path, file.name, path) for file in path.iterdir()] if path.is_dir() else [path]
-    )  # no links to the outside
+    # no links to the outside
+    files = [inside(path, file.name, path) for file in path.iterdir()] if path.is_dir() else [path]
     for file in files:
         if not file.is_dir():
             with opened(file, sys.maxsize):  # no FIFO, which would block, and no pointer of Git LFS

@@ -15,7 +15,7 @@ from factorgraph_loc.io.bags.poses import ODOMETRY as ORIGINS
 from factorgraph_loc.io.bags.poses import POINT, POSES, ROBOT, STATIC, WORLD, Tree, tree_of
 from factorgraph_loc.io.bags.tables import CORNERS, DETECTIONS
 from factorgraph_loc.io.bags.topics import LIST, TF, has_header, leaves
-from factorgraph_loc.io.field_names import LANDMARK, RANGE, READ, TRUTH, plain, rank
+from factorgraph_loc.io.guesses import ANGLES, ENDS, LANDMARK, RANGE, READ, TRUTH, plain, rank
 from factorgraph_loc.io.proposals import Proposal, proposal_of
 from factorgraph_loc.text import listed
 
@@ -26,12 +26,8 @@ NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORE
 
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
-# suffixes of field names that imply a unit; the first match is used
-UNITS = {
-    "phase": {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"},
-    "frequency": {"mhz": "MHz", "khz": "kHz", "hz": "Hz"},
-    "stamp": {"us": "us", "ms": "ms", "ns": "ns"},
-}
+# suffixes of field names that imply a unit; the longest match is used
+UNITS = {"phase": ANGLES, "frequency": ENDS["frequency"], "stamp": {unit: unit for unit in ("us", "ms", "ns")}}
 
 
 @dataclass(frozen=True)
@@ -303,9 +299,8 @@ def _units(fields: Mapping[str, str]) -> dict[str, str]:
     out = {}
     for name, ends in UNITS.items():
         plain = _plain(fields.get(name, ""))
-        unit = next((unit for end, unit in ends.items() if plain.endswith(end)), None)
-        if unit is not None:
-            out[name] = unit
+        if known := [end for end in ends if plain.endswith(end)]:
+            out[name] = ends[max(known, key=len)]
     return out
 
 

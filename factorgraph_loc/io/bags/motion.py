@@ -180,10 +180,10 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
     """The motion between consecutive poses in the frame of odometry, or between transforms."""
-    poses = poses_of_topic(listeners, options, static)
+    made = poses_of_topic(listeners, options, static)
 
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
-        path = poses.path(warnings)
+        path = made(warnings)
         t_ns = path.stamps()
         moves = motions.between_poses(path.name, t_ns, path.on_floor(warnings, options), warnings)
         return t_ns, motions.after_rest(moves)

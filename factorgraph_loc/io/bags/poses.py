@@ -5,9 +5,10 @@ Static transforms give the mounting of sensors; a chain of transforms gives a tr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from functools import partial
+from itertools import islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -59,26 +60,6 @@ class StartTopic(TopicSettings, Turned):
     """A topic whose first pose with covariance is the known start."""
 
 
-class Poses:
-    """Collects the poses of a topic; points are poses without heading."""
-
-    def __init__(self, bag: Bag, name: str) -> None:
-        kind = bag.topic(name, *sorted({*POSES, POINT})).type
-        self._are_points = kind == POINT
-        pose = POSES.get(kind, "point")
-        # transforms have translation and rotation, poses position and orientation
-        position, rotation = ("translation", "rotation") if pose == "transform" else ("position", "orientation")
-        paths = [f"{pose}.{position}.{axis}" for axis in "xyz"] + [f"{pose}.{rotation}.{axis}" for axis in "xyzw"]
-        if self._are_points:
-            paths = [f"{pose}.{axis}" for axis in "xyz"]
-        self._rows = TopicRows(f"{bag.path} {name}", len(paths), paths)
-        self.add = self._rows.add
-
-    def path(self, warnings: list[Notice]) -> PosePath:
-        """The poses, the last one of equal timestamps; InputError names the invalid message."""
-        return path_of(self._rows.source, self._rows, warnings, has_rotations=not self._are_points)
-
-
 class Start:
     """Collects the first pose with covariance of a topic, the known start."""
 
@@ -119,10 +100,10 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
     return rotations_of(source, rows, table[:, 3:])
 
 
-def path_of(source: str, rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
+def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
     """The poses of rows of positions and quaternions, or of positions alone; the last one of equal timestamps. InputError names the
     invalid message."""
-    values = rows.values
+    source, values = rows.source, rows.values
     if not has_rotations:
         values = np.column_stack((values, np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))))
     rotations = checked_rotations(source, rows.rows, values)
@@ -130,19 +111,29 @@ def path_of(source: str, rows: TopicRows, warnings: list[Notice], *, has_rotatio
     return path.rows(checks.in_order(source, rows.rows, rows.t_ns, warnings))
 
 
+def upward(parents: Mapping[str, str], frame: str) -> list[str]:
+    """``frame`` and the frames above it, nearest first, each once."""
+    chain = [frame]
+    while (parent := parents.get(chain[-1], frame)) not in chain:
+        chain.append(parent)
+    return chain
+
+
 class StaticFrames:
-    """Collects static transforms: parent and pose of each frame. ``base``: the frame of the robot."""
+    """Collects static transforms: ``parents`` of frames, and their ``poses`` (4, 4) there. ``base``: the frame of the robot."""
 
     def __init__(self, base: str = ROBOT[0]) -> None:
         self.base = base
-        self.parents: dict[str, tuple[str, Array]] = {}
+        self.parents: dict[str, str] = {}
+        self.poses: dict[str, Array] = {}
 
     def add(self, item: Stamped, t_ns: int) -> None:
         for transform in item.message.transforms:
             values = np.array([seven(transform.transform, "translation", "rotation")])
             rotations = checked_rotations(item.topic, np.array([item.row]), values)
-            parent = plain(transform.header.frame_id)
-            self.parents[plain(transform.child_frame_id)] = (parent, matrices(values[:, :3], rotations)[0])
+            child = plain(transform.child_frame_id)
+            self.parents[child] = plain(transform.header.frame_id)
+            self.poses[child] = matrices(values[:, :3], rotations)[0]
 
     def pose(self, frame: str) -> Array | None:
         """The pose (4, 4) of ``frame`` on the robot; None if no transforms connect them."""
@@ -161,10 +152,8 @@ class StaticFrames:
     def _up(self, frame: str) -> dict[str, Array]:
         """The poses of ``frame`` in itself and in all frames above it, nearest first."""
         out = {frame: np.eye(4)}
-        while frame in self.parents and self.parents[frame][0] not in out:
-            parent, pose = self.parents[frame]
-            out[parent] = pose @ out[frame]
-            frame = parent
+        for child, parent in pairwise(upward(self.parents, frame)):
+            out[parent] = self.poses[child] @ out[child]
         return out
 
 
@@ -185,14 +174,14 @@ class FrameReference:
         for transform in item.message.transforms:
             child, parent = plain(transform.child_frame_id), plain(transform.header.frame_id)
             self._parents[child] = parent
-            edge = self._edges.setdefault(child, TopicRows(self._source, 7))
+            edge = self._edges.setdefault(child, TopicRows(f"{self._source} {parent} to {child}", 7))
             stamp = self._stamper.choose(as_nanoseconds(transform.header.stamp, 1), t_ns)
             edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
 
     def path(self, warnings: list[Notice]) -> PosePath:
         """The poses at the timestamps of the most frequent transform where all are known; the others are interpolated."""
         edges = [
-            self._edge(name, warnings) if name in self._edges else self._static.parents[name][1]
+            path_of(self._edges[name], warnings) if name in self._edges else self._static.poses[name]
             for name in self._chain()
         ]
         moving = [edge for edge in edges if isinstance(edge, PosePath)]
@@ -215,26 +204,16 @@ class FrameReference:
 
     def _chain(self) -> list[str]:
         """The frames from the child up to the parent, without the parent."""
-        chain: list[str] = []
-        frame = self._child
-        parents = {name: parent for name, (parent, _) in self._static.parents.items()}
-        parents |= self._parents
-        while frame != self._parent:
-            if frame not in parents or frame in chain:
-                known = sorted({*parents, *parents.values()})
-                wrong = next((name for name in (self._parent, self._child) if name not in known), None)
-                hint = (
-                    f"there is no frame {quoted(wrong)}{nearest(wrong, known)}"
-                    if wrong
-                    else f"it ends at {quoted(frame)}"
-                )
-                raise InputError(f"{self._source}: no transforms connect {self._child} to {self._parent}: {hint}")
-            chain.append(frame)
-            frame = parents[frame]
-        return chain
-
-    def _edge(self, name: str, warnings: list[Notice]) -> PosePath:
-        return path_of(f"{self._source} {self._parents[name]} to {name}", self._edges[name], warnings)
+        parents = self._static.parents | self._parents
+        chain = upward(parents, self._child)
+        if self._parent in chain:
+            return chain[: chain.index(self._parent)]
+        known = sorted({*parents, *parents.values()})
+        wrong = next((name for name in (self._parent, self._child) if name not in known), None)
+        hint = (
+            f"there is no frame {quoted(wrong)}{nearest(wrong, known)}" if wrong else f"it ends at {quoted(chain[-1])}"
+        )
+        raise InputError(f"{self._source}: no transforms connect {self._child} to {self._parent}: {hint}")
 
 
 def static_frames(listeners: Listeners, base: str) -> StaticFrames:
@@ -245,13 +224,26 @@ def static_frames(listeners: Listeners, base: str) -> StaticFrames:
     return frames
 
 
-def poses_of_topic(listeners: Listeners, options: PoseTopic, frames: StaticFrames) -> Poses | FrameReference:
-    """Register a collector for a topic of poses, or of tf with two frames, and return it."""
+def poses_of_topic(
+    listeners: Listeners, options: PoseTopic, frames: StaticFrames
+) -> Callable[[list[Notice]], PosePath]:
+    """Register a collector for a topic of poses or points, or of tf with two frames. Returns the function that makes its path once
+    the bag is read, see :func:`path_of`."""
     bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
-    is_tf = bag.topic(options.topic).type in TF
-    poses = FrameReference(bag, options, stamper, frames) if is_tf else Poses(bag, options.topic)
-    listeners.add(options.topic, poses, stamper)
-    return poses
+    kind = bag.topic(options.topic).type
+    if kind in TF:
+        reference = FrameReference(bag, options, stamper, frames)
+        listeners.add(options.topic, reference, stamper)
+        return reference.path
+    pose = POSES.get(bag.topic(options.topic, *sorted({*POSES, POINT})).type, "point")
+    # transforms have translation and rotation, poses position and orientation
+    position, rotation = ("translation", "rotation") if pose == "transform" else ("position", "orientation")
+    paths = [f"{pose}.{position}.{axis}" for axis in "xyz"] + [f"{pose}.{rotation}.{axis}" for axis in "xyzw"]
+    if kind == POINT:
+        paths = [f"{pose}.{axis}" for axis in "xyz"]
+    rows = TopicRows(f"{bag.path} {options.topic}", len(paths), paths)
+    listeners.add(options.topic, rows, stamper)
+    return partial(path_of, rows, has_rotations=kind != POINT)
 
 
 def plain(frame: str) -> str:
@@ -280,16 +272,9 @@ class Tree:
 
     def above(self, frame: str, names: tuple[str, ...]) -> str | None:
         """The first of ``names`` that is above ``frame``, which moves in it."""
-        moves = False
-        known: set[str] = set()
-        visited = {frame}
-        while frame in self.parents and self.parents[frame] not in visited:
-            moves |= frame in self.moving
-            frame = self.parents[frame]
-            visited.add(frame)
-            if moves:
-                known.add(frame)
-        return next((name for name in names if name in known), None)
+        chain = upward(self.parents, frame)
+        first = next((i for i, name in enumerate(chain) if name in self.moving), len(chain))
+        return next((name for name in names if name in chain[first + 1 :]), None)
 
 
 def tree_of(bag: Bag, remarks: list[str]) -> Tree:

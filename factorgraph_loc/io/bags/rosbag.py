@@ -137,7 +137,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     streams |= {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
     reference = None
     if poses and of_reference:
-        path = poses.path(warnings)
+        path = poses(warnings)
         has_heading = of_reference.has_heading and path.has_rotations
         t = checks.seconds(path.stamps(), t0_ns)
         reference = Trajectory(t, path.on_floor(warnings, of_reference), has_heading=has_heading)
@@ -226,4 +226,4 @@ def read_trajectory(path: Path, topic: str) -> PosePath:
         static = static_frames(listeners, ROBOT[0])
         poses = poses_of_topic(listeners, PoseTopic(topic=name, parent=parent, child=child), static)
         listeners.run()
-        return replace(poses.path(warnings), warnings=tuple(warnings))
+        return replace(poses(warnings), warnings=tuple(warnings))

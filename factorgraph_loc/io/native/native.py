@@ -19,7 +19,7 @@ from factorgraph_loc.io.native.world_file import parse_world, read_world, write_
 from factorgraph_loc.io.readers.manifests import StartSettings
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.maps.points import POINTS_SUFFIX
-from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.sections import layers
@@ -192,19 +192,12 @@ def write_files(log: Log, folder: Path, format: str) -> None:
         run["has_heading"] = log.reference.has_heading
         write_tum(log.reference, folder / REFERENCE, log.t0_ns)
     if log.start is not None:
-        run["start"] = start_table(log.start, log.t0_ns)
+        run["start"] = {
+            **dict(zip(("x", "y", "heading"), log.start.pose.tolist(), strict=True)),
+            "sigma_position": float(max(log.start.sigmas[:2])),
+            "sigma_heading": float(log.start.sigmas[2]),
+            "t_ns": round(log.start.t * 1e9) + log.t0_ns,
+        }
     if log.metadata:
         run["metadata"] = dict(log.metadata)
     write_toml(folder / RUN_FILE, run)
-
-
-def start_table(start: StartPose, t0_ns: int) -> dict[str, Any]:
-    x, y, heading = (float(v) for v in start.pose)
-    return {
-        "x": x,
-        "y": y,
-        "heading": heading,
-        "sigma_position": float(max(start.sigmas[:2])),
-        "sigma_heading": float(start.sigmas[2]),
-        "t_ns": round(start.t * 1e9) + t0_ns,
-    }

@@ -96,10 +96,8 @@ class RobotOptions:
 def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
     """A rig with these sensors, and remarks on guessed values. InputError if a value is out of bounds, or there is no sensor."""
     sections: dict[str, Any] = {}
-    sensors: list[str] = []
     remarks: list[str] = []
     if robot.odometry != "none":
-        sensors.append("odometry")
         remarks.append(
             "odometry: noise and uncertainty are those of unknown indoor wheels; `fgloc calibrate` learns them"
         )
@@ -107,28 +105,23 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
     if robot.odometry == "omnidirectional":
         sections["odometry"]["noise"] = {"lateral": Rig().odometry.noise.along.model_dump()}
     if robot.imu:
-        sensors.append("imu")
         sections["imu"] = {}
     if robot.landmarks is not None:
-        sensors.append("bearing_range")
         sections["bearing_range"] = {"range_sigma": robot.landmarks}
         remarks.append("bearing_range: the sensor is taken to be at the robot's centre, looking forward")
     if robot.antennas:
-        sensors.append("rfid")
         sections["rfid"] = {"antennas": _antennas(robot.antennas), **READS}
         remarks.append(
             "rfid: names and places of the antennas are guesses: measure them; `fgloc calibrate` learns how they read"
         )
     if robot.camera is not None:
-        sensors.append("camera")
         sections["camera"] = _camera(*robot.camera)
         remarks.append(
             "camera: lens and mounting are guesses, 60 degrees wide, looking forward; calibrate the lens with OpenCV"
         )
-    if not sensors:
+    if not sections:
         raise InputError("the new rig has no sensors, expected odometry, landmarks, antennas or a camera")
-    content = {"name": name, "sensors": sensors, **sections}
-    return parse_model(Rig, content, "the new rig"), remarks
+    return parse_model(Rig, {"name": name, "sensors": list(sections), **sections}, "the new rig"), remarks
 
 
 def _antennas(names: Sequence[str]) -> dict[str, dict[str, float]]:

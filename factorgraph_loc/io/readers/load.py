@@ -145,7 +145,8 @@ def _find(log: str, data_root: str | Path | None, named: str | None) -> _Source:
     if named is not None:
         if not path.exists():
             raise InputError(f"{log}: does not exist")
-        return _Source(named, path, None if named == "native" else _name(path))
+        name = path.resolve().stem if path.is_file() else path.resolve().name
+        return _Source(named, path, None if named == "native" else name)
     if path.is_dir() and (path / RUN_FILE).is_file():
         path /= RUN_FILE
     if path.exists() and is_bag(path):
@@ -174,10 +175,6 @@ def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
     if path.suffix.lower() in TABLES:
         raise InputError(f"{log}: is a table: describe its columns in a manifest with the reader mapped")
     raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
-
-
-def _name(path: Path) -> str:
-    return path.resolve().stem if path.is_file() else path.resolve().name
 
 
 def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
@@ -221,8 +218,7 @@ def _read(source: _Source, rig: Rig | None, world: World | None, options: Mappin
         if log.rig is DEFAULT_RIG:
             log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
         else:
-            sentence = "the gyro is not used, because the rig's sensors do not include imu"
-            warnings.append(notice("unused_gyro", sentence))
+            warnings.append(notice("unused_gyro", "the gyro is not used, because the rig's sensors do not include imu"))
     if log.rig.name == DEFAULT_RIG.name:
         sentence = "no rig is given: the default rig does not have this robot's noise and mounting"
         warnings.append(notice("default_rig", sentence))

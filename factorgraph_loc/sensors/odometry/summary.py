@@ -24,11 +24,10 @@ ALIKE = 0.6  # minimum correlation of equal motion
 DEGREES = (20.0, 150.0)  # range of the slope if one rate is in degrees
 CHORD = 2.0  # s over which distances and turns are compared
 SCALED = 0.1  # relative difference above which a scale is doubtful
-STANDS, DRIVES = (
-    0.02,
-    0.5,
-)  # m of a reference that stands still and of odometry that drives meanwhile, in a window of STILL
+# m of a reference that stands still and of odometry that drives meanwhile, in a window of STILL
+STANDS, DRIVES = 0.02, 0.5
 STILL = 5.0  # s
+IN_DEGREES = "{source} turns {ratio:.0f} times as much as {other}: is it in degrees?"
 COVERED = 0.9  # minimum share of a log that the reference should cover
 
 
@@ -188,11 +187,9 @@ def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
         lines.append(notice("opposite_turns", sentence, name))
     size = abs(found.slope)
     if DEGREES[0] < size < DEGREES[1]:
-        sentence = "{source} turns {ratio:.0f} times as much as the odometry: is it in degrees?"
-        lines.append(notice("degrees", sentence, name, size))
+        lines.append(notice("degrees", IN_DEGREES, name, size, "the odometry"))
     elif DEGREES[0] < 1.0 / size < DEGREES[1]:
-        sentence = "the odometry turns {ratio:.0f} times as much as {source}: is it in degrees?"
-        lines.append(notice("degrees", sentence, 1.0 / size, name))
+        lines.append(notice("degrees", IN_DEGREES, "the odometry", 1.0 / size, name))
     if found.shift:
         # a late timestamp needs a negative offset; the odometry is early if the other one is late
         offset = -found.shift if sensor == "imu" else found.shift

@@ -152,10 +152,9 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
             stops = "antenna {antenna} stops at {t:.1f} s, {before:.1f} s before the others"
             out.append(notice("antenna_stops", stops, name, antenna.last, last - antenna.last))
         elif antenna.last_read is None:
-            out.append(notice("silent_antenna", "antenna {antenna} reads nothing", name))
+            out.append(notice("silent", "antenna {antenna} reads nothing", name))
         elif antenna.last_read < last - STOPPED:
-            silent = "antenna {antenna} reads nothing after {t:.1f} s"
-            out.append(notice("silent_antenna", silent, name, antenna.last_read))
+            out.append(notice("silent", "antenna {antenna} reads nothing after {t:.1f} s", name, antenna.last_read))
     return out + _clock_trouble(log, found)
 
 
