@@ -102,7 +102,7 @@ def document(calibration: Calibration) -> dict[str, Any]:
         "growth": growth(calibration.trials),
         "refused": calibration.refused,
         "turns": list(calibration.knowledge.turns),
-        "doubts": list(calibration.doubts),
+        "doubts": [str(doubt) for doubt in calibration.doubts],
         "rig": calibration.rig.model_dump(mode="json", exclude_none=True),
     }
 

@@ -92,7 +92,7 @@ def run(
     result, scores = outcome.result, outcome.scores
     show.warnings(scores["warnings"])
     if json:
-        show.document(scores)
+        show.document(scores | {"warnings": [str(warning) for warning in scores["warnings"]]})
         return
     _print_accuracy(scores)
     _print_further(scores, rpe=options.rpe)

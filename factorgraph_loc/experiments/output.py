@@ -17,7 +17,6 @@ import polars as pl
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import errors, score
-from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.experiments.store import TIMING, TIMINGS
 from factorgraph_loc.files.columns import COVARIANCES
 from factorgraph_loc.files.models import write_text, write_toml
@@ -124,8 +123,7 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
     write_text(folder / LEARNT, json_text(learnt_tables(result.learnt)))
     write_parquet(innovations(result, log), folder / INNOVATIONS)
     write_text(folder / EVENTS, events(result, log).write_csv())
-    warnings = [vars(warning) for warning in scores[WARNINGS]]  # for the same lines when they are read again
-    write_text(folder / METRICS, json_text({**scores, WARNINGS: warnings}))
+    write_text(folder / METRICS, json_text(scores))
 
 
 def map_of(result: RunResult, log: Log) -> World | None:

@@ -110,7 +110,7 @@ class TrajectoryScore:
             "transform.rotation": self.transform.rotation.tolist(),
             "transform.translation": self.transform.translation.tolist(),
             "transform.scale": self.transform.scale,
-            "warnings": list(self.warnings),
+            "warnings": [str(warning) for warning in self.warnings],
         }
 
 
