@@ -34,8 +34,6 @@ def test_a_run_has_the_scores_of_its_files(office, tmp_path):
     assert alone.result.final.poses == pytest.approx(kept.result.final.poses, abs=0.0)
     with pytest.raises(fgloc.InputError, match="holds results already"):
         fgloc.run(office, "ekf", out=tmp_path / "run")
-    with pytest.raises(fgloc.InputError, match="--final-only changes nothing for ekf, expected smoother"):
-        fgloc.run(office, "ekf", final_only=True)
 
 
 def test_compare_takes_names_and_settings_by_estimator(office, tmp_path):

@@ -16,7 +16,6 @@ from factorgraph_loc.experiments.compare import summary_text
 from factorgraph_loc.experiments.preparation import used_sensors
 from factorgraph_loc.files.temporary import of_system, require_free, temporary_folder
 from factorgraph_loc.fitting.posterior import FittedConstant
-from factorgraph_loc.fusion.registry import for_final_only
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, read_log
 from factorgraph_loc.io.results import FILES
 from factorgraph_loc.model.log import Log
@@ -54,7 +53,6 @@ def run(
     tick_gap: float = TICK_GAP,
     learn: bool = False,
     align: Alignment = "none",
-    final_only: bool = False,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
@@ -62,15 +60,15 @@ def run(
     """Run one estimator on one log and score the result.
 
     For the arguments see :class:`~factorgraph_loc.model.scoring.RunConfig`. ``learn``: learn the rig from the log itself, for
-    the final trajectory alone. ``final_only``: make no causal estimates. ``align``: also score after this alignment with the
-    reference. ``out``: folder for the files that ``fgloc run`` writes.
+    the final trajectory alone. ``align``: also score after this alignment with the reference. ``out``: folder for the files that
+    ``fgloc run`` writes.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)
-    given = {estimator: settings or {}}
-    chosen = (for_final_only(given) if final_only else given)[estimator]
     loaded = read_log(log, rig=rig, world=world)
-    config = RunConfig(estimator, chosen, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap)
+    config = RunConfig(
+        estimator, settings or {}, None if sensors is None else tuple(sensors), prior, seed, max_gap, tick_gap
+    )
     learnt: tuple[FittedConstant, ...] = ()
     if learn:
         result, knowledge = run_and_learn(loaded, config, progress)

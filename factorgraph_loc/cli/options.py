@@ -147,13 +147,6 @@ class RunOptions:
     rpe: Annotated[
         bool, typer.Option("--rpe", help="Show relative errors too, over a metre of path and over a second.")
     ] = False
-    final_only: Annotated[
-        bool,
-        typer.Option(
-            "--final-only",
-            help="Want only the final trajectory: the smoother solves all at the end, without causal estimates.",
-        ),
-    ] = False
     overwrite: Overwrite = False
 
     def given(self) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from factorgraph_loc.experiments.reporting import PAGE, report_experiment
 from factorgraph_loc.experiments.store import Store
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.files.temporary import new_below, of_system, require_free, temporary_folder
-from factorgraph_loc.fusion import registry
 from factorgraph_loc.io.readers import LogLike, RigLike, WorldLike, load_all
 from factorgraph_loc.io.results import FILES, ResultFiles
 from factorgraph_loc.model.log import Log
@@ -69,7 +68,6 @@ def compare(
     tick_gap: float = TICK_GAP,
     align: Alignment = "none",
     rpe: bool = False,
-    final_only: bool = False,
     jobs: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
@@ -77,9 +75,8 @@ def compare(
     """Run several estimators on several logs with each seed, as an experiment in ``jobs`` processes (None: one per core).
 
     ``settings``: of each estimator. ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
-    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``final_only``: make no causal estimates, where an estimator
-    can do without. A run that fails, or whose process dies, becomes a row with its reason; the others continue. Runs whose
-    results are stored are not repeated.
+    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. A run that fails, or whose process dies, becomes a row with
+    its reason; the others continue. Runs whose results are stored are not repeated.
 
     Written into ``out``, by default a new folder below ``out``: ``results.parquet`` and ``results.csv`` (the rows),
     ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
@@ -91,7 +88,7 @@ def compare(
     """
     out = new_below(Path("out"), "compare") if out is None else Path(out)
     require_free(out, FINISHED, overwrite=overwrite)
-    named = _named(estimators, settings or {}, final_only=final_only)
+    named = _named(estimators, settings or {})
     logs = load_all(logs, rig, world)
     if not logs or not named:
         raise InputError("there is nothing to compare, expected at least one log and one estimator")
@@ -116,14 +113,11 @@ def compare(
     return Comparison(done.table, done.failures, done.warnings, out)
 
 
-def _named(
-    estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]], *, final_only: bool
-) -> Mapping[str, Mapping[str, Any]]:
+def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
     """The settings of each estimator, by name; InputError for settings of another one."""
     if unknown := [name for name in settings if name not in estimators]:
         raise InputError(f"settings are given for {unknown[0]}, which is not run here; run: {listed(estimators)}")
-    named = {name: settings.get(name, {}) for name in estimators}
-    return registry.for_final_only(named) if final_only else named
+    return {name: settings.get(name, {}) for name in estimators}
 
 
 def _experiment(

@@ -11,9 +11,7 @@ from factorgraph_loc.fusion.base import EVERY, Estimator
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.plugins import ESTIMATORS, load
 from factorgraph_loc.sensors.registry import Channel, channels, parent_of
-from factorgraph_loc.text import listed, quoted
-
-FINAL_ONLY = "final_only"  # the setting of an estimator that can solve only at the end
+from factorgraph_loc.text import quoted
 
 
 @dataclass(frozen=True)
@@ -36,16 +34,6 @@ def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
     Raises InputError for an unknown estimator, an unknown key or a value out of bounds.
     """
     return parse_model(settings_type(name), overrides, f"settings of {name}")
-
-
-def for_final_only(settings: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Settings of estimators by name for a comparison of final trajectories: ``final_only`` is set for estimators that have it.
-    InputError if no estimator has it or is an offline one."""
-    can = [name for name in settings if FINAL_ONLY in settings_type(name).model_fields]
-    if not can and all(getattr(estimator_type(name), "causal", True) for name in settings):
-        able = [name for name in ESTIMATORS if FINAL_ONLY in settings_type(name).model_fields]
-        raise InputError(f"--final-only changes nothing for {listed(list(settings))}, expected {listed(able)}")
-    return {name: {**given, FINAL_ONLY: True} if name in can else dict(given) for name, given in settings.items()}
 
 
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:

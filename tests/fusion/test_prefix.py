@@ -14,7 +14,7 @@ from factorgraph_loc import ImageStream, InputError, PointMap, World
 from factorgraph_loc.experiments.preparation import resolve_prior
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.fusion.graph.isam import Incremental
-from factorgraph_loc.fusion.registry import ESTIMATORS, for_final_only, settings_of
+from factorgraph_loc.fusion.registry import ESTIMATORS, settings_of
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import Tick, selected
 from factorgraph_loc.simulation import named_settings, simulate
@@ -221,11 +221,3 @@ def test_a_final_trajectory_that_needs_causal_estimates_is_refused(other):
     with pytest.raises(InputError, match=r"final_only is true, but (lag is 10|smooth is false)"):
         settings_of("smoother", {"final_only": True} | other)
     assert settings_of("smoother", {"final_only": True, "lag": "all"})
-
-
-def test_those_that_can_do_without_causal_estimates_are_told_to():
-    given = {"ekf": {}, "smoother": {"self_calibration": False}}
-    assert for_final_only(given) == {"ekf": {}, "smoother": {"self_calibration": False, "final_only": True}}
-    assert for_final_only({"batch": {}}) == {"batch": {}}
-    with pytest.raises(InputError, match="--final-only changes nothing for ekf, expected smoother"):
-        for_final_only({"ekf": {}})
