@@ -58,15 +58,8 @@ class Guard:
     def process(self, estimator: Estimator, measurement: Measurement) -> None:
         """Give a measurement to the estimator."""
         self._last, self._computing, self._of = measurement, "", None
-        if not (self._is_quiet or measurement.is_motion):  # odometry is only stored, without warnings of NumPy
-            with self:
-                estimator.process(measurement)
-            return
-        try:
+        with self:
             estimator.process(measurement)
-        except Exception as error:
-            self._pass_on(error)
-            raise
 
     def computing(self, what: str, t: float | None = None) -> Self:
         """A context for a request of ``what``, such as ``the estimate``, at a time [s] or without one."""
@@ -82,12 +75,8 @@ class Guard:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         if not self._is_quiet:
             self._silence.__exit__(None, None, None)
-        if error is not None:
-            self._pass_on(error)
-
-    def _pass_on(self, error: BaseException) -> None:
-        """Raise what an error of a computation becomes; nothing for others."""
-        if isinstance(error, FAILURES) or (isinstance(error, RunFailedError) and type(error) is RunFailedError):
+        if isinstance(error, FAILURES) or type(error) is RunFailedError:
+            assert error is not None
             raise self._failure(_reason(error)) from error
 
     def _failure(self, why: str) -> RunFailedError:

@@ -19,17 +19,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factorgraph_loc.fusion.cloud import Cloud, pose_moments, systematic
 from factorgraph_loc.fusion.tracking import Change
 from factors import positive, se2
 from factors.compiled import compiled
 from factors.motion import ChainState, Increment
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 BREAK = 100.0  # squared Mahalanobis distance from a pose to its ancestor: ten standard deviations
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def draw_ancestors(
     later_constants: Array,
     covariance: Array,
     uniform: Array,
-) -> Indices:
+) -> Integers:
     """One index (M,) into the N particles for each later state (Godsill et al., 2004, eq. 7): an ancestor is drawn with its weight
     times the transition density.
 
@@ -182,7 +180,7 @@ def _draw(
     whitened_later: Array,
     whitener: Array,
     uniform: Array,
-) -> Indices:
+) -> Integers:
     """``whitened`` (P+3, N) and ``whitened_later`` (P+3, M): the constants' part of the whitened states; ``whitener`` (3, 3): of
     the pose's error given the constants."""
     count = len(predicted)

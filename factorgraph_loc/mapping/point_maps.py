@@ -98,13 +98,7 @@ def _common(first: PointMap, second: PointMap) -> Array | None:
     """The common errors of the views of both maps; zero for a map that was made with a reference."""
     if first.common is None and second.common is None:
         return None
-    nothing = [np.zeros((len(points.owners), 3, 3)) for points in (first, second)]
-    return np.concatenate(
-        [
-            none if points.common is None else points.common
-            for none, points in zip(nothing, (first, second), strict=True)
-        ]
-    )
+    return np.concatenate([np.zeros((len(p.owners), 3, 3)) if p.common is None else p.common for p in (first, second)])
 
 
 def _same(first: PointMap, second: PointMap) -> Integers:

@@ -67,11 +67,6 @@ def look_around() -> Path:
     return Path(poses, "turn")
 
 
-def straight(turn: float, length: float) -> Path:
-    """A straight path of ``length`` [m] after a turn in place [rad]."""
-    return _arc(turn, 0.0, length)
-
-
 def primitives(length: float) -> list[Path]:
     """Paths that begin with a turn in place, one set for each of :data:`DIRECTIONS` directions. A set has a straight path and two
     gentle arcs of ``length`` [m], and a straight path of half the length. Ahead there are also two sharper arcs. Raises
@@ -82,8 +77,8 @@ def primitives(length: float) -> list[Path]:
     for turn in (2.0 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS).tolist():
         for curvature in CURVATURES:
             if turn == 0.0 or abs(curvature) <= CURVATURES[-2]:
-                out.append(_arc(turn, curvature, length))
-        out.append(_arc(turn, 0.0, SHORT * length))
+                out.append(arc(turn, curvature, length))
+        out.append(arc(turn, 0.0, SHORT * length))
     return out
 
 
@@ -145,8 +140,8 @@ def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: i
     return out
 
 
-def _arc(turn: float, curvature: float, length: float) -> Path:
-    """A turn in place and an arc."""
+def arc(turn: float, curvature: float, length: float) -> Path:
+    """A turn in place [rad] and an arc of ``length`` [m] with this curvature [rad/m]."""
     count = max(1, math.ceil(length / STEP - 1e-9))
     driven = np.minimum(STEP * np.arange(count + 1), length)
     poses = se2.exp(np.column_stack((driven, np.zeros(len(driven)), curvature * driven)))

@@ -15,7 +15,7 @@ from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
-from factorgraph_loc.planning.paths import DIRECTIONS, Path, free_steps, straight
+from factorgraph_loc.planning.paths import DIRECTIONS, Path, arc, free_steps
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.sensors.interfaces import LiveSensor
 from factorgraph_loc.sensors.odometry import simulation as wheels
@@ -39,7 +39,7 @@ class ProximitySensor:
 
     def __init__(self, space: FreeSpace, sight: float) -> None:
         self.space = space
-        self._rays = [straight(2.0 * math.pi * k / DIRECTIONS, sight) for k in range(DIRECTIONS)]
+        self._rays = [arc(2.0 * math.pi * k / DIRECTIONS, 0.0, sight) for k in range(DIRECTIONS)]
         self._sight = sight
 
     def expected(self, poses: Array) -> Array:

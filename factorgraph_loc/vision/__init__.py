@@ -11,6 +11,5 @@ __all__ = [
     "keypoints",
     "matching",
     "relocalization",
-    "settings",
     "tracks",
 ]

@@ -15,8 +15,7 @@ from typer.testing import CliRunner, Result
 
 from factorgraph_loc import ImageStream, IncrementStream, Landmark, Log, Rig, Trajectory, World, load, write_native
 from factorgraph_loc.cli.app import app
-from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.vision.settings import FrontendSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings, FrontendSettings
 from factors import se2
 from factors.camera.model import camera_pose
 

@@ -10,8 +10,8 @@ from picture import SMALL, moved_over
 
 from factorgraph_loc import ImageStream, Log, PointMap, Rig, SightingStream, Trajectory, VelocityStream, World
 from factorgraph_loc.evaluation.inspect import inspect
+from factorgraph_loc.sensors.camera.settings import FrontendSettings
 from factorgraph_loc.sensors.camera.summary import mounting_problems
-from factorgraph_loc.vision.settings import FrontendSettings
 
 CAMERA = SMALL.model_copy(update={"frontend": FrontendSettings(feature="orb", count=30)})
 

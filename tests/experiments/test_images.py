@@ -10,8 +10,8 @@ from factorgraph_loc import ImageStream, InputError, PointMap, SightingStream, c
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.sensors.camera import frontend
+from factorgraph_loc.sensors.camera.settings import FrontendSettings
 from factorgraph_loc.sensors.camera.use import frontend_of
-from factorgraph_loc.vision.settings import FrontendSettings
 
 CAMERA = SMALL.model_copy(update={"frontend": FrontendSettings(feature="orb", count=30)})
 

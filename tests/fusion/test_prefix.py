@@ -17,8 +17,8 @@ from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.registry import ESTIMATORS, settings_of
 from factorgraph_loc.model.log import cut
 from factorgraph_loc.model.measurement import Tick, selected
+from factorgraph_loc.sensors.camera.settings import FrontendSettings
 from factorgraph_loc.simulation import named_settings, simulate
-from factorgraph_loc.vision.settings import FrontendSettings
 
 READS = ("odometry", "rfid")
 FEW = {"particles": 150, "min_particles": 100, "smooth": False}

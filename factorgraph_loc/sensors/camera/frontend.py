@@ -23,7 +23,7 @@ from factorgraph_loc.files.bounded import IMAGE, read_bytes
 from factorgraph_loc.maps.markers import MarkerFamily, corner_names
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.camera.measurement import FeatureStream, ImageStream, SightingStream
-from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings, FrontendSettings
 from factorgraph_loc.text import Notice, notice
 from factorgraph_loc.vision.feature_cache import FeatureCache, ImageFeatures, cache_folder, decode, encode
 from factorgraph_loc.vision.features import Extractor, extractor
@@ -31,7 +31,6 @@ from factorgraph_loc.vision.fiducials import find_markers
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.images import as_image, read_image
 from factorgraph_loc.vision.keypoints import Integers
-from factorgraph_loc.vision.settings import FrontendSettings
 from factorgraph_loc.vision.tracks import FeatureTracker
 from factors.camera.model import CameraModel
 

@@ -1,4 +1,4 @@
-"""The camera settings of a rig, and the settings of simulated pixels."""
+"""The camera settings of a rig, with those of feature detection, and the settings of simulated pixels."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.maps.points import CommonError
+from factorgraph_loc.maps.points import CommonError, Feature
 from factorgraph_loc.model.settings import Angle, Hertz, Metres, Offset, SensorSettings, Share
-from factorgraph_loc.vision.settings import FrontendSettings
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 if TYPE_CHECKING:
     from factorgraph_loc.model.world import World
+
 
 Focal = Annotated[float, Field(gt=1.0, le=1e5), InUnit("px")]
 Pixel = Annotated[float, Field(ge=-1e5, le=1e5), InUnit("px")]
@@ -29,6 +29,19 @@ Distance = Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")]
 Turn = Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")]
 COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # of distortion
 WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
+
+
+class FrontendSettings(FileModel):
+    """Settings of the detection of features and markers."""
+
+    feature: Feature = "colour"
+    """kind of feature to detect, if the map's points have no descriptors"""
+    count: Annotated[int, Field(ge=10, le=20_000)] = 500
+    """largest number of features per image"""
+    everywhere: bool = False
+    """whether all parts of an image have equally many features, if possible, not the strongest ones; always so without a map of
+    points
+    """
 
 
 class CameraUncertainty(FileModel):

@@ -17,13 +17,12 @@ from factorgraph_loc.model.measurement import named as name_of
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.measurement import CameraImage, FeatureStream, ImageStream
-from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings, FrontendSettings
 from factorgraph_loc.sensors.interfaces import Ending, Review, Use
 from factorgraph_loc.sensors.registry import moving
 from factorgraph_loc.sensors.tables import Intake
 from factorgraph_loc.text import Notice, notice, plain
 from factorgraph_loc.vision.frame import CameraFrame
-from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
 
 if TYPE_CHECKING:

@@ -21,13 +21,12 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.measurement import ImageStream
-from factorgraph_loc.sensors.camera.settings import CameraSettings
+from factorgraph_loc.sensors.camera.settings import CameraSettings, FrontendSettings
 from factorgraph_loc.sensors.camera.use import frames_of
 from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.features import EXTRACTORS
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.relocalization import located
-from factorgraph_loc.vision.settings import FrontendSettings
 from factors.se2 import Array
 
 COUNT = 1500

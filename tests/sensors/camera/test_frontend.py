@@ -13,9 +13,9 @@ from picture import SMALL
 from factorgraph_loc import FeatureStream, ImageStream, InputError, Log, Rig, World
 from factorgraph_loc.sensors.camera import frontend
 from factorgraph_loc.sensors.camera.frontend import with_features
+from factorgraph_loc.sensors.camera.settings import FrontendSettings
 from factorgraph_loc.vision import feature_cache
 from factorgraph_loc.vision.features import EXTRACTORS, extractor
-from factorgraph_loc.vision.settings import FrontendSettings
 
 ORB = FrontendSettings(feature="orb", count=100)
 SOURCE = Path(frontend.__file__).parents[2] / "vision"

@@ -6,7 +6,7 @@ from picture import SMALL
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.sensors.camera.frontend import LiveFrontend
-from factorgraph_loc.vision.settings import FrontendSettings
+from factorgraph_loc.sensors.camera.settings import FrontendSettings
 
 CAMERA = SMALL.model()
 
