@@ -175,9 +175,6 @@ def _runs(
 ) -> Iterator[PlannedRun]:
     settings = _settings(entry, point)
     estimator = facts.estimator(entry.name, settings)
-    if _needs_only_final(experiment, settings, estimator.effective):
-        settings |= {"final_only": True}
-        estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
         for seed in experiment.seeds[:1] if estimator.deterministic else experiment.seeds:
             config = RunConfig(
@@ -200,14 +197,6 @@ def _runs(
                 key=run_key(log.digest, vars(config) | {"settings": estimator.effective}),
                 sweep=point,
             )
-
-
-def _needs_only_final(experiment: Experiment, settings: Mapping[str, Any], effective: Mapping[str, Any]) -> bool:
-    """Whether runs need no causal estimates: the report shows none and no times, and the estimator does not require them."""
-    if "final_only" not in effective or "final_only" in settings:
-        return False
-    shown = all(metric.startswith("final.") for metric in experiment.report.metrics)
-    return shown and effective["smooth"] and effective["lag"] in (None, "all")
 
 
 def _placed(experiment: Experiment, folder: Path, data_root: str | None) -> Experiment:

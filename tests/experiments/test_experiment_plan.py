@@ -188,15 +188,3 @@ def test_the_rig_and_the_map_that_are_given_are_part_of_the_log(planned, logs):
     world.write_text(world.read_text() + "\n")
     (changed,) = planned(logs=[{"log": "one", "rig": str(rig), "world": str(world)}])
     assert len({own.key, given.key, changed.key}) == 3
-
-
-def test_where_only_final_scores_are_shown_the_smoother_makes_no_causal_estimates(planned):
-    def settings(**content):
-        usual = {"logs": ["one"], "estimators": ["smoother"], "report": {"metrics": ["final.position_rmse"]}}
-        return [run.settings for run in planned(**usual | content)]
-
-    assert settings() == [{"final_only": True}]
-    assert settings(report={"metrics": ["final.position_rmse", "causal.anees"]}) == [{}]
-    assert settings(estimators=["ekf"]) == [{}]
-    for chosen in ({"final_only": False}, {"lag": 5.0}, {"smooth": False}):
-        assert settings(estimators=[{"name": "smoother", "settings": chosen}]) == [chosen]
