@@ -9,7 +9,6 @@ from typer.core import TyperGroup
 
 from factorgraph_loc.cli import (
     experimenting,
-    features,
     inspecting,
     learning,
     lookups,
@@ -17,7 +16,6 @@ from factorgraph_loc.cli import (
     running,
     scoring,
     show,
-    simulating,
     viewing,
 )
 from factorgraph_loc.cli.stopping import OutputError, end, standard_streams, unwrapped
@@ -82,11 +80,11 @@ app.command()(viewing.view)
 app.command()(viewing.export)
 app.command()(learning.calibrate)
 app.command("map")(learning.map_)
-app.command()(simulating.simulate)
+app.command()(inspecting.simulate)
 app.command()(experimenting.active)
 app.add_typer(rigs.app, name="rigs")
 app.add_typer(experimenting.app, name="experiment")
-app.add_typer(features.app, name="features")
+app.add_typer(scoring.features, name="features")
 
 
 def _print_version(wanted: bool) -> None:

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, get_args
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.warned import lines
 from factorgraph_loc.experiments.cluster import Cluster
-from factorgraph_loc.experiments.execute import Executor, Planned, execute
+from factorgraph_loc.experiments.execute import Executor, Planned, Processes, execute
 from factorgraph_loc.experiments.experiment_file import Experiment, Limits, read_experiment
 from factorgraph_loc.experiments.plan import PlannedRun, plan
-from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import State, Store
 from factorgraph_loc.files.bounded import kind
 

@@ -106,7 +106,7 @@ WRAP = """
     [
         ("factorgraph_loc.cli.stopping", SEND, signal.SIGINT),
         ("typer", SEND, signal.SIGINT),
-        ("factorgraph_loc.cli.simulating", WRAP, signal.SIGINT),
+        ("factorgraph_loc.cli.scoring", WRAP, signal.SIGINT),
         ("numpy", WRAP, signal.SIGINT),
         ("factorgraph_loc.cli.app", HANG_UP, signal.SIGHUP),
     ],

@@ -8,11 +8,10 @@ import time
 
 import pytest
 
-from factorgraph_loc.experiments import pool
-from factorgraph_loc.experiments.execute import execute
+from factorgraph_loc.experiments import execute as pool
+from factorgraph_loc.experiments.execute import Processes, execute
 from factorgraph_loc.experiments.experiment_file import Experiment, Limits
 from factorgraph_loc.experiments.plan import plan
-from factorgraph_loc.experiments.pool import Processes
 from factorgraph_loc.experiments.store import Store
 
 SHORT = {"simulate": "office", "settings": {"drive": {"duration": 4}}}
