@@ -14,7 +14,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import YAML
 from factorgraph_loc.files.column_mapping import TableFolder
 from factorgraph_loc.files.models import parse_model, read_text
-from factorgraph_loc.io.guesses import TRUTH, Guess, guess, sample_of
+from factorgraph_loc.io.guesses import TRUTH, Guess, guess
 from factorgraph_loc.io.motions import wheel_steps
 from factorgraph_loc.io.proposals import Proposal, proposal_of, toml_of
 from factorgraph_loc.io.readers.mapped import ReferenceFile, read_reference
@@ -88,7 +88,7 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
     if unused:
         roles.remarks.append(f"not used: {listed(unused)}")
     if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
-        antennas = dict.fromkeys(roles.tables["rfid"].sample.columns[roles.tables["rfid"].fields["antenna"]])
+        antennas = dict.fromkeys(roles.tables["rfid"].columns[roles.tables["rfid"].fields["antenna"]])
         names = shlex.quote(",".join(antennas)) if len(antennas) < LISTED else listed(antennas)
         roles.remarks.append(
             f"the rig needs antennas of these names, as `fgloc rigs new --antennas {names}` writes them"
@@ -119,7 +119,7 @@ def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
     table, reads = roles.tables[role], roles.tables.get("rfid")
     settings = table.mapping(FIELDS[role])
     if role == "tags" and reads is not None:
-        tags, read = (set(g.sample.columns[g.fields["epc"]]) for g in (table, reads))
+        tags, read = (set(g.columns[g.fields["epc"]]) for g in (table, reads))
         case = next((case for case in ("upper", "lower") if all(epc == getattr(epc, case)() for epc in read)), None)
         if case is not None and not tags & read and {getattr(epc, case)() for epc in tags} & read:
             settings["epc_case"] = case
@@ -131,8 +131,8 @@ def _guesses(folder: Path) -> list[Guess]:
     out = []
     for file in sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES and entry.is_file()):
         with suppress(InputError):
-            if (sample := sample_of(file)) is not None:
-                out.append(guess(sample))
+            if (table := guess(file)) is not None:
+                out.append(table)
     return out
 
 

@@ -89,15 +89,26 @@ REAR = {"rear", "back", "rl", "rr", "bl", "br"}  # words in names of rear wheels
 EPC = re.compile(r"(0x)?[0-9A-Fa-f]{8,}$")
 
 
-@dataclass(frozen=True)
-class Sample:
-    """The ``columns`` of a table as texts, by name or, without ``header``, by number from 1; ``separator`` and ``decimal`` mark."""
+@dataclass
+class Guess:
+    """A table with ``columns`` of texts, by name or, without ``header``, by number from 1; ``separator`` and ``decimal`` mark.
+
+    Guessed are its ``fields`` with the column of each and their ``units``; ``reasons``: of guesses by values.
+    """
 
     path: Path
     separator: str
     decimal: str
     header: bool
     columns: Mapping[str, Sequence[str]]
+    fields: dict[str, str] = field(default_factory=dict)
+    units: dict[str, str | float] = field(default_factory=dict)
+    reasons: list[str] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.path.name
 
     def numbers(self, name: str) -> Array | None:
         """The numbers (N,) of a column, NaN where it is empty; None if it has other texts, or none."""
@@ -107,38 +118,22 @@ class Sample:
             return values if np.isfinite(values).any() else None
         return None
 
-
-@dataclass
-class Guess:
-    """The ``fields`` of a table with the column of each, their ``units``, and the ``reasons`` of guesses by values."""
-
-    sample: Sample
-    fields: dict[str, str] = field(default_factory=dict)
-    units: dict[str, str | float] = field(default_factory=dict)
-    reasons: list[str] = field(default_factory=list)
-
-    @property
-    def name(self) -> str:
-        """The name of the file."""
-        return self.sample.path.name
-
     def values(self, name: str) -> Array:
         """The numbers (N,) of a field."""
-        values = self.sample.numbers(self.fields[name])
+        values = self.numbers(self.fields[name])
         return np.empty(0) if values is None else values
 
     def times(self) -> Array:
         """The timestamps (N,) in seconds; empty without any."""
         unit = self.units.get("t")
         if unit == "iso":
-            return np.array([iso_nanoseconds(text) / 1e9 for text in self.sample.columns[self.fields["t"]]])
+            return np.array([iso_nanoseconds(text) / 1e9 for text in self.columns[self.fields["t"]]])
         return self.values("t") * (STAMPS[str(unit)] / STAMPS["s"]) if unit else np.empty(0)
 
     @property
     def is_tum(self) -> bool:
         """Whether the table is a TUM file."""
-        sample = self.sample
-        return not sample.header and sample.separator == " " and self.has("qw") and self.units.get("t") == "s"
+        return not self.header and self.separator == " " and self.has("qw") and self.units.get("t") == "s"
 
     def has(self, *names: str) -> bool:
         """Whether the table has all these fields."""
@@ -147,12 +142,11 @@ class Guess:
     def mapping(self, names: Sequence[str]) -> dict[str, Any]:
         """The keys of a manifest that map the fields ``names``, as far as the table has them."""
         out: dict[str, Any] = {"file": self.name}
-        sample = self.sample
         if self.is_tum:
             return out | {"format": "tum"}
-        out |= {} if sample.separator == "," else {"separator": sample.separator}
-        out |= {} if sample.decimal == "." else {"decimal": sample.decimal}
-        out |= {} if sample.header else {"header": False}
+        out |= {} if self.separator == "," else {"separator": self.separator}
+        out |= {} if self.decimal == "." else {"decimal": self.decimal}
+        out |= {} if self.header else {"header": False}
         out["columns"] = {name: self.fields[name] for name in names if name in self.fields}
         if units := {name: self.units[name] for name in out["columns"] if name in self.units}:
             out["units"] = units
@@ -169,8 +163,8 @@ def rank(name: str, known: Sequence[str]) -> int | None:
     return next((known.index(text) for text in (name, UNIT.sub("", name)) if text in known), None)
 
 
-def sample_of(path: Path) -> Sample | None:
-    """The columns of a table; None if the file is no table of at least two rows and columns."""
+def guess(path: Path) -> Guess | None:
+    """The fields and units of a table; None if the file is no table of at least two rows and columns."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     for separator in SEPARATORS:
@@ -191,7 +185,7 @@ def sample_of(path: Path) -> Sample | None:
     columns = {name: [parts[i] for parts in rows] for i, name in enumerate(names)}
     cells = " ".join(text for parts in rows[:LOOKED_AT] for text in parts)
     decimal = "," if separator != "," and re.search(r"\d,\d", cells) and not re.search(r"\d\.\d", cells) else "."
-    return Sample(path, separator, decimal, not names[0].isdecimal(), columns)
+    return _filled(Guess(path, separator, decimal, not names[0].isdecimal(), columns))
 
 
 def _is_value(text: str) -> bool:
@@ -205,25 +199,24 @@ def _is_time(text: str) -> bool:
     return False
 
 
-def guess(sample: Sample) -> Guess:
-    """The fields and units of a table."""
-    out = Guess(sample)
+def _filled(out: Guess) -> Guess:
+    """The table with its fields and units."""
     _add_time(out)
-    if not sample.header:
+    if not out.header:
         _add_tum(out)
         return out
     taken = set(out.fields.values())
-    for name in sample.columns:
+    for name in out.columns:
         text, end = _split(name)
         ranked = [(at, f) for f, known in NAMES.items() if (at := rank(plain(text), known)) is not None]
         if name in taken or not ranked:
             continue
         best = min(ranked)[1]
-        if best not in out.fields and (best in TEXTS or sample.numbers(name) is not None):
+        if best not in out.fields and (best in TEXTS or out.numbers(name) is not None):
             out.fields[best] = name
             if unit := ENDS.get(best, {}).get(end):
                 out.units[best] = unit
-    for name, texts in sample.columns.items():
+    for name, texts in out.columns.items():
         if "epc" not in out.fields and name not in taken and all(EPC.match(text) for text in texts[:LOOKED_AT]):
             out.fields["epc"] = name
             out.reasons.append(f"{quoted(name)} has hexadecimal numbers as EPCs have")
@@ -244,15 +237,14 @@ def _split(name: str) -> tuple[str, str]:
 
 def _add_time(out: Guess) -> None:
     """The column of the time: named so, with times or numbers that hardly ever fall; without header the first one."""
-    sample = out.sample
-    names = list(sample.columns)
-    named = [name for name in names if TIME.match(plain(_split(name)[0]))] if sample.header else names[:1]
+    names = list(out.columns)
+    named = [name for name in names if TIME.match(plain(_split(name)[0]))] if out.header else names[:1]
     for name in [*named, *names[:1]]:
-        texts = sample.columns[name]
+        texts = out.columns[name]
         if all(map(_is_time, texts)):
             out.fields["t"], out.units["t"] = name, "iso"
             return
-        values = sample.numbers(name)
+        values = out.numbers(name)
         if (
             values is None
             or not np.isfinite(values).all()
@@ -263,7 +255,7 @@ def _add_time(out: Guess) -> None:
         end = _split(name)[1] or plain(name)
         out.fields["t"] = name
         out.units["t"] = SECONDS.get(end) or _unit_of_times(values)
-        if end not in SECONDS and sample.header:
+        if end not in SECONDS and out.header:
             out.reasons.append(f"{quoted(name)} is in {out.units['t']}: it begins with {texts[0]}")
         return
 
@@ -281,8 +273,8 @@ def _unit_of_times(values: Array) -> str:
 
 def _add_tum(out: Guess) -> None:
     """The eight columns of a TUM file: time, position, and a quaternion of length 1."""
-    names = list(out.sample.columns)
-    values = [out.sample.numbers(name) for name in names]
+    names = list(out.columns)
+    values = [out.numbers(name) for name in names]
     if len(names) != 8 or any(v is None for v in values):
         return
     length = np.linalg.norm(np.column_stack([v for v in values[4:] if v is not None]), axis=1)
@@ -292,7 +284,7 @@ def _add_tum(out: Guess) -> None:
 
 def _add_wheels(out: Guess) -> None:
     """The columns of two or four wheels: their speeds, rates, angles or distances, or counters, which are whole numbers."""
-    words = {name: [word.lower() for word in WORDS.findall(name)] for name in out.sample.columns}
+    words = {name: [word.lower() for word in WORDS.findall(name)] for name in out.columns}
     sides = {
         side: [
             name
@@ -311,7 +303,7 @@ def _add_wheels(out: Guess) -> None:
             "there are four wheels: if they are mecanum wheels, set base [m], the distance between the axles"
         )
     left, right = (front[side][0] for side in ("left", "right"))
-    if out.sample.numbers(left) is None or out.sample.numbers(right) is None:
+    if out.numbers(left) is None or out.numbers(right) is None:
         return
     parts = set(words[left])
     kind = next(
