@@ -19,10 +19,10 @@ from factors.se2 import Array
 
 INDEX = "results.parquet"  # of several runs
 ESTIMATES, INNOVATIONS, EVENTS = "estimates.parquet", "innovations.parquet", "events.csv"
-TEXTS, STAMP = ("kind", "status"), "t_ns"
+STAMP = "t_ns"
 ERRORS = ("error_position", "error_heading", "nees")
 NUMBERS = ("x", "y", "heading", *COVARIANCES, *ERRORS)
-COLUMNS = (STAMP, *TEXTS, *NUMBERS)
+COLUMNS = {STAMP: pl.Int64, "kind": pl.String, "status": pl.String, **dict.fromkeys(NUMBERS, pl.Float64)}
 FINAL, CAUSAL, LEARNT, CONFIG, METRICS = "final.tum", "causal.tum", "learnt.json", "config.toml", "metrics.json"
 FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)  # the last one is written last
 
@@ -61,7 +61,11 @@ class ResultFiles:
     def estimates(self) -> dict[str, Estimates]:
         """The estimates of each of :data:`KINDS`: the causal ones from the first localized one on, and the final ones."""
         source = self.folder / ESTIMATES
-        table = parse_estimates(self.read(ESTIMATES), source)
+        table = parse_parquet(self.read(ESTIMATES), source, list(COLUMNS))
+        with foreign(source, "is no table of estimates"):
+            table = table.cast(COLUMNS)  # type: ignore[arg-type]
+        if not table[STAMP].is_between(-LATEST, LATEST).fill_null(value=False).all():
+            raise InputError(f"{source}: {STAMP} has a row without a stamp, or with one beyond {LATEST:.1e} ns")
         t0_ns = table[STAMP].min() if self.t0_ns is None else self.t0_ns
         by_kind = {kind: table.filter(pl.col("kind") == kind) for kind in KINDS}
         localized = (by_kind["causal"]["status"] == "localized").arg_true()
@@ -90,23 +94,3 @@ class ResultFiles:
                 f"{source}: has a row that lacks its stamp or its event, or a stamp beyond {LATEST:.1e} ns"
             )
         return tuple(((t_ns - (self.t0_ns or 0)) / 1e9, text) for t_ns, text in table.iter_rows())
-
-
-def parse_estimates(content: bytes, source: object) -> pl.DataFrame:
-    """The table in the bytes of ``estimates.parquet``, numbers as floats, null where unknown.
-
-    Raises InputError with ``source`` if the file is damaged."""
-    table = parse_parquet(content, source, COLUMNS)
-    for name in COLUMNS:
-        kind = table.schema[name]
-        is_right = (kind == pl.String) if name in TEXTS else kind.is_integer() if name == STAMP else kind.is_numeric()
-        if not is_right and kind != pl.Null:
-            raise InputError(f"{source}: {name} is of type {kind}, expected {'texts' if name in TEXTS else 'numbers'}")
-    table = table.select(pl.col(name).cast(_kind(name), strict=False) for name in COLUMNS)
-    if not table[STAMP].is_between(-LATEST, LATEST).fill_null(value=False).all():
-        raise InputError(f"{source}: {STAMP} has a row without a stamp, or with one beyond {LATEST:.1e} ns")
-    return table
-
-
-def _kind(name: str) -> type[pl.DataType]:
-    return pl.String if name in TEXTS else pl.Int64 if name == STAMP else pl.Float64
