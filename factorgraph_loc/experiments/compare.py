@@ -92,15 +92,9 @@ def compare(
     logs = load_all(logs, rig, world)
     if not logs or not named:
         raise InputError("there is nothing to compare, expected at least one log and one estimator")
-    keys: dict[str, Any] = {
-        "prior": prior,
-        "seeds": tuple(seeds),
-        "max_gap": max_gap,
-        "tick_gap": tick_gap,
-        "align": align,
-    }
-    keys["sensors"] = (None if sensors is None else tuple(sensors),)
-    experiment = _experiment(logs, named, keys, rpe=rpe)
+    keys = {"prior": prior, "seeds": tuple(seeds), "max_gap": max_gap, "tick_gap": tick_gap, "align": align}
+    several = (None if sensors is None else tuple(sensors),)
+    experiment = _experiment(logs, named, keys | {"sensors": several}, rpe=rpe)
     prepared = _prepared(experiment, logs, out)
     for name in WRITTEN:
         (out / name).unlink(missing_ok=True)
@@ -124,8 +118,7 @@ def _experiment(
     logs: Sequence[Log], estimators: Mapping[str, Mapping[str, Any]], keys: Mapping[str, Any], *, rpe: bool
 ) -> Experiment:
     """The experiment of a comparison."""
-    align = keys.get("align", "none")
-    tables = further_tables([{"scoring.align": None if align == "none" else align}], rpe=rpe)
+    tables = further_tables([{"scoring.align": keys["align"]}] if keys["align"] != "none" else [], rpe=rpe)
     further = [key for keys in tables.values() for key in keys]
     content: dict[str, Any] = {
         "name": "Comparison",

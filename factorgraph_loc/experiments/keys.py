@@ -124,7 +124,7 @@ class Facts:
     libraries, so that each file is read once."""
 
     def __init__(self, cache: Path | None = None) -> None:
-        self._cache, self._new = cache, False
+        self._cache = cache
         self._known = _Kept() if cache is None else _kept(cache)
 
     def digest(self, source: LogSource) -> str:
@@ -149,28 +149,26 @@ class Facts:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
         if time.time() - stat.st_mtime > _UNSETTLED:
             self._known.files[str(path)] = (stat.st_size, stat.st_mtime_ns, digest)
-            self._new = True
         return digest
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
         """Facts of all logs of a source. Raises InputError as the reader or the simulation's settings do."""
         if digest not in self._known.logs:
-            self._known.logs[digest], self._new = [_facts(log) for log in source.load_all()], True
+            self._known.logs[digest] = [_facts(log) for log in source.load_all()]
         return self._known.logs[digest]
 
     def estimator(self, name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
         """Facts of an estimator with these settings. Raises InputError for an unknown estimator or invalid settings."""
         key = f"{name} {canonical(settings)}"
         if key not in self._known.estimators:
-            self._known.estimators[key], self._new = _of_estimator(name, settings), True
+            self._known.estimators[key] = _of_estimator(name, settings)
         return self._known.estimators[key]
 
     def save(self) -> None:
-        """Write new facts to the cache; errors are ignored."""
-        if self._new and self._cache is not None:
+        """Write the facts to the cache; errors are ignored."""
+        if self._cache is not None:
             with suppress(OSError):
                 write_text(self._cache, json.dumps(self._known.model_dump()))
-            self._new = False
 
 
 def _kept(cache: Path) -> _Kept:

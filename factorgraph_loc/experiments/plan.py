@@ -177,24 +177,21 @@ def _runs(
     estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
         for seed in experiment.seeds[:1] if estimator.deterministic else experiment.seeds:
-            config = RunConfig(
-                entry.name,
-                settings,
-                sensors,
-                experiment.prior,
-                seed,
-                experiment.max_gap,
-                experiment.tick_gap,
-                experiment.align,
-            )
+            config = {
+                "estimator": entry.name,
+                "settings": settings,
+                "sensors": sensors,
+                "seed": seed,
+                **{name: getattr(experiment, name) for name in ("prior", "max_gap", "tick_gap", "align")},
+            }
             yield PlannedRun(
-                **vars(config),
+                **config,
                 source=log.source,
                 log_digest=log.digest,
                 log=log.name,
                 duration=log.duration,
                 label=entry.shown,
-                key=run_key(log.digest, vars(config) | {"settings": estimator.effective}),
+                key=run_key(log.digest, config | {"settings": estimator.effective}),
                 sweep=point,
             )
 

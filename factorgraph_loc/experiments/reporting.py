@@ -15,6 +15,7 @@ from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.keys import code_version, library_versions
 from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.result_table import collect
+from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.version import __version__
 
@@ -79,12 +80,12 @@ def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) ->
 def _scene(run: PlannedRun, kept: Path) -> Scene | None:
     """The scene of a run's log; None if the log has disappeared."""
     with suppress(OSError, ValueError):
-        return Scene.read(kept)
+        return Scene.model_validate_json(kept.read_bytes())
     try:
         scene = Scene.of(run.source.load())
     except InputError:
         return None
     with suppress(OSError):  # results may be read-only
         kept.parent.mkdir(parents=True, exist_ok=True)
-        scene.write(kept)
+        write_text(kept, scene.model_dump_json())
     return scene

@@ -237,7 +237,7 @@ class Results:
 
     def _variant(self, row: Row, several: set[str]) -> str:
         label = label_of(row)
-        sensors = [", ".join(_sensors(row)) or "the rig's sensors"] if label in several else []
+        sensors = [(row["sensors"] or "the rig's sensors").replace(",", ", ")] if label in several else []
         return _named(label, [*sensors, *self._swept(row, of_log=False)])
 
     def _log(self, row: Row) -> str:
@@ -288,12 +288,7 @@ def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Poo
 
 
 def _labels_with_several_sensors(rows: Sequence[Row]) -> set[str]:
-    met: dict[str, set[tuple[str, ...]]] = {}
+    met: dict[str, set[str | None]] = {}
     for row in rows:
-        met.setdefault(label_of(row), set()).add(_sensors(row))
+        met.setdefault(label_of(row), set()).add(row.get("sensors"))
     return {label for label, sensors in met.items() if len(sensors) > 1}
-
-
-def _sensors(row: Row) -> tuple[str, ...]:
-    sensors = row.get("sensors") or ()
-    return tuple(sensors.split(",") if isinstance(sensors, str) else sensors)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from pydantic import BaseModel, Field
 
 from factorgraph_loc.evaluation.inference import independent_count
 from factorgraph_loc.evaluation.pairing import pauses
-from factorgraph_loc.files.models import write_text
 from factorgraph_loc.io.results import Estimates
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Marks, marks
@@ -47,15 +45,6 @@ class Scene(BaseModel, frozen=True, allow_inf_nan=False):
             reference=[_plain(piece) for piece in _pieces(log)],
             t0_ns=log.t0_ns,
         )
-
-    def write(self, path: Path) -> None:
-        """Write a JSON file atomically."""
-        write_text(path, self.model_dump_json() + "\n")
-
-    @classmethod
-    def read(cls, path: Path) -> Scene:
-        """Read the file of :meth:`write`. Raises OSError or ValueError if it is missing or damaged."""
-        return cls.model_validate_json(path.read_bytes())
 
 
 def _thinned(layer: Marks) -> Array:
