@@ -107,33 +107,14 @@ def run_active(
     Runs with the same seed share world, start, and noise sequences, for all policies and estimators. Raises InputError for a
     wrong policy, estimator or start, and for a sensor faster than the robot's control; RunFailedError if the estimator fails.
     """
-    settings = settings or ActiveSettings()
-    for name, rate in _rates(simulation):
-        if rate > RATE:
-            raise InputError(
-                f"{simulation.name}: {name} is {rate:g}, expected at most {RATE:g}, the rate of the robot's control"
-            )
-    chooser = named_policy(policy)
-
-    def of_world() -> np.random.Generator:
-        return generator(seed if simulation.world_seed is None else simulation.world_seed, "world")
-
-    world = make_world(simulation.world, of_world())
-    space = free_space(world, settings.clearance)
-    of_start, of_robot, of_estimator, of_policy = np.random.default_rng((seed, 1)).spawn(4)
-    start = _start(make_plan(simulation.world, of_world()), world, space, settings, of_start)
-    robot = SimulatedRobot(world, space, simulation, start, settings, of_robot)
-    setup = model_setup.Setup(simulation.rig, world, robot.channels, of_estimator)
-    guard = Guard(f"{estimator} on {simulation.name}")
-    with guard:
-        made = _estimator(estimator, setup, settings)
-    loop = _ClosedLoop(robot, guard, made, chooser, setup, space, simulation, settings, of_policy)
+    loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()
     position, heading = loop.errors()
+    robot = loop.robot
     return ActiveRun(
         seed=seed,
         preset=simulation.name,
-        world=world,
+        world=loop.world,
         policy=policy,
         estimator=estimator,
         localized=localized,
@@ -151,27 +132,35 @@ class _ClosedLoop:
     """One run: propose, predict, choose, move, and update by the actual reads."""
 
     def __init__(
-        self,
-        robot: SimulatedRobot,
-        guard: Guard,
-        estimator: Estimator,
-        policy: Policy,
-        setup: model_setup.Setup,
-        space: FreeSpace,
-        simulation: SimulationSettings,
-        settings: ActiveSettings,
-        rng: np.random.Generator,
+        self, simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings
     ) -> None:
+        for name, rate in _rates(simulation):
+            if rate > RATE:
+                raise InputError(
+                    f"{simulation.name}: {name} is {rate:g}, expected at most {RATE:g}, the rate of the robot's control"
+                )
+        self._policy: Policy = named_policy(policy)
+
+        def of_world() -> np.random.Generator:
+            return generator(seed if simulation.world_seed is None else simulation.world_seed, "world")
+
+        self.world = world = make_world(simulation.world, of_world())
+        self._space = space = free_space(world, settings.clearance)
+        of_start, of_robot, of_estimator, self._rng = np.random.default_rng((seed, 1)).spawn(4)
+        start = _start(make_plan(simulation.world, of_world()), world, space, settings, of_start)
+        self.robot = robot = SimulatedRobot(world, space, simulation, start, settings, of_robot)
+        setup = model_setup.Setup(simulation.rig, world, robot.channels, of_estimator)
+        self._guard = Guard(f"{estimator} on {simulation.name}")
+        with self._guard:
+            self._estimator = _estimator(estimator, setup, settings)
         self.steps: list[PlanningStep] = []
         self.claimed_wrong = False
-        self._robot, self._estimator, self._policy = robot, estimator, policy
-        self._guard = guard
-        self._space, self._settings, self._rng = space, settings, rng
+        self._settings = settings
         self._paths, self._turn = primitives(settings.policy.horizon), look_around()
         self._looked_at = -math.inf  # metres driven at the last proximity update of the particles
         self._turned_at = -math.inf  # metres driven when the robot last turned around
         self._sensors = Sensors.of(
-            setup.world, setup.rig, simulation, settings.speed, settings.turn_rate, only=robot.sensors
+            world, simulation.rig, simulation, settings.speed, settings.turn_rate, only=robot.sensors
         )
         # positions of the robot next to each tag
         nearest_cells = cKDTree(space.centres).query(self._sensors.goals)[1]
@@ -179,7 +168,7 @@ class _ClosedLoop:
 
     def run(self) -> bool:
         """Run to the end; whether the robot was localized."""
-        robot, settings = self._robot, self._settings
+        robot, settings = self.robot, self._settings
         done = self._take(robot.begin())
         while not done and robot.metres < settings.max_metres - 1e-3 and robot.t < settings.max_seconds:
             choice = self._choose()
@@ -194,20 +183,20 @@ class _ClosedLoop:
 
     def errors(self) -> tuple[float, float]:
         """Errors of the estimate in position [m] and heading [rad], NaN without an estimate."""
-        error = self._estimate().pose - self._robot.pose
+        error = self._estimate().pose - self.robot.pose
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
     def _take(self, reports: Iterator[Measurement]) -> bool:
         """Process the reports; whether the robot is localized correctly after one of them."""
         for report in reports:
             self._feed(report)
-            if isinstance(self._estimator, ActiveMcl) and self._robot.metres >= self._looked_at + LOOK:
-                self._looked_at = self._robot.metres
+            if isinstance(self._estimator, ActiveMcl) and self.robot.metres >= self._looked_at + LOOK:
+                self._looked_at = self.robot.metres
                 # filters move at scans and ticks only
-                self._feed(Tick(self._robot.t))
-                with self._guard.computing("the walls", self._robot.t):
-                    self._estimator.see(self._robot.proximity, self._robot.read_proximity())
-            if report.sensor in self._robot.decisive and self._is_sure():
+                self._feed(Tick(self.robot.t))
+                with self._guard.computing("the walls", self.robot.t):
+                    self._estimator.see(self.robot.proximity, self.robot.read_proximity())
+            if report.sensor in self.robot.decisive and self._is_sure():
                 position, heading = self.errors()
                 if position < self._settings.position_limit and heading < self._settings.heading_limit:
                     return True
@@ -219,7 +208,7 @@ class _ClosedLoop:
         self._guard.process(self._estimator, measurement)
 
     def _estimate(self) -> PoseEstimate:
-        with self._guard.computing("the estimate", self._robot.t):
+        with self._guard.computing("the estimate", self.robot.t):
             return sound(self._estimator.estimate())
 
     def _is_sure(self) -> bool:
@@ -231,37 +220,29 @@ class _ClosedLoop:
         return position < self._settings.position_limit and heading < self._settings.heading_limit
 
     def _choose(self) -> Choice:
-        self._feed(Tick(self._robot.t))
+        self._feed(Tick(self.robot.t))
         started = perf_counter()
-        with self._guard.computing("the belief", self._robot.t):
+        with self._guard.computing("the belief", self.robot.t):
             belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
         modes = _places(belief)
         proposed = [*self._paths, *self._far(modes)]
-        if self._robot.metres >= self._turned_at + self._settings.policy.replan:
+        if self.robot.metres >= self._turned_at + self._settings.policy.replan:
             proposed.append(self._turn)
-        paths, free = usable(proposed, self._robot.free_ahead(proposed), self._settings.sight)
+        paths, free = usable(proposed, self.robot.free_ahead(proposed), self._settings.sight)
         situation = Situation(
-            particles,
-            weights,
-            self._sensors,
-            self._space,
-            paths,
-            free,
-            self._settings,
-            self._rng,
-            modes,
+            particles, weights, self._sensors, self._space, paths, free, self._settings, self._rng, modes
         )
         choice = self._policy(situation)
         elapsed = 1e3 * (perf_counter() - started)
         if choice.path is not None and choice.path.kind == self._turn.kind:
-            self._turned_at = self._robot.metres
+            self._turned_at = self.robot.metres
         estimate = self._estimate()
         self.steps.append(
             PlanningStep(
-                t=self._robot.t,
-                metres=self._robot.metres,
-                truth=self._robot.pose.copy(),
+                t=self.robot.t,
+                metres=self.robot.metres,
+                truth=self.robot.pose.copy(),
                 pose=estimate.pose,
                 covariance=estimate.covariance,
                 particles=particles[systematic(weights, self._rng, min(SHOWN, len(weights)))],
@@ -285,7 +266,7 @@ class _ClosedLoop:
         return out
 
     def _in_world(self, path: Path) -> Array:
-        return np.asarray(se2.compose(self._robot.pose, path.poses))
+        return np.asarray(se2.compose(self.robot.pose, path.poses))
 
 
 def _rates(simulation: SimulationSettings) -> Iterator[tuple[str, float]]:

@@ -152,7 +152,7 @@ def test_the_belief_is_of_where_the_robot_is_now(monkeypatch: pytest.MonkeyPatch
 
     def watched(loop):
         out = choose(loop)
-        seen.append((loop._estimator.estimate().t, loop._robot.t))
+        seen.append((loop._estimator.estimate().t, loop.robot.t))
         return out
 
     monkeypatch.setattr(closed_loop._ClosedLoop, "_choose", watched)
