@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks, world_estimate
+from factorgraph_loc.fusion.filter import Filter, FilterSettings, at_ticks
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.trajectory import Trajectory
@@ -54,7 +54,8 @@ class DeadReckoning(Filter):
         raise AssertionError("dead reckoning has no sensor but odometry")
 
     def _estimate(self) -> PoseEstimate:
-        return world_estimate(self._t, *self._state)
+        pose, covariance = self._state
+        return PoseEstimate(self._t, pose, se2.body_to_world_one(pose, covariance), "localized")
 
     def _record(self) -> _PoseRecord:
         return _PoseRecord(self._t, *self._state)

@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks, world_estimate
+from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks
 from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, constants_of, learnt_from, on_pose
 from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
@@ -270,7 +270,8 @@ class Ekf(Filter):
         doubted = is_doubted(self._sensors.values())
         doubted = doubted or self._search.is_unsure(self._t, self._state.covariance[:3, :3])
         status: Status = "ambiguous" if doubted else "localized"
-        return world_estimate(self._t, self._state.pose, self._state.covariance, status)
+        pose, covariance = self._state.pose, se2.body_to_world_one(self._state.pose, self._state.covariance)
+        return PoseEstimate(self._t, pose, covariance, status)
 
     def _record(self) -> _Record:
         step, self._step = self._step or self._standstill(), None

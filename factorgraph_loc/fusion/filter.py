@@ -16,7 +16,7 @@ from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.timeline import Taken, Timeline
 from factorgraph_loc.fusion.tracking import Tracked
-from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
+from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
@@ -247,11 +247,6 @@ def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: A
     rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
     covariances = se2.body_to_world(poses[rows], body_covariances[rows])
     return Trajectory(np.unique(np.array(ticks)), poses[rows], covariances)
-
-
-def world_estimate(t: float, pose: Array, covariance: Array, status: Status = "localized") -> PoseEstimate:
-    """An estimate from the covariance (S, S) of an error state that begins with the pose's body-frame perturbation."""
-    return PoseEstimate(t, pose, se2.body_to_world_one(pose, covariance), status)
 
 
 def twin(rng: np.random.Generator) -> np.random.Generator:

@@ -52,7 +52,6 @@ from factorgraph_loc.slam.monoslam_state import (
     of_mounting,
     squared,
     starting,
-    weighted,
     widened,
     with_floor,
 )
@@ -261,7 +260,7 @@ class Monoslam(Filter):
                 innovation = Innovation.of(sights, prior.covariance)
                 residual = match.pixels - sights.pixels
                 weight = huber_weight(squared(residual, sights.noise), eye.model.robust)
-                noise = weighted(sights.noise, 1.0 / weight)
+                noise = sights.noise * (1.0 / weight)[:, None, None]
             root, gain = innovation.gain(noise / tempering[:, None, None])
             whitened = np.linalg.solve(root, residual.ravel() + innovation.jacobian @ delta[innovation.columns])
             last_delta, delta = delta, gain.T @ whitened

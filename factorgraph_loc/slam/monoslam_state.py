@@ -225,14 +225,11 @@ class Eye:
 
     def all(self, state: SlamState, which: Sequence[int], points: Array, covariances: Array | None) -> Sights:
         """Predicted pixels (K, 2) of points of the state, then of the map."""
-        return joined(self.mapped(state, which), self.known(state.robot, points, covariances))
-
-
-def joined(first: Sights, second: Sights) -> Sights:
-    if not len(first) or not len(second):
-        return first if len(first) else second
-    names = Sights.__dataclass_fields__
-    return Sights(*(np.concatenate((getattr(first, name), getattr(second, name))) for name in names))
+        first, second = self.mapped(state, which), self.known(state.robot, points, covariances)
+        if not len(first) or not len(second):
+            return first if len(first) else second
+        names = Sights.__dataclass_fields__
+        return Sights(*(np.concatenate((getattr(first, name), getattr(second, name))) for name in names))
 
 
 @dataclass(frozen=True)
@@ -289,11 +286,7 @@ def starting(sigmas: Array) -> Array:
     return np.diag(np.concatenate((motion, sigmas)) ** 2)
 
 
-def weighted(noise: Array, factors: Array) -> Array:
-    """The ``noise`` (K, 2, 2) of pixels whose variances are multiplied by ``factors`` (K,)."""
-    return noise * factors[:, None, None]
-
-
 def widened(noise: Array, residual: Array, innovation: Innovation) -> Array:
     """The ``noise`` (K, 2, 2), widened beyond the gate by the squared excess."""
-    return weighted(noise, np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE) ** 2)
+    excess = np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE)
+    return np.asarray(noise * (excess**2)[:, None, None])
