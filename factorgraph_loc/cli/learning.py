@@ -239,7 +239,7 @@ def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[s
 
 def _reasons(made: MadeTags) -> dict[str, str]:
     """Why each tag that is not located is not."""
-    return {name: why.text for name, why in made.open.items()}
+    return {name: str(why) for name, why in made.open.items()}
 
 
 def _notes(made: LandmarkMap) -> list[str]:
@@ -266,4 +266,4 @@ def _notes_on_tags(made: MadeTags) -> list[str]:
         lines.append(
             f"{len(chance)} tags that the map lacks were read so rarely that no position explains the reads better than chance"
         )
-    return lines + [f"not in the map: {name}, {why.text}" for name, why in unmapped.items() if name not in chance]
+    return lines + [f"not in the map: {name}, {why}" for name, why in unmapped.items() if name not in chance]

@@ -5,7 +5,7 @@ The map is written in the frame of the survey of the log's rig (``[survey]``), s
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -22,20 +22,13 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
+from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array
 
 MAX_GAP = 0.5  # s between poses of the reference, beyond which it is not interpolated
 
 Poses = Literal["reference", "odometry"]
-
-
-class Unlocated(NamedTuple):
-    """Why a tag was not located: it was never read (``unread``), its reads may be due to ``chance``, or its position is
-    ``ambiguous`` or ``uncertain``. ``text``: the reason with its figures."""
-
-    kind: Literal["unread", "chance", "ambiguous", "uncertain"]
-    text: str
 
 
 @dataclass(frozen=True)
@@ -48,7 +41,7 @@ class MadeTags:
     world: World
     made: LandmarkMap
     poses: Array
-    open: Mapping[str, Unlocated]
+    open: Mapping[str, Notice]
     modes: Mapping[str, tuple[TagMode, ...]]
 
     @property
@@ -144,17 +137,18 @@ def _along_reference(
     return learnt, facing, posteriors, at[which]
 
 
-def _why(posterior: TagPosterior, reads: int) -> Unlocated:
-    """The reason why a tag is not in the map."""
+def _why(posterior: TagPosterior, reads: int) -> Notice:
+    """The reason why a tag is not in the map: it is ``unread``, or read by ``chance``, or its position ``ambiguous`` or
+    ``uncertain``."""
     if not reads:
-        return Unlocated("unread", "never read")
+        return notice("unread", "never read")
     count = f"read {reads} times" if reads > 1 else "read once"
     if not posterior.is_explained:
-        return Unlocated("chance", f"{count}: no position explains that significantly better than chance")
+        return notice("chance", "{reads}: no position explains that significantly better than chance", count)
     if posterior.is_ambiguous:
         places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in posterior.modes[:3]]
-        return Unlocated("ambiguous", f"{count}: ambiguous, {' or '.join(places)}")
-    return Unlocated("uncertain", f"{count}: too uncertain, sigma {posterior.modes[0].sigma:.1f} m")
+        return notice("ambiguous", "{reads}: ambiguous, {places}", count, " or ".join(places))
+    return notice("uncertain", "{reads}: too uncertain, sigma {sigma:.1f} m", count, posterior.modes[0].sigma)
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
