@@ -175,7 +175,6 @@ def _result(
         *unused(log, use.sensors),
         *prepared.warnings,
         *(warning for result in reviews.values() for warning in result.warnings),
-        *(doubt for result in reliability.values() for doubt in result.doubts),
         *never_localized(log, use.sensors, causal.estimates.status, end.final),
         *partly_scored(log, end.final, config.max_gap),
         *in_bent_map(log, causal.frame, end.final),

@@ -20,7 +20,7 @@ class Reliability:
 
     ``what``: plural of the detections; ``groups`` (G,): their names; ``observed``, ``predicted`` and ``sigma`` (G,): counts, and
     the standard deviation of the observed one for a correct model, with the correlation of successive measurements.
-    ``overdispersion``: number of measurements that contain the information of one independent one. ``doubts``: one line each.
+    ``overdispersion``: number of measurements that contain the information of one independent one.
     """
 
     what: str
@@ -29,7 +29,6 @@ class Reliability:
     predicted: Array
     sigma: Array
     overdispersion: float
-    doubts: tuple[Notice, ...] = ()
 
 
 @dataclass(frozen=True)

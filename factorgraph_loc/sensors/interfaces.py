@@ -37,7 +37,7 @@ Places = NDArray[np.int64]
 class Use:
     """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``; ``given``: those of the
     user; ``modalities``: of measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the
-    map; ``warnings``: one line each."""
+    map; ``warnings``: about the settings."""
 
     log: Log
     sensors: tuple[str, ...]

@@ -183,8 +183,8 @@ TURNED, LATE = math.radians(3.0), 0.05  # rad, s: likewise of the yaw of an ante
 
 def review(use: Use, ending: Ending) -> Review:
     """The warnings of a run, and the reliability of the detection models along its final trajectory."""
-    reliable = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
-    return Review(tuple(doubts(use, ending.diagnostics, ending.learnt)), reliable)
+    models = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
+    return Review((*doubts(use, ending.diagnostics, ending.learnt), *models.warnings), models.reliability)
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
@@ -283,18 +283,18 @@ class _Looks:
     distance: Array
 
 
-def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Reliability | None:
-    """The reliability of the detection models with what was learnt of them; None without reads, antennas or covariances.
+def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Review:
+    """The reliability of the detection models with what was learnt of them, and warnings.
 
-    Probably dead tags and times without reads are left out. Tags that seem to have moved count, because many
-    seem to where the model is wrong.
+    Empty without reads, antennas or covariances. Probably dead tags and times without reads are left out. Tags that
+    seem to have moved count, because many seem to where the model is wrong.
     """
     log, settings = use.log, use.log.rig.find(RfidSettings)
     stream = log.streams.get("rfid")
     if settings is None or "rfid" not in use.sensors or not isinstance(stream, RfidStream) or not len(stream.t):
-        return None
+        return Review()
     if not log.world.tags or len(final) < 2 or final.covariances is None or "rfid" not in use.modalities:
-        return None
+        return Review()
     dead = diagnostics.doubted.get("dead_tags", {})
     kept = [name for name in log.world.tags if name not in dead]
     looks = _observed(use, stream, settings, learnt, final, kept)
@@ -327,17 +327,17 @@ def _observed(
     return _Looks(p[n, tag], hits[rows, tag].astype(float), antenna[rows], tag, block[rows], distance[n, tag])
 
 
-def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Reliability | None:
-    """The counts by bands of distance and by antennas, None if there are too few."""
+def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Review:
+    """The counts by bands of distance and by antennas, empty if there are too few."""
     if looks.p.sum() < FEWEST:
-        return None
+        return Review()
     groups = ReadGroups(antennas)
     ones = np.ones(len(looks.p), dtype=np.int64)
     reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
     groups.add(looks.antenna, ones, reads, ones[:, None] > 0)
     ratio, chosen = _overdispersion(looks, (looks.distance // BAND).astype(np.int64)), groups.large()
     if not len(chosen):
-        return None
+        return Review()
     observed, predicted, variance = groups.sums[:, chosen]
     # what the estimators take successive rounds for is no reason to doubt the model either
     sigma = np.sqrt(max(ratio, 1.0 / tempering) * variance)
@@ -353,7 +353,7 @@ def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> 
             "{tempering:.2g} in the rig, which has {present:g}"
         )
         doubts.append(notice("bursts", sentence, log, ratio, 1.0 / ratio, tempering))
-    return Reliability("reads", groups.names(chosen), observed, predicted, sigma, ratio, tuple(doubts))
+    return Review(tuple(doubts), Reliability("reads", groups.names(chosen), observed, predicted, sigma, ratio))
 
 
 def _overdispersion(looks: _Looks, band: Integers) -> float:
