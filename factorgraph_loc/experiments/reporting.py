@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.report import RunFiles, Scene, write_report
+from factorgraph_loc.evaluation.report import Scene, write_report
 from factorgraph_loc.experiments.experiment import Prepared, prepare
 from factorgraph_loc.experiments.experiment_file import Experiment
 from factorgraph_loc.experiments.keys import code_version, library_versions
@@ -17,6 +17,7 @@ from factorgraph_loc.experiments.plan import PlannedRun
 from factorgraph_loc.experiments.result_table import collect
 from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import writing
+from factorgraph_loc.io.results import ResultFiles
 from factorgraph_loc.version import __version__
 
 PAGE = "report.html"
@@ -55,11 +56,12 @@ def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) ->
     runs = {run.key: run for run in prepared.runs}
     scenes: dict[str, Scene | None] = {}
 
-    def files(key: str) -> RunFiles:
+    def files(key: str) -> tuple[ResultFiles, Scene | None]:
         run = runs[key]
         if run.log_digest not in scenes:
             scenes[run.log_digest] = _scene(run, prepared.store.folder / "scenes" / f"{run.log_digest}.json")
-        return RunFiles(partial(prepared.store.read, key), scenes[run.log_digest])
+        scene = scenes[run.log_digest]
+        return ResultFiles(partial(prepared.store.read, key), None if scene is None else scene.t0_ns), scene
 
     path = prepared.folder / PAGE
     with writing(path):

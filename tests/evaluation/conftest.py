@@ -8,7 +8,8 @@ import polars as pl
 import pytest
 from scipy.signal import lfilter
 
-from factorgraph_loc.evaluation.report import RunFiles, Scene
+from factorgraph_loc.evaluation.report import Scene
+from factorgraph_loc.io.results import ResultFiles
 from factorgraph_loc.model.scoring import MAX_GAP
 
 
@@ -51,7 +52,8 @@ class Made:
 
     def runs(self, key):
         """The files of a run."""
-        return RunFiles({"estimates.parquet": self.tables[key], "config.toml": self.config}.__getitem__, self.scene)
+        files = {"estimates.parquet": self.tables[key], "config.toml": self.config}
+        return ResultFiles(files.__getitem__, self.scene and self.scene.t0_ns), self.scene
 
 
 ANGLES = np.linspace(0.0, 5.0, 50)

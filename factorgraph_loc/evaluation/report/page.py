@@ -3,7 +3,7 @@
 The text is in ``drawing/templates/report.html``; here are the values that it shows.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import tomli_w
 from factorgraph_loc.drawing.pages import render
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.report import plots, tables
-from factorgraph_loc.evaluation.report.results import Results, RunFiles, read_runs, score
+from factorgraph_loc.evaluation.report.results import Results, Runs, read_runs, score
 from factorgraph_loc.evaluation.scores import REPORT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.files.models import write_text
@@ -24,7 +24,7 @@ _SWEPT = 3  # metrics that are plotted over a swept setting
 
 def write_report(
     rows: pl.DataFrame,
-    runs: Callable[[str], RunFiles],
+    runs: Runs,
     out: Path,
     *,
     metrics: Sequence[str] = REPORT,
@@ -37,10 +37,9 @@ def write_report(
     """Write the page ``out``.
 
     ``rows``: one per run, with key, log, estimator, seed, status (ok, failed), reason, scores, and optionally label, sensors,
-    kind (of a failure), warnings and ``sweep.*``. ``runs``: the files of a successful run, by its key. ``metrics``: scores to
-    show. ``baseline``: the label that the others are compared with; the first without one, or if no run has it. ``experiment``:
-    the experiment file as plain values. ``damaged``: descriptions of runs with unusable results. ``versions``: of the software
-    used. Raises InputError for no rows.
+    kind (of a failure), warnings and ``sweep.*``. ``metrics``: scores to show. ``baseline``: the label that the others are
+    compared with; the first without one, or if no run has it. ``experiment``: the experiment file as plain values. ``damaged``:
+    descriptions of runs with unusable results. ``versions``: of the software used. Raises InputError for no rows.
     """
     if not len(rows):
         raise InputError(f"there are no runs to report on{f' ({len(damaged)} are damaged)' if damaged else ''}")
@@ -105,7 +104,7 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
     }
 
 
-def _read(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> dict[str, Any]:
+def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
     """Values from the files of the runs."""
     read = read_runs(results, metric, runs)
     return {

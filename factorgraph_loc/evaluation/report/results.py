@@ -33,13 +33,8 @@ FEWEST, MOST = 60, 1000  # bounds for one trajectory
 TRACKS = 1000  # maximum number of runs with trajectories; further logs appear in tables only
 
 
-@dataclass(frozen=True)
-class RunFiles:
-    """``read``: returns the content of a file of a run (``estimates.parquet``, ``config.toml``) by its name; ``scene``: map of
-    the log, if known."""
-
-    read: Callable[[str], bytes]
-    scene: Scene | None = None
+Runs = Callable[[str], tuple[ResultFiles, Scene | None]]
+"""The files of a successful run, and the map of its log if known, by the key of the run."""
 
 
 @dataclass
@@ -59,7 +54,7 @@ class RunData:
     configs: dict[str, str] = field(default_factory=dict)
 
 
-def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) -> RunData:
+def read_runs(results: Results, metric: str, runs: Runs) -> RunData:
     """Read the files of all successful runs; of several seeds the trajectory with the median ``metric`` is drawn."""
     data = RunData()
     chosen = {
@@ -78,8 +73,8 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
             row = chosen.get((variant, log))
             if row is None:
                 continue
-            files = runs(str(row["key"]))
-            scene = scene or files.scene
+            files, background = runs(str(row["key"]))
+            scene = scene or background
             series = _series(files)
             if left > 0:
                 plain = {kind: tracks.thinned(s, poses) for kind, s in series.items()}
@@ -90,7 +85,7 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
                 counts.setdefault(variant, []).append(trust)
                 data.nees[variant, log] = trust[0]
             well = [run for run in results.runs(variant, log) if run["status"] == "ok"]
-            every = [(run, series if run is row else _series(runs(str(run["key"])))) for run in well]
+            every = [(run, series if run is row else _series(runs(str(run["key"]))[0])) for run in well]
             for kind in KINDS:
                 scored = [
                     s[kind].errors["error_position"]
@@ -109,10 +104,9 @@ def read_runs(results: Results, metric: str, runs: Callable[[str], RunFiles]) ->
     return data
 
 
-def _series(files: RunFiles) -> dict[str, Estimates]:
+def _series(files: ResultFiles) -> dict[str, Estimates]:
     """The estimates of a run by kind, without kinds that it lacks."""
-    estimates_by_kind = ResultFiles(files.read, files.scene.t0_ns if files.scene else None).estimates()
-    return {kind: estimates for kind, estimates in estimates_by_kind.items() if len(estimates.trajectory)}
+    return {kind: estimates for kind, estimates in files.estimates().items() if len(estimates.trajectory)}
 
 
 @dataclass(frozen=True)
