@@ -183,7 +183,7 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
     settings = log.rig.find(CameraSettings)
     if settings is None or not pictures_of.has_pictures(log):
         return
-    model, at, poses = settings.model(), _camera_path(log, runs), _carrier(log, runs)
+    model, (at, poses) = settings.model(), _carried(log, runs)
     if at != CAMERA:
         place = rr.Transform3D(translation=model.position, mat3x3=model.rotation)
         recording.log(at, place, static=True)
@@ -196,25 +196,21 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
     recording.log(at, lens, static=True)
     pictures = pictures_of.images(log)
     while some := list(itertools.islice(pictures, BATCH)):
-        _pictures(recording, f"{at}/image", some)
+        t, contents = zip(*some, strict=True)
+        columns = rr.EncodedImage.columns(blob=list(contents), media_type=["image/jpeg"] * len(contents))
+        recording.send_columns(f"{at}/image", _times(np.array(t)), columns)
         if log.world.points is not None and poses is not None:
-            t = np.array([t for t, _ in some])
-            expected = [_expected(model, pose, log.world.points.positions) for pose in poses.at(t, max_gap=GAP)]
-            _pixels_over_time(recording, f"{at}/image/map", t, expected)
+            path = poses.at(np.array(t), max_gap=GAP)
+            expected = [_expected(model, pose, log.world.points.positions) for pose in path]
+            _pixels_over_time(recording, f"{at}/image/map", np.array(t), expected)
             recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=DETECTION), static=True)
     sightings = list(pictures_of.sightings(log))
     if sightings:
         labels = [name for _, names, _ in sightings for name in names]
-        t = np.array([t for t, _, _ in sightings])
-        _pixels_over_time(recording, f"{at}/image/landmarks", t, [pixels for _, _, pixels in sightings], labels)
+        seen = np.array([t for t, _, _ in sightings])
+        _pixels_over_time(recording, f"{at}/image/landmarks", seen, [pixels for _, _, pixels in sightings], labels)
         style = rr.Points2D.from_fields(radii=3.0, colors=SIGHTING, show_labels=False)
         recording.log(f"{at}/image/landmarks", style, static=True)
-
-
-def _pictures(recording: rr.RecordingStream, at: str, pictures: Sequence[tuple[float, bytes]]) -> None:
-    t, contents = zip(*pictures, strict=True)
-    columns = rr.EncodedImage.columns(blob=list(contents), media_type=["image/jpeg"] * len(contents))
-    recording.send_columns(at, _times(np.array(t)), columns)
 
 
 def _pixels_over_time(
@@ -234,18 +230,12 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
     return np.asarray(pixels[visible[np.argsort(depths[visible])[:NEAREST]]])
 
 
-def _carrier(log: Log, runs: Sequence[StoredRun]) -> Trajectory | None:
-    """Trajectory of the robot that carries the drawn camera: of the first run that has one, else the reference."""
-    trajectories = [run.played() for run in runs if len(run.played())]
-    return trajectories[0] if trajectories else log.reference
-
-
-def _camera_path(log: Log, runs: Sequence[StoredRun]) -> str:
-    """The entity path of the camera: below the first robot drawn, if there is one."""
-    robots = [run.name for run in runs if len(run.played())]
-    if log.reference is not None:
-        robots.append("reference")
-    return f"{WORLD}/{robots[0]}/robot/camera" if robots else CAMERA
+def _carried(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
+    """The entity path of the drawn camera, and the trajectory of its robot: of the first run that has one, else the reference."""
+    for run in runs:
+        if len(run.played()):
+            return f"{WORLD}/{run.name}/robot/camera", run.played()
+    return CAMERA if log.reference is None else f"{WORLD}/reference/robot/camera", log.reference
 
 
 def _times(t: Array) -> list[rr.TimeColumn]:
@@ -270,7 +260,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
     )
     beside: list[rrb.View] = []
     if log.rig.find(CameraSettings) is not None and pictures_of.has_pictures(log):
-        beside.append(rrb.Spatial2DView(origin=_camera_path(log, runs), name="camera"))
+        beside.append(rrb.Spatial2DView(origin=_carried(log, runs)[0], name="camera"))
     titles = {"error_position": "error of position [m]", "error_heading": "error of heading [rad]", "nees": "NEES"}
     beside += [
         rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title)
