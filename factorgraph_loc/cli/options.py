@@ -14,7 +14,7 @@ import typer
 from factorgraph_loc.cli import completion
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
-from factorgraph_loc.text import listed, quoted
+from factorgraph_loc.text import listed, quoted, well_formed
 
 if TYPE_CHECKING:
     from factorgraph_loc.model.log import Log
@@ -219,10 +219,8 @@ def nested_changes(texts: Sequence[str]) -> dict[str, Any]:
 
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
     """``a.b=3`` as ("a.b", 3)."""
-    from factorgraph_loc.files.models import is_utf8
-
     key, equals, value = text.partition("=")
-    if not equals or not key.strip() or not value.strip() or not is_utf8(text):
+    if not equals or not key.strip() or not value.strip() or text != well_formed(text):
         raise InputError(f"{option} is {quoted(text)}, expected KEY=VALUE")
     return key.strip(), _scalar(value.strip())
 

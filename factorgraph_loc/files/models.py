@@ -22,7 +22,7 @@ from pydantic.fields import FieldInfo
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import temporary_file
-from factorgraph_loc.text import LISTED, NAME, error_text, listed, plain, quoted
+from factorgraph_loc.text import LISTED, NAME, error_text, listed, plain, quoted, well_formed
 
 LONGEST_FILE = 100  # bytes of a generated file name
 DEEPEST = 64  # nesting levels of tables or lists, and parts of a key
@@ -138,17 +138,8 @@ def check_content(content: dict[str, Any], source: object) -> None:
             )
         if not isinstance(value, str | int | float):
             raise InputError(f"{plain(source)}: {plain(key)} is {quoted(value)}, expected a number or text")
-        if isinstance(value, str) and not is_utf8(value):
+        if isinstance(value, str) and value != well_formed(value):
             raise InputError(f"{plain(source)}: {plain(key)} is {quoted(value)}, which is not text in UTF-8")
-
-
-def is_utf8(text: str) -> bool:
-    """Whether a text can be encoded as UTF-8."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def read_json(path: Path) -> Any:
