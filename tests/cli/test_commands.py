@@ -4,12 +4,17 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 
+import cv2
 import pytest
 from typer.main import get_command
 
-from factorgraph_loc import __version__
+from factorgraph_loc import FglocError, InputError, RunFailedError, __version__
 from factorgraph_loc.cli.app import app
+from factorgraph_loc.cli.main import main
+from factorgraph_loc.cli.options import parse_settings
+from factorgraph_loc.model.scoring import parse_seeds
 
 
 def test_version_and_help(fgloc):
@@ -40,17 +45,6 @@ def test_datasets(fgloc):
         assert name in result.stdout
     names = [entry["name"] for entry in json.loads(fgloc("datasets", "--json").stdout)]
     assert "plaza2" in names
-
-
-@pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_convert(fgloc, short_log, tmp_path, kind):
-    out = tmp_path / "copy"
-    result = fgloc("convert", short_log, out, "--format", kind)
-    assert result.exit_code == 0
-    assert str(out) in result.stdout
-    assert (out / f"odometry.{kind}").is_file()
-    one, other = (json.loads(fgloc("info", log, "--json").stdout) for log in (short_log, out))
-    assert one["streams"] == other["streams"]
 
 
 def test_convert_overwrites_a_log_alone(fgloc, refused, short_log, tmp_path):
@@ -84,3 +78,120 @@ def test_every_command_shows_an_example_that_it_accepts(fgloc, names, command):
     command.make_context(names[-1], example.split())  # raises for an unknown option or a missing argument
     if " ".join(names) in WITHOUT_FILES:
         assert fgloc(*names, *example.split()).exit_code == 0
+
+
+def commands(group: object, name: str = "fgloc") -> Iterator[tuple[str, object]]:
+    """Every command that does something, by its full name."""
+    for word, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from commands(command, f"{name} {word}")
+        else:
+            yield f"{name} {word}", command
+
+
+@pytest.mark.parametrize(("name", "command"), list(commands(get_command(app))))
+def test_every_command_can_print_json(name, command):
+    assert "--json" in {option for parameter in command.params for option in parameter.opts}, name
+
+
+def test_convert_and_simulate_print_json_alone(fgloc, tmp_path):
+    made = json.loads(fgloc("simulate", "office", "-o", tmp_path / "one", "--duration", 5, "--json").stdout)
+    assert made == {"log": "office-0", "seed": 0, "span": 5.0, "folder": str(tmp_path / "one")}
+    several = fgloc("simulate", "office", "-o", tmp_path / "logs", "--duration", 5, "--seeds", "2:4", "--json")
+    assert [one["seed"] for one in json.loads(several.stdout)] == [2, 3]
+    copied = json.loads(fgloc("convert", tmp_path / "one", tmp_path / "copy", "--json").stdout)
+    assert copied["log"] == "office-0"
+    assert sorted(path.name for path in (tmp_path / "copy").iterdir()) == copied["files"]
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "said"),
+    [
+        (InputError("hall.toml: rate is -1"), 2, "error: hall.toml: rate is -1\n"),
+        (RunFailedError("the estimate is not finite"), 1, "error: the estimate is not finite\n"),
+        (KeyboardInterrupt(), 130, "interrupted\n"),
+        (ZeroDivisionError("of ours"), 70, "ZeroDivisionError: of ours\n"),
+    ],
+)
+@pytest.mark.parametrize("debug", [False, True])
+def test_exit_codes(raised, code, said, debug, monkeypatch, capsys):
+    def describe(_):
+        raise raised
+
+    monkeypatch.setattr("factorgraph_loc.io.readers.describe", describe)
+    monkeypatch.setattr("sys.argv", ["fgloc", "datasets", *(["--debug"] if debug else [])])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == code
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    if debug and code in (1, 2):
+        assert printed.err.endswith(f"{type(raised).__name__}: {raised}\n")
+    else:
+        assert printed.err.endswith(said)
+    assert ("Traceback" in printed.err) == (code == 70 or (debug and code != 130))
+
+
+@pytest.mark.parametrize(
+    ("args", "fragments"),
+    [
+        (["-e", "efk"], ["'efk'", "did you mean ekf?"]),
+        (["-e", "ekf", "--set", "ekf.max_dely=1"], ["max_dely", "did you mean max_delay?"]),
+        (["-e", "ekf", "--set", "ekf.max_delay=soon"], ["max_delay", "'soon'", "number"]),
+        (["-e", "ekf", "--set", "smother.lag=1"], ["'smother'", "did you mean smoother?"]),
+        (["-e", "ekf", "--set", "smoother.lag=1"], ["smoother.lag=1", "smoother is not run here"]),
+        (["-e", "ekf", "--set", "lag=1"], ["lag=1", "NAME.key=value"]),
+        (["-e", "ekf", "--set", "ekf.max_delay"], ["--set", "KEY=VALUE"]),
+        (["-e", "ekf", "--prior", "1"], ["'1'", "X,Y or X,Y,HEADING"]),
+        (["-e", "dead_reckoning", "--prior", "1,2"], ["dead_reckoning cannot find an unknown heading", "X,Y,HEADING"]),
+        (["-e", "ekf", "--sensors", "odometri"], ["odometri", "odometry"]),
+        (["-e", "ekf", "--rig", "nowhere.rig.toml"], ["nowhere.rig.toml"]),
+        (["-e", "ekf", "--world", "nowhere.world.toml"], ["nowhere.world.toml"]),
+        (["-e", "ekf", "--reader", "mrclam", "--reader-option", "robt=1"], ["robt", "did you mean robot?"]),
+    ],
+)
+def test_options_of_run(refused, short_log, tmp_path, args, fragments):
+    said = refused("run", short_log, "-o", tmp_path / "out", *args)
+    assert all(fragment in said for fragment in fragments)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_log_that_does_not_exist(refused):
+    said = refused("info", "plaza3")
+    assert "plaza3" in said
+    assert "plaza2" in said
+
+
+def test_typers_own_usage_errors_have_exit_code_2(fgloc, short_log):
+    assert fgloc("run", short_log).exit_code == 2
+    assert "Did you mean" in fgloc("inof").stderr
+    assert fgloc("run", short_log, "-e", "ekf", "-o", "x", "--seed", "many").exit_code == 2
+
+
+def test_debug_shows_the_error_itself(fgloc):
+    assert isinstance(fgloc("info", "plaza3", "--debug").exception, FglocError)
+    assert isinstance(fgloc("--debug", "info", "plaza3").exception, FglocError)
+
+
+def test_texts_of_options():
+    assert parse_seeds("0:10") == range(10)
+    assert list(parse_seeds("7")) == [7]
+    for text in ("", "a", "3:1", "-2", "1:2:3"):
+        with pytest.raises(InputError, match="--seeds"):
+            parse_seeds(text)
+    texts = ["smoother.lag=10", "smoother.loss=cauchy", "ekf.smooth=false", "smoother.gate.scale=1e-3"]
+    assert parse_settings(texts, ["smoother", "ekf"]) == {
+        "smoother": {"lag": 10, "loss": "cauchy", "gate": {"scale": 1e-3}},
+        "ekf": {"smooth": False},
+    }
+    with pytest.raises(InputError, match=r"no key smoother.lag.x, as smoother.lag is 10"):
+        parse_settings(["smoother.lag=10", "smoother.lag.x=1"], ["smoother"])
+
+
+def test_info_draws_a_log(fgloc, refused, short_log, tmp_path):
+    picture = tmp_path / "new" / "log.png"
+    result = fgloc("info", short_log, "-o", picture)
+    assert result.exit_code == 0
+    assert result.stdout.endswith(f"wrote {picture}\n")
+    assert cv2.imread(str(picture)).shape[1] == 1600
+    assert "expected a name that ends in .png" in refused("info", short_log, "-o", tmp_path / "log.pdf")

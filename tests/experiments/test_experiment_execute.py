@@ -183,17 +183,3 @@ def test_a_damaged_result_is_found_and_done_again(experiment, out):
     second = run_experiment(prepared).table
     times = [name for name in first.columns if name.startswith("timing.")]
     assert second.drop(times).equals(first.drop(times))
-
-
-def test_the_table_is_written_when_an_experiment_is_stopped(experiment, out, monkeypatch):
-    class Stopped(Here):
-        def submit(self, take, left):
-            if left == 1:
-                raise KeyboardInterrupt
-            super().submit(take, left)
-
-    monkeypatch.setattr("factorgraph_loc.experiments.experiment.Processes", Stopped)
-    with pytest.raises(KeyboardInterrupt):
-        run_experiment(experiment())
-    assert load_results(out)["label"].to_list() == ["fake"]
-    assert [one.label for one in experiment().todo()] == ["ekf"]

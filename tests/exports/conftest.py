@@ -7,17 +7,11 @@ import pytest
 from by_hand import reads
 from drives import driven
 
+from factorgraph_loc import ImageStream, IncrementStream, Log, Rig, SightingStream, Tag, Trajectory, World
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import ImageStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
-from factorgraph_loc.sensors.rfid.map import Tag
 from factors import se2
 
 T0_NS = 1_700_000_000_000_000_000

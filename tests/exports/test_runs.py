@@ -10,16 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from factorgraph_loc import ImageStream, Trajectory
+from factorgraph_loc import ImageStream, InputError, PosePath, Trajectory, write_trajectory
 from factorgraph_loc.drawing.figures import ellipses
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.experiments.output import write_run
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.exports import scene
 from factorgraph_loc.exports.runs import find_runs, is_results, read_runs
 from factorgraph_loc.io.readers.pose_file import read_matrices
-from factorgraph_loc.io.trajectories import write_trajectory
-from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.sensors.camera import summary as pictures_of
 
 

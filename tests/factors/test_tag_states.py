@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from factors.rfid.tag_states import (
-    FARTHEST,
-    MOST_MOVED,
-    PITCH,
-    WEAKNESSES,
-    TagStates,
-    displacements,
-    hypotheses,
-)
+from factors.rfid.tag_states import FARTHEST, MOST_MOVED, PITCH, WEAKNESSES, TagStates, displacements, hypotheses
 
 PLACES, WEAK = len(displacements()), len(WEAKNESSES)
 TAG = np.zeros(1, dtype=np.int64)

@@ -11,8 +11,7 @@ import pytest
 from by_hand import made
 from landmark_world import simulate, with_sightings
 
-from factorgraph_loc import IncrementOdometry, IncrementStream, Log, RfidScan, Rig, Tick, Trajectory
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import IncrementOdometry, IncrementStream, InputError, Log, RfidScan, Rig, Tick, Trajectory
 from factorgraph_loc.evaluation.metrics import errors, score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.belief import PosePrior

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from factorgraph_loc import InputError, read_log
-from factorgraph_loc.api.logs import manifest
+from factorgraph_loc import InputError, manifest, read_log
 from factorgraph_loc.io.guesses import guess
 
 START = 1.7e9  # s since 1970

@@ -11,15 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, Log, Rig, StartPose, Trajectory, World, load, read_world
 from factorgraph_loc.files.models import parse_model
 from factorgraph_loc.io.native.native import RunFile, write_native
-from factorgraph_loc.io.native.world_file import read_world
-from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import Log, StartPose
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, Landmark
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.odometry.settings import ImuSettings

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 from by_hand import reads
 
-from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc import InputError, Rig, Trajectory, World, read_world
 from factorgraph_loc.model.log import Log, StartPose, cut, join
 from factorgraph_loc.model.measurement import Rows
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import (
     BearingRange,
     BearingRangeSettings,

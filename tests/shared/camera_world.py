@@ -6,16 +6,10 @@ import changed_logs
 import numpy as np
 from drives import driven, slipped
 
-from factorgraph_loc.maps.points import PointMap
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
+from factorgraph_loc import CameraFrame, Log, PointMap, Rig, Trajectory, VelocityStream, World
 from factorgraph_loc.sensors.camera.measurement import FeatureStream, SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import GrowthSettings, OdometryNoise, OdometrySettings
-from factorgraph_loc.vision.frame import CameraFrame
 from factors.camera import model as reprojection
 
 ODOMETRY_STEP = 0.05  # s

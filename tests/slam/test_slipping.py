@@ -8,10 +8,14 @@ import numpy as np
 import pytest
 
 from factorgraph_loc.fusion.graph.graph import Keyframe
+from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.settings import Estimated
+from factorgraph_loc.slam.keyframe_cameras import KeyframeCameras
 from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.slipping import moved_since, unless_slipped
+from factorgraph_loc.slam.unknown_points import UnknownPoints, _Point
 from factors import se2
-from factors.camera.model import CameraModel, predict
+from factors.camera.model import PARAMETERS, CameraModel, predict
 from factors.motion import ChainState, Increment, propagate
 from factors.odometry.model import Growth, OdometryModel, relative_motion, slip
 
@@ -142,3 +146,106 @@ def test_wheels_that_slip_are_no_moving_thing(slid):
         assert not things.moving
         assert things.is_static("room0")
         assert things.is_static("new")
+
+
+GUESS = np.zeros(3), np.diag((0.2, 0.2, 0.05)) ** 2
+KNOWN, SLIPPED = np.diag((0.05, 0.05, 0.02)) ** 2, np.diag((0.3, 0.3, 0.15)) ** 2
+FEW = np.array(((3.0, -0.5, 0.4), (4.0, 0.6, 1.0), (5.0, -0.2, 1.4), (2.5, 0.3, 0.7)))
+
+
+def placed(moved, last, step=KNOWN):
+    """The pose (3,) from four points that were seen at ``last`` [s], by a robot that ``moved`` (3,) from its guess after a ``step``
+    of this covariance (3, 3); and how many of them count."""
+    points = UnknownPoints(MODEL, Diagnostics())
+    known = [_Point(i, last, 1e4 * np.eye(3)) for i in range(len(FEW))]
+    keyframes = [
+        Keyframe(i, t, ChainState(t, *np.zeros(7)), Increment(np.zeros(3), step, t - 4.0))
+        for i, t in ((0, 4.0), (1, 10.0))
+    ]
+    motion = SimpleNamespace(slip=lambda _: (np.zeros((3, 3)), np.inf))
+    graph = SimpleNamespace(current=FEW.__getitem__, keyframes=keyframes, motion=motion)
+    pixels, _ = predict(MODEL, se2.exp(np.asarray(moved)), FEW)
+    none = np.zeros(len(FEW), dtype=bool)
+    named = SimpleNamespace(names=tuple("abcd"))
+    image = SimpleNamespace(m=named, keyframe=keyframes[1], graph=graph, model=MODEL)
+    (pose, _), _, _, right = points._placed(image, known, pixels, GUESS, none)
+    return pose, np.count_nonzero(right)
+
+
+@pytest.mark.parametrize("last", [9.5, 1.0])
+def test_points_place_a_robot_near_its_guess(last):
+    moved = (0.1, -0.1, 0.04)
+    pose, count = placed(moved, last)
+    assert count == len(FEW)
+    assert np.allclose(pose, se2.exp(np.array(moved)), atol=0.02)
+
+
+@pytest.mark.parametrize("moved", [(0.1, -0.2, 0.4), (0.5, 0.0, 0.0)], ids=["from its guess", "since they were seen"])
+def test_a_few_points_seen_lately_do_not_place_it_where_it_cannot_be(moved):
+    """They agree, which wrong matches do, too; seen long ago, they may close a loop."""
+    pose, count = placed(moved, 9.5)
+    assert count == 0
+    assert np.array_equal(pose, GUESS[0])
+    pose, count = placed(moved, 1.0)
+    assert count == len(FEW)
+    assert np.allclose(pose, se2.exp(np.array(moved)), atol=0.08)
+
+
+def test_wheels_that_slipped_may_have_taken_it_far():
+    moved = (0.5, 0.0, 0.0)
+    pose, count = placed(moved, 9.5, SLIPPED)
+    assert count == len(FEW)
+    assert np.allclose(pose, se2.exp(np.array(moved)), atol=0.08)
+
+
+LENS = CameraModel(370.0, 370.0, 240.0, 180.0, width=480, height=360)
+OFFSET, SIGMA, TWIST = 0.4, 0.05, np.array((0.8, -0.1, 0.9))
+POSE = np.array((2.0, -1.0, 0.7))
+ROOT = np.array(((0.1, 0.0, 0.0), (0.02, 0.2, 0.0), (0.0, -0.03, 0.06)))
+STEP = 1e-6
+GRAPH = SimpleNamespace(
+    mapped_constants=7,
+    values={7: np.array((0.02, OFFSET))},
+    covariances={7: np.diag((0.01, SIGMA)) ** 2},
+    motion=SimpleNamespace(twist=lambda _: TWIST),
+)
+
+
+@pytest.fixture
+def cameras():
+    sigmas = np.array([{"focal": 0.01, "time_offset": SIGMA}.get(name, 0.0) for name in PARAMETERS])
+    found = KeyframeCameras(LENS, Estimated.among(PARAMETERS, sigmas))
+    found.add(Keyframe(3, 1.5, ChainState(1.5, *np.zeros(7)), None), GRAPH)
+    return found
+
+
+def at_image(xi, offset):
+    """The pose at the time of the image, of a robot that is at POSE moved by ``xi`` (3,) at the stamp."""
+    return se2.compose(se2.compose(POSE, se2.exp(xi)), se2.exp(offset * TWIST))
+
+
+def test_the_covariance_at_the_image_is_that_of_the_motion_to_it(cameras):
+    pose, covariance = cameras.at_image(3, (POSE, ROOT @ ROOT.T), GRAPH)
+    expected = at_image(np.zeros(3), OFFSET)
+    assert pose == pytest.approx(expected)
+    moved = [at_image(STEP * axis, OFFSET) for axis in np.eye(3)] + [at_image(np.zeros(3), OFFSET + STEP)]
+    jacobian = np.column_stack([se2.log(se2.between(expected, there)) / STEP for there in moved])
+    before = np.zeros((4, 4))
+    before[:3, :3], before[3, 3] = ROOT @ ROOT.T, SIGMA**2
+    assert covariance == pytest.approx(jacobian @ before @ jacobian.T, rel=1e-4, abs=1e-8)
+
+
+def test_the_pose_at_the_stamp_is_that_before_the_motion_to_the_image(cameras):
+    guess = POSE, ROOT @ ROOT.T
+    pose, covariance = cameras.at_stamp(3, cameras.at_image(3, guess, GRAPH), GRAPH)
+    assert pose == pytest.approx(guess[0])
+    assert covariance == pytest.approx(guess[1])
+
+
+def test_keyframes_that_are_forgotten_leave_nothing(cameras):
+    cameras.anchor(Keyframe(3, 1.5, ChainState(1.5, *np.zeros(7)), None), 9)
+    cameras.forget(3)
+    assert cameras.twists.keys() == cameras.anchored.keys() == {3}
+    cameras.forget(4)
+    assert not cameras.twists
+    assert not cameras.anchored

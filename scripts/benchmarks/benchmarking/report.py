@@ -35,14 +35,13 @@ ACCURACY = (
 @dataclass(frozen=True)
 class Options:
     """``seeds``: number of simulated logs of each kind, ``duration`` [s]: of simulated drives, None for each section's default;
-    ``jobs``: parallel processes; ``cache``: folder of rendered drives, None for one below ``out``."""
+    ``jobs``: parallel processes."""
 
     seeds: int | None
     jobs: int
     data_root: Path | None
     out: Path
     duration: float | None = None
-    cache: Path | None = None
 
     def count(self, usual: int) -> int:
         return usual if self.seeds is None else self.seeds
@@ -52,7 +51,8 @@ class Options:
 
     @property
     def drives(self) -> Path:
-        return self.cache or self.out / "drives"
+        """The folder of rendered drives."""
+        return self.out / "drives"
 
 
 @dataclass

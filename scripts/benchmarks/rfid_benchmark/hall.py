@@ -14,13 +14,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings, preset
-from rfid_benchmark.simulated_trials import (
-    Clock,
-    SimulatedTrial,
-    held,
-    lasting,
-    started,
-)
+from rfid_benchmark.simulated_trials import Clock, SimulatedTrial, held, lasting, started
 
 SEEDS = 5
 FIRST = 3000  # first seed, not used by other sections

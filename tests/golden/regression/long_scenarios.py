@@ -9,17 +9,7 @@ from short_logs import with_signals
 
 from factorgraph_loc.model.log import Log, cut, join
 from factorgraph_loc.simulation import preset, simulate
-from regression.scenarios import (
-    FINDERS,
-    LAG,
-    MAPPERS,
-    ON_FLOOR,
-    READERS,
-    UNKNOWN,
-    WATCHERS,
-    Scenario,
-    recorded,
-)
+from regression.scenarios import FINDERS, LAG, MAPPERS, ON_FLOOR, READERS, UNKNOWN, WATCHERS, Scenario, recorded
 
 START, SECONDS = 60.0, 60.0  # of the parts; before that the robot in the woods stands
 MANY = "particle_filter_many"

@@ -7,17 +7,10 @@ import pytest
 from drives import driven, even_noise
 from mapped_hall import VELOCITIES, write_mapped
 
-from factorgraph_loc.errors import InputError
+from factorgraph_loc import InputError, Log, Rig, Trajectory, VelocityStream, World, load, write_native
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
-from factorgraph_loc.io.native.native import write_native
-from factorgraph_loc.io.readers import load
-from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.loops.measurement import Loops, LoopSettings, LoopStream
-from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factorgraph_loc.sensors.odometry.settings import OdometrySettings
 from factorgraph_loc.sensors.tables import checked
 from factors import se2
