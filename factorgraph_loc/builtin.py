@@ -7,6 +7,7 @@ SENSORS.own |= {
     "landmarks": "factorgraph_loc.sensors.landmarks:SENSOR",
     "rfid": "factorgraph_loc.sensors.rfid:SENSOR",
     "camera": "factorgraph_loc.sensors.camera:SENSOR",
+    "positions": "factorgraph_loc.sensors.positions:SENSOR",
     "loops": "factorgraph_loc.sensors.loops:SENSOR",
 }
 ESTIMATORS.own |= {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -137,7 +137,7 @@ class Table:
     """A table of a sensor. ``stream``: class of the stream that it describes, "" for none.
 
     ``is_scan``: whether rows of one timestamp form one measurement. ``optional``: groups of columns that a file may lack, each
-    group as a whole.
+    group as a whole. ``messages``: the path of each column in ROS messages, by their type.
     """
 
     name: str
@@ -145,6 +145,7 @@ class Table:
     stream: Place = ""
     is_scan: bool = False
     optional: tuple[tuple[str, ...], ...] = ()
+    messages: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Column:
         return next(column for column in self.columns if column.name == name)

@@ -13,11 +13,13 @@ from factorgraph_loc.files.checks import ROUNDING
 from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column, farthest
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.registry import channels
 from factorgraph_loc.sensors.tables import columns_of
 from factorgraph_loc.text import Notice, listed, notice
 from factors.se2 import Array
 
+TURNED = 2.0  # rad
 LONG_GAP = 5.0  # s
 TOLERANCE = 1e-9  # relative tolerance for converted values
 
@@ -82,6 +84,25 @@ def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]
     count = "a gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
     sentence = "{stream}: {gaps} above {limit:g} s, the longest {length:.1f} s at t = {start:.3f} s"
     return [notice("gaps", sentence, name, count, LONG_GAP, length, start)]
+
+
+def without_false_headings(log: Log) -> Log:
+    """The log, whose reference has no headings if these never change while the odometry turns by more than :data:`TURNED`: systems
+    that measure positions alone report an orientation of zero."""
+    stream, reference = log.streams.get("odometry"), log.reference
+    if reference is None or not reference.has_heading or len(reference.t) < 2 or np.ptp(reference.poses[:, 2]) > 1e-9:
+        return log
+    if isinstance(stream, IncrementStream):
+        turned = float(np.abs(stream.dtheta).sum())
+    elif isinstance(stream, VelocityStream):
+        turned = float(np.abs(stream.w[:-1]) @ np.diff(stream.t))
+    else:
+        return log
+    if turned <= TURNED:
+        return log
+    sentence = "the reference never turns, while the odometry turns by {turned:.0f} rad: its headings are ignored"
+    warning = notice("false_headings", sentence, turned)
+    return replace(log, reference=replace(reference, has_heading=False), warnings=(*log.warnings, warning))
 
 
 def look_over(log: Log) -> list[Notice]:

@@ -54,7 +54,8 @@ class SensorType:
     """A sensor: its ``channels``, its ``settings`` (sections of the rig), its ``layers`` of the world, and the places of its
     functions, "" for none. :func:`functions` returns those of all sensors.
 
-    ``detects``: the layer of the world whose elements it detects, "" for none.
+    ``detects``: the layer of the world whose elements it detects, "" for none. ``locates``: whether it localizes the robot without
+    a map.
 
     ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``; ``draw``: ``(log) ->``
     :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers. ``bind``: ``(binding) ->``
@@ -79,6 +80,7 @@ class SensorType:
     layers: Mapping[str, Layer] = field(default_factory=dict)
     simulation: Mapping[str, Section] = field(default_factory=dict)
     detects: str = ""
+    locates: bool = False
     bind: Place = ""
     summarize: Place = ""
     draw: Place = ""
@@ -145,13 +147,12 @@ def parent_of(channel: str) -> str:
 
 
 def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
-    """The sensors with a channel among ``names`` that can detect elements of a ``world``."""
+    """The sensors with a channel among ``names`` that can localize the robot in a ``world``."""
     return [
         sensor
         for sensor in sensors().values()
-        if sensor.detects
-        and any(channel.name in names for channel in sensor.channels)
-        and getattr(world, sensor.detects, None)
+        if any(channel.name in names for channel in sensor.channels)
+        and (sensor.locates or (sensor.detects and getattr(world, sensor.detects, None)))
     ]
 
 

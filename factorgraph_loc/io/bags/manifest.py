@@ -4,6 +4,8 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +14,12 @@ from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
 from factorgraph_loc.io.bags.file import Bag, Topic, open_bag
 from factorgraph_loc.io.bags.motion import IMU, JOINTS, ODOMETRY, TWISTS
 from factorgraph_loc.io.bags.poses import ODOMETRY as ORIGINS
-from factorgraph_loc.io.bags.poses import POINT, POSES, ROBOT, STATIC, WORLD, Tree, tree_of
+from factorgraph_loc.io.bags.poses import POINT, POSES, ROBOT, SAMPLE, STATIC, WORLD, Tree, tree_of
 from factorgraph_loc.io.bags.tables import CORNERS, DETECTIONS
 from factorgraph_loc.io.bags.topics import LIST, TF, has_header, leaves
 from factorgraph_loc.io.guesses import ANGLES, ENDS, LANDMARK, RANGE, READ, TRUTH, plain, rank
 from factorgraph_loc.io.proposals import Proposal, proposal_of
+from factorgraph_loc.sensors.positions.measurement import POSITIONS_ON_EARTH
 from factorgraph_loc.text import listed
 
 LEFT, RIGHT = re.compile("left", re.IGNORECASE), re.compile("right", re.IGNORECASE)
@@ -96,7 +99,7 @@ def propose(bag: Bag) -> Uses:
     topics = [topic for topic in bag.topics.values() if topic.count]
     tree = tree_of(bag, out.remarks)
     _motion(out, bag, topics, tree)
-    _reference(out, topics, tree)
+    _reference(out, bag, topics, tree)
     out.take("imu", [topic for topic in topics if topic.type == IMU])
     _camera(out, topics)
     out.take("bearing_range", [topic for topic in topics if topic.type in DETECTIONS])
@@ -182,13 +185,21 @@ def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
     return {"wheels": sides | WHEELS}
 
 
-def _reference(out: Uses, topics: Sequence[Topic], tree: Tree) -> None:
+def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
+    """Poses are a reference, or positions of a sensor if they have no headings and the name of their topic does not say more."""
     poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]
+    measured = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name) and t not in named]
+    positions = [t for t in measured if t.type == POINT or _never_turns(bag, t)]
+    fixes = [topic for topic in topics if topic.type in POSITIONS_ON_EARTH.messages]
+    out.take("position", [*positions, *fixes])
+    if positions or fixes:
+        name = out.options["position"]["topic"]
+        out.remarks.append(f"{name} has positions without headings: give the rig the section [position]")
     if named:
         out.take("reference", named)
         return
-    plain = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name)]
+    plain = [topic for topic in measured if topic not in positions]
     if plain:
         out.take("reference", plain[:1])
         out.remarks.append(f"{plain[0].name} is used as the reference: remove it if it is an estimate, not the truth")
@@ -202,6 +213,13 @@ def _reference(out: Uses, topics: Sequence[Topic], tree: Tree) -> None:
             f"{robot} in {world}, of {tree.topic}, is used as the reference: remove it if it is an estimate, as of amcl or SLAM, "
             "not the truth"
         )
+
+
+def _never_turns(bag: Bag, topic: Topic) -> bool:
+    """Whether all orientations in the first messages of a topic of poses are equal."""
+    get = attrgetter(f"{POSES[topic.type]}.{'rotation' if topic.type.endswith('TransformStamped') else 'orientation'}")
+    turned = (get(item.message) for item in islice(bag.messages([topic.name]), SAMPLE))
+    return len({(q.x, q.y, q.z, q.w) for q in turned}) == 1
 
 
 def _camera(out: Uses, topics: Sequence[Topic]) -> None:

@@ -102,10 +102,10 @@ class Options(FileModel):
     """frame of the robot, for mountings in tf_static"""
 
 
-OTHERS = [
-    tables[0] for name, (_, tables) in native_tables().items() if name not in {*Options.model_fields, "inventories"}
-]
-add_fields(Options, {table.name: (TableTopic | None, None) for table in OTHERS}, after="camera")
+OTHERS = {
+    name: tables for name, (_, tables) in native_tables().items() if name not in {*Options.model_fields, "inventories"}
+}
+add_fields(Options, dict.fromkeys(OTHERS, (TableTopic | None, None)), after="camera")
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -177,9 +177,9 @@ def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack
         out["bearing_range"] = listeners.listen(options.bearing_range, Landmarks(bag, options.bearing_range, frames))
     if options.camera:
         out["camera"] = _images(listeners, options.camera, stack)
-    for table in OTHERS:
-        if (mapping := getattr(options, table.name)) is not None:
-            out[table.name] = listeners.listen(mapping, rows_of_table(bag, mapping, table))
+    for name, tables in OTHERS.items():
+        if (mapping := getattr(options, name)) is not None:
+            out[name] = listeners.listen(mapping, rows_of_table(bag, mapping, tables))
     return out
 
 

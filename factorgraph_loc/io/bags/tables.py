@@ -21,6 +21,7 @@ from factorgraph_loc.files.tables import NAMES, NUMBERS, Cells, TableRows
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import StaticFrames
 from factorgraph_loc.io.bags.topics import LIST, Fields, TopicRows, TopicSettings, as_nanoseconds, as_text, leaves
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Axes, Turned
@@ -28,7 +29,7 @@ from factorgraph_loc.sensors.camera.measurement import SIGHTINGS
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.rfid import tables as native_rfid
 from factorgraph_loc.sensors.rfid.stream import RFID, RfidStream
-from factorgraph_loc.sensors.tables import stream_of
+from factorgraph_loc.sensors.tables import Reading, assemble, native_tables, stream_of
 from factorgraph_loc.text import Notice, listed
 
 LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
@@ -111,6 +112,9 @@ class RowsOfTopic:
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> Stream:
         """The rows as a stream; problems are an InputError or a warning."""
+        channel, _ = native_tables()[self._table.name]
+        if channel.assemble:
+            return assemble(channel, {self._table.name: self.rows_of()}, Reading(DEFAULT_RIG, t0_ns, warnings))
         return stream_of(self._table, self.rows_of(), t0_ns, warnings)
 
 
@@ -275,12 +279,15 @@ class Corners(RowsOfTopic):
                 self._rows.append(item, t_ns, (corner.x, corner.y))
 
 
-def rows_of_table(bag: Bag, options: TableTopic, table: Table) -> RowsOfTopic:
-    """The collector of a topic of rows of ``table``; the corners of AprilTags need no fields."""
-    if table.name == SIGHTINGS.name and not options.fields and bag.topic(options.topic).type == CORNERS:
+def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> RowsOfTopic:
+    """The collector of a topic of rows of the first of ``tables`` that knows the messages; of the first one otherwise. The corners
+    of AprilTags need no fields."""
+    kind = bag.topic(options.topic).type
+    if tables[0].name == SIGHTINGS.name and not options.fields and kind == CORNERS:
         return Corners(bag, options.topic)
+    table = next((table for table in tables if kind in table.messages), tables[0])
     columns = {column.name: column for column in table.columns[1:]}
-    fields = options.fields or {name: name for name in columns}
+    fields = options.fields or table.messages.get(kind) or {name: name for name in columns}
     needed = {name for name, column in columns.items() if not column.may_lack}
     if not needed <= set(fields) <= set(columns):
         raise InputError(f"{bag.path} {options.topic}: fields are {listed(fields)}, expected {listed(columns)}")

@@ -7,6 +7,7 @@ are read; errors list the available fields. Timestamps are those of headers (tim
 from __future__ import annotations
 
 import math
+import re
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from itertools import repeat
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 LIST = "[]"
+ELEMENT = re.compile(r"\[(\d+)\]$")  # at the end of the path of one element of a list of numbers
 BYTES = ("uint8", "byte", "char", "octet")  # a list of these is one value, such as an EPC
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 HEADER = "std_msgs/msg/Header"
@@ -76,7 +78,7 @@ class Fields:
 def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
     """InputError with the available fields if the messages lack ``path``."""
     known = leaves(store, topic.type)
-    if path not in known and path + LIST not in known:
+    if path not in known and path + LIST not in known and ELEMENT.sub(LIST, path) not in known:
         raise InputError(f"{where} is {quoted(path)}, which {topic.type} lacks; its fields: {listed(known)}")
     if path.count(LIST) > 1:
         raise InputError(f"{where} is {quoted(path)}, a list within a list, expected at most one {LIST}")
@@ -136,7 +138,10 @@ def as_nanoseconds(value: Any, unit: int) -> int:
 
 
 def _getter(path: str) -> Callable[[Any], Any]:
-    """A getter of the field at a path, or of that field of the elements of a list."""
+    """A getter of the field at a path, of an element of a list, or of that field of all elements."""
+    if element := ELEMENT.search(path):
+        of_list, i = attrgetter(path[: element.start()]), int(element[1])
+        return lambda message: of_list(message)[i]
     outer, is_list, inner = path.partition(LIST)
     get = attrgetter(outer)
     if not is_list:

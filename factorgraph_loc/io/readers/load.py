@@ -14,7 +14,7 @@ from factorgraph_loc.files.data_root import EXPECTED, RUN_FILE, find_data_root, 
 from factorgraph_loc.files.models import nearest, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.io.bags.file import is_bag, require_metadata
-from factorgraph_loc.io.checks import look_over, require_bounds
+from factorgraph_loc.io.checks import look_over, require_bounds, without_false_headings
 from factorgraph_loc.io.motions import with_wheels_in, with_wheels_of
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig
 from factorgraph_loc.io.native.world_file import read_world
@@ -209,6 +209,7 @@ def _read(source: _Source, rig: Rig | None, world: World | None, options: Mappin
         metadata=metadata,
     )
     require_bounds(log)
+    log = without_false_headings(log)
     if manifest is not None and manifest.markers is not None:
         from factorgraph_loc.sensors.camera.frontend import with_markers  # noqa: PLC0415 - most logs do not need OpenCV
 

@@ -134,7 +134,9 @@ add_fields(
 
 def read(path: Path | None, options: Options) -> Log:
     """The log in the folder ``path``; t = 0 at its first timestamp. InputError names file, row and column."""
-    if path is None or not path.is_dir():
+    if path is None:
+        raise InputError("mapped: path is missing in the manifest: name the folder of the log's files")
+    if not path.is_dir():
         raise InputError(f"{path}: is not a folder: path in the manifest names the folder of the log's files")
     if options.odometry is None:
         raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")

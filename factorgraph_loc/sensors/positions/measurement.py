@@ -1,0 +1,150 @@
+"""Measured positions, their stream and table, and the settings of the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.files.columns import LENGTH, STAMP, Table, number, within
+from factorgraph_loc.files.models import FARTHEST, InUnit
+from factorgraph_loc.model.measurement import Stream
+from factorgraph_loc.model.settings import Offset, SensorSettings
+from factorgraph_loc.sensors.tables import Reading, stream_of
+from factorgraph_loc.text import notice
+from factors import se2
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from factorgraph_loc.files.tables import TableRows
+
+AREA, DEGREES = {"m^2": 1.0}, {"deg": 1.0}
+VARIANCES = ("var_x", "cov_xy", "var_y")
+_POINT = {axis: f"pose.position.{axis}" for axis in "xy"}
+_COVARIANCE = dict(zip(VARIANCES, ("covariance[0]", "covariance[1]", "covariance[7]"), strict=True))
+_SPREAD = tuple(
+    number(name, AREA, -np.inf, np.inf, "of its covariance; not used if implausible", may_lack=True)
+    for name in VARIANCES
+)
+POSITIONS = Table(
+    "position",
+    (
+        STAMP,
+        within("x", LENGTH, FARTHEST, "position in the world"),
+        within("y", LENGTH, FARTHEST, "position in the world"),
+        *_SPREAD,
+    ),
+    stream="factorgraph_loc.sensors.positions.measurement:PositionStream",
+    optional=(VARIANCES,),
+    messages={
+        "geometry_msgs/msg/PointStamped": {axis: f"point.{axis}" for axis in "xy"},
+        "geometry_msgs/msg/PoseStamped": _POINT,
+        "geometry_msgs/msg/PoseWithCovarianceStamped": {
+            name: f"pose.{path}" for name, path in (_POINT | _COVARIANCE).items()
+        },
+        "nav_msgs/msg/Odometry": {name: f"pose.{path}" for name, path in (_POINT | _COVARIANCE).items()},
+    },
+)
+POSITIONS_ON_EARTH = Table(
+    "position",
+    (
+        STAMP,
+        number("latitude", DEGREES, -89.0, 89.0, "geodetic latitude"),
+        number("longitude", DEGREES, -180.0, 360.0, "longitude"),
+        *_SPREAD,
+    ),
+    optional=(VARIANCES,),
+    messages={
+        "sensor_msgs/msg/NavSatFix": {
+            "latitude": "latitude",
+            "longitude": "longitude",
+            **{name: f"position_covariance[{i}]" for name, i in zip(VARIANCES, (0, 1, 4), strict=True)},
+        }
+    },
+)
+# the ellipsoid of WGS 84: its semi-major axis [m], and the square of its eccentricity
+MAJOR, ECCENTRICITY = 6378137.0, 6.69437999014e-3
+# m^2: variances that a system may state; others are placeholders, such as 0, 9999 and 1e308
+PLAUSIBLE = (1e-6, 2500.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """A position ``x``, ``y`` [m] in the world, and its covariance ``var_x``, ``cov_xy``, ``var_y`` [m^2], NaN if unknown."""
+
+    sensor: ClassVar[str] = "position"
+    modality: ClassVar[str] = "position"
+    is_motion: ClassVar[bool] = False
+    count: ClassVar[int] = 1
+    t: float
+    x: float
+    y: float
+    var_x: float = np.nan
+    cov_xy: float = np.nan
+    var_y: float = np.nan
+    source: str = modality
+
+
+@dataclass(frozen=True)
+class PositionStream(Stream):
+    """Positions ``x``, ``y`` (N,) [m] and their covariances ``var_x``, ``cov_xy``, ``var_y`` (N,) [m^2], NaN if unknown."""
+
+    kind: ClassVar[type[Any]] = Position
+    x: Array
+    y: Array
+    var_x: Array
+    cov_xy: Array
+    var_y: Array
+
+
+class PositionSettings(SensorSettings):
+    """A system that measures the position of a point of the robot."""
+
+    x: Offset = 0.0
+    """position of the point on the robot, forward"""
+    y: Offset = 0.0
+    """position of the point on the robot, to the left"""
+    sigma: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("m")] = 0.3
+    """standard deviation of x and y where the log states no plausible covariance"""
+    robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
+    """scale of the Geman-McClure loss, in standard deviations"""
+
+    def covariance(self, m: Position) -> Array:
+        """The covariance (2, 2) [m^2] of a position: its own, if that is plausible."""
+        low, high = PLAUSIBLE
+        determinant = m.var_x * m.var_y - m.cov_xy**2
+        if low <= m.var_x <= high and low <= m.var_y <= high and determinant > 0.0:
+            return np.array(((m.var_x, m.cov_xy), (m.cov_xy, m.var_y)))
+        return self.sigma**2 * np.eye(2)
+
+
+def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
+    """The positions of a log; covariances that it lacks are unknown. Latitudes and longitudes become metres to the east and north
+    of the first position."""
+    (table,) = rows.values()
+    columns = {name: np.full(len(table.rows), np.nan) for name in VARIANCES} | dict(table.numbers)
+    if "latitude" in columns:
+        for column in POSITIONS_ON_EARTH.columns[1:3]:
+            column.require(table.path, table.rows, columns[column.name])
+        degrees = np.column_stack((columns.pop("latitude"), columns.pop("longitude")))
+        columns |= dict(zip("xy", on_map(degrees, degrees[:1]).T, strict=True))
+        if len(degrees):
+            sentence = (
+                "position: x points east and y north of latitude {latitude}, longitude {longitude}, the first position"
+            )
+            reading.warnings.append(notice("origin", sentence, *degrees[0]))
+    return stream_of(POSITIONS, replace(table, numbers=columns), reading.t0_ns, reading.warnings)
+
+
+def on_map(degrees: Array, origin: Array) -> Array:
+    """Metres (N, 2) to the east and north of ``origin`` (1, 2) of latitudes and longitudes (N, 2) [deg], within some kilometres:
+    arcs of the radii of curvature there (Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems",
+    2nd edition, 2013, section 2.4.2)."""
+    latitude = np.radians(origin[:, 0])
+    root = 1.0 - ECCENTRICITY * np.sin(latitude) ** 2
+    meridian, normal = MAJOR * (1.0 - ECCENTRICITY) / root**1.5, MAJOR / np.sqrt(root)
+    north, east = np.radians(degrees - origin).T
+    return np.column_stack((se2.wrap(east) * normal * np.cos(latitude), north * meridian))

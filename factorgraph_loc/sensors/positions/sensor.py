@@ -1,0 +1,92 @@
+"""The position sensor of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from factorgraph_loc.sensors.base import Binding, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.positions.finder import PositionFinder
+from factorgraph_loc.sensors.positions.measurement import Position, PositionSettings
+from factors.graph import Factor
+from factors.motion import Increment
+from factors.positions.factor import PositionFactor
+from factors.se2 import Array
+from factors.update import Correction
+
+
+@dataclass(frozen=True)
+class PositionObservation(ResidualObservation):
+    """One position; weighs all particles at once."""
+
+    @property
+    def factor(self) -> PositionFactor:
+        """The factor of the position."""
+        return cast(PositionFactor, self.terms[0].factor)
+
+    def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
+        return -self.factor.losses(poses)
+
+
+class PositionSensor(Sensor):
+    """The position sensor of a run. A position that is equal to the previous one, to the last digit, is counted as ignored: the
+    system repeats what it knew, or the robot stands still."""
+
+    modality = "position"
+
+    def __init__(self, binding: Binding, settings: PositionSettings) -> None:
+        super().__init__(binding.name)
+        self._settings, self._diagnostics = settings, binding.diagnostics
+        self._arm = np.array((settings.x, settings.y))
+        self._last: tuple[float, float, float] | None = None
+        self.finder = self._finder = PositionFinder(self.observation, binding.motion)
+
+    def observation(self, m: Position, offset: Increment | None = None) -> PositionObservation:
+        """The observation of a measurement, on the pose that lies ``offset`` before it."""
+        position, covariance = np.array((m.x, m.y)), self._settings.covariance(m)
+        factor = PositionFactor(position, covariance, self._arm, self._settings.robust, offset)
+        return PositionObservation(m.t, (Term(factor, (), 2),))
+
+    def observe(self, m: Position, view: View) -> Iterator[PositionObservation]:
+        """The position as one factor."""
+        last, self._last = self._last, (m.t, m.x, m.y)
+        if last is not None and last[0] < m.t and last[1:] == self._last[1:]:
+            self._diagnostics.ignore(f"{self.name}: the previous position again")
+            return
+        yield self.observation(m, view.offset)
+
+    def judge(self, observation: PositionObservation, correction: Correction, view: View) -> bool:
+        """Report the innovation and the residual."""
+        self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
+        (error,) = -observation.factor.errors(view.pose[None])
+        self._diagnostics.add_residuals(f"{self.name}.x", [float(error[0])])
+        self._diagnostics.add_residuals(f"{self.name}.y", [float(error[1])])
+        return True
+
+    def evidence(self, m: Position) -> PositionObservation:
+        return self.observation(m)
+
+    @property
+    def suspicious_since(self) -> float | None:
+        return self._finder.suspicious_since
+
+    def accept(self) -> None:
+        self._finder.clear()
+
+    def at_end(self, factor: Factor, width: float) -> Factor:
+        return cast(PositionFactor, factor).widened(width)
+
+    def rewind(self, t: float) -> None:
+        if self._last is not None and self._last[0] > t:
+            self._last = None
+
+
+def bind(binding: Binding) -> PositionSensor | None:
+    """The sensor of a run, or None if it is not used."""
+    settings = binding.setup.rig.find(PositionSettings)
+    if settings is None or PositionSensor.modality not in binding.setup.sensors:
+        return None
+    return PositionSensor(binding, settings)

@@ -1,0 +1,1 @@
+"""Measured positions of a point of the robot."""

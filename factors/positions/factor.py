@@ -1,0 +1,93 @@
+"""The factor of a measured position, such as of a GNSS or UWB receiver, on the pose of the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from factors import positive, se2
+from factors.motion import Increment
+from factors.robust import geman_mcclure_loss, geman_mcclure_weight
+from factors.se2 import Array
+
+
+@dataclass(frozen=True)
+class PositionFactor:
+    """A position (2,) [m] in the world with ``covariance`` (2, 2) as a factor on the pose (3,).
+
+    ``arm`` (2,) [m]: the measured point in the robot frame. ``offset``: the motion from the pose to the measurement, None if the
+    times are equal. ``robust``: scale of the Geman-McClure loss in standard deviations.
+    """
+
+    position: Array
+    covariance: Array
+    arm: Array
+    robust: float
+    offset: Increment | None = None
+
+    def errors(self, poses: Array) -> Array:
+        """Predicted minus measured positions (N, 2) [m] from poses (N, 3)."""
+        return np.asarray(se2.transform_from(poses, self._arm_at_pose()) - self.position)
+
+    def linearized(self, poses: Array) -> tuple[Array, Array]:
+        """Whitened residuals (N, 2) of poses (N, 3), and their Jacobians (N, 2, 3) by the body-frame perturbation."""
+        arm, axes = self._arm_at_pose(), _axes(poses[:, 2])
+        jacobian = axes @ np.array(((1.0, 0.0, -arm[1]), (0.0, 1.0, arm[0])))
+        whitener = positive.whitener(self._covariances(poses))
+        return np.einsum("nij,nj->ni", whitener, self.errors(poses)), whitener @ jacobian
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened residual (1, 2) and its Jacobian (1, 2, 3)."""
+        residual, jacobian = self.linearized(values[0][None])
+        return residual, [jacobian]
+
+    def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """Whitened, robustly weighted residual (2,) and its Jacobian (2, 3)."""
+        residual, (jacobian,) = self.whitened(values)
+        weight = np.sqrt(self.weight(residual[0] @ residual[0]))
+        return weight * residual[0], [weight * jacobian[0]]
+
+    def losses(self, poses: Array) -> Array:
+        """The robust loss (N,) of poses (N, 3)."""
+        squared = positive.squared(self.errors(poses), self._covariances(poses))
+        return np.asarray(geman_mcclure_loss(squared, self.robust))
+
+    def squared(self, pose: Array, covariance: Array) -> float:
+        """The squared Mahalanobis distance from the prediction ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+        residual, (jacobian,) = self.whitened([pose])
+        return float(positive.squared(residual[0], np.eye(2) + jacobian[0] @ covariance @ jacobian[0].T))
+
+    def cost(self, values: Sequence[Array]) -> float:
+        """The robust loss."""
+        return float(self.losses(values[0][None])[0])
+
+    def weight(self, squared: Array) -> Array:
+        """The robust weight of squared whitened residuals."""
+        return np.asarray(geman_mcclure_weight(squared, self.robust))
+
+    def dof(self) -> int:
+        """Number of measured coordinates."""
+        return 2
+
+    def widened(self, width: float) -> PositionFactor:
+        """The factor with a loss ``width`` times as wide."""
+        return replace(self, robust=width * self.robust)
+
+    def _arm_at_pose(self) -> Array:
+        return self.arm if self.offset is None else np.asarray(se2.transform_from(self.offset.delta, self.arm))
+
+    def _covariances(self, poses: Array) -> Array:
+        """Covariances (N, 2, 2) of the errors: of the measurement, and of the motion since the pose."""
+        if self.offset is None:
+            return np.broadcast_to(self.covariance, (len(poses), 2, 2))
+        x, y = self.arm
+        moved = _axes(poses[:, 2] + self.offset.delta[2]) @ np.array(((1.0, 0.0, -y), (0.0, 1.0, x)))
+        return np.asarray(self.covariance + moved @ self.offset.covariance @ moved.transpose(0, 2, 1))
+
+
+def _axes(headings: Array) -> Array:
+    """Rotations (N, 2, 2) by headings (N,)."""
+    c, s = np.cos(headings), np.sin(headings)
+    return np.stack((np.stack((c, -s), axis=-1), np.stack((s, c), axis=-1)), axis=-2)
