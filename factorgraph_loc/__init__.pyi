@@ -66,6 +66,7 @@ from factorgraph_loc.sensors.landmarks.measurement import (
 )
 from factorgraph_loc.sensors.landmarks.measurement import Landmark as Landmark
 from factorgraph_loc.sensors.loops.measurement import LoopStream as LoopStream, Loops as Loops
+from factorgraph_loc.sensors.positions.measurement import Position as Position, PositionStream as PositionStream
 from factorgraph_loc.sensors.odometry.measurement import (
     IncrementOdometry as IncrementOdometry,
     IncrementStream as IncrementStream,

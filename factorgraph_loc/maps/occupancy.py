@@ -20,7 +20,7 @@ Wall = tuple[float, float, float, float]
 Yaw = Annotated[float, Field(ge=-7.0, le=7.0), InUnit("rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 TOLERANCE = 0.75  # cells between a wall and the cell centres: half a cell for an oblique line
-STRIP = 256  # rows of cells that are read at once
+STRIP = 256  # rows of cells in a strip
 MIN_EXTENT = 2.0  # cells; smaller groups are noise of the mapping sensor
 
 
@@ -71,7 +71,7 @@ def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
         # a colour counts by the mean of its channels, as in map_server
         mode = "RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB"
         out = np.empty((image.height, image.width), dtype=bool)
-        for top in range(0, image.height, STRIP):  # in strips, as numbers of all cells at once need much memory
+        for top in range(0, image.height, STRIP):  # numbers of all cells need much memory
             strip = image.crop((0, top, image.width, min(top + STRIP, image.height))).convert(mode)
             out[top : top + STRIP] = _are_occupied(np.asarray(strip, dtype=np.uint8), stated)
     return out

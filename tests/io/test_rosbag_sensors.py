@@ -194,3 +194,37 @@ def test_landmarks_and_pixels_by_a_mapping(maker, read_drive):
     seen, shown = log.streams["bearing_range"], log.streams["sightings"]
     assert (seen.landmark, seen.range.tolist(), seen.bearing.tolist()) == (["AB", "CD"], [2.5, 3.5], [0.5, -0.5])
     assert (shown.point, shown.u.tolist(), shown.v.tolist()) == (["AB", "CD"], [2.5, 3.5], [0.5, -0.5])
+
+
+def test_positions_of_a_bag_with_their_covariances(maker, read_drive):
+    covariance = np.zeros(36)
+    covariance[[0, 1, 7]] = 0.04, 0.01, 0.09
+    for i in range(3):
+        pose = maker.make(
+            "geometry_msgs/msg/PoseWithCovariance", pose=maker.pose(1.0 + i, 2.0, 0.0), covariance=covariance
+        )
+        maker.stamped("/uwb", T0 + 100 * MS * i, "geometry_msgs/msg/PoseWithCovarianceStamped", pose=pose)
+    stream = read_drive(maker, position={"topic": "/uwb"}).streams["position"]
+    np.testing.assert_allclose(stream.x, (1.0, 2.0, 3.0))
+    np.testing.assert_allclose((stream.var_x[0], stream.cov_xy[0], stream.var_y[0]), (0.04, 0.01, 0.09))
+    assert proposed(maker.path).options["position"] == {"topic": "/uwb"}
+
+
+def test_fixes_of_a_bag_are_metres_from_the_first(maker, read_drive):
+    for i in range(3):
+        status = maker.make("sensor_msgs/msg/NavSatStatus", status=0, service=1)
+        maker.stamped(
+            "/fix",
+            T0 + 100 * MS * i,
+            "sensor_msgs/msg/NavSatFix",
+            status=status,
+            latitude=60.0 + i / 3600.0,
+            longitude=10.0,
+            altitude=5.0,
+            position_covariance=np.zeros(9),
+            position_covariance_type=0,
+        )
+    log = read_drive(maker, position={"topic": "/fix"})
+    np.testing.assert_allclose(log.streams["position"].y, (0.0, 30.9, 61.9), atol=0.1)
+    assert "origin" in [warning.kind for warning in log.warnings]
+    assert proposed(maker.path).options["position"] == {"topic": "/fix"}

@@ -218,8 +218,8 @@ def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None
 def _never_turns(bag: Bag, topic: Topic) -> bool:
     """Whether all orientations in the first messages of a topic of poses are equal."""
     get = attrgetter(f"{POSES[topic.type]}.{'rotation' if topic.type.endswith('TransformStamped') else 'orientation'}")
-    turned = (get(item.message) for item in islice(bag.messages([topic.name]), SAMPLE))
-    return len({(q.x, q.y, q.z, q.w) for q in turned}) == 1
+    turned = [get(item.message) for item in islice(bag.messages([topic.name]), SAMPLE)]
+    return len(turned) > 2 and len({(q.x, q.y, q.z, q.w) for q in turned}) == 1
 
 
 def _camera(out: Uses, topics: Sequence[Topic]) -> None:

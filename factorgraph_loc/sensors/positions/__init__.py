@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "measurement", "summary"]
+__all__ = ["SENSOR", "measurement"]
 
 SENSOR = SensorType(
     "positions",
