@@ -13,6 +13,7 @@ __all__ = [
     "loops",
     "motion",
     "odometry",
+    "positions",
     "positive",
     "rfid",
     "robust",

@@ -10,6 +10,7 @@ __all__ = [
     "loops",
     "motion",
     "odometry",
+    "positions",
     "registry",
     "rfid",
     "smoothed",

@@ -1,1 +1,3 @@
 """Measured positions of a point of the robot."""
+
+__all__ = ["factor"]

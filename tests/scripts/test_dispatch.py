@@ -21,8 +21,8 @@ CLASSES = [*STREAMS, *(stream.kind for stream in STREAMS)]
 TYPES = {kind.__name__ for kind in CLASSES}
 HELD = {field.name for kind in CLASSES for field in fields(kind)} - {"t", "source"}
 SECTIONS = {name for sensor in sensors().values() for name in sensor.settings}
-# landmarks are what estimators may learn, too, and a survey is none of a sensor alone
-NAMES = {*channels(), *sensors(), *SECTIONS} - {"landmarks", "survey"}
+# landmarks are what estimators may learn, too, a survey is none of a sensor alone, and tables of results have a position
+NAMES = {*channels(), *sensors(), *SECTIONS} - {"landmarks", "survey", "position"}
 
 KEPT = {
     "experiments/maps.py": (1, "the word says whether poses are given or estimated, not which sensor there is"),
