@@ -207,8 +207,8 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
     sightings = list(pictures_of.sightings(log))
     if sightings:
         labels = [name for _, names, _ in sightings for name in names]
-        seen = np.array([t for t, _, _ in sightings])
-        _pixels_over_time(recording, f"{at}/image/landmarks", seen, [pixels for _, _, pixels in sightings], labels)
+        stamps = np.array([t for t, _, _ in sightings])
+        _pixels_over_time(recording, f"{at}/image/landmarks", stamps, [pixels for _, _, pixels in sightings], labels)
         style = rr.Points2D.from_fields(radii=3.0, colors=SIGHTING, show_labels=False)
         recording.log(f"{at}/image/landmarks", style, static=True)
 

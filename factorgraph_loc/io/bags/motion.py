@@ -6,6 +6,7 @@ Each wheel has a topic, or both wheels are joints of one message.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
@@ -89,29 +90,24 @@ class JointRows:
         return self.rows.in_order(joints, warnings)
 
 
-class TwoWheels:
-    """The numbers of two topics, in pairs with the nearest stamps. A pair has the later one, when both are known."""
-
-    def __init__(self, left: TopicRows, right: TopicRows) -> None:
-        self.rows, self._right = left, right
-
-    def pairs(self, warnings: list[Notice]) -> tuple[Integers, Array]:
-        """Timestamps (N,), and the left and the right number (N, 2). InputError if the topics have no time in common."""
-        l_ns, left = self.rows.in_order(("wheel",), warnings)
-        r_ns, right = self._right.in_order(("wheel",), warnings)
-        later = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
-        earlier = np.maximum(later - 1, 0)
-        near = np.where(np.abs(r_ns[earlier] - l_ns) <= np.abs(r_ns[later] - l_ns), earlier, later)
-        usual = float(np.median(np.diff(l_ns))) if len(l_ns) > 1 else 0.0
-        keep = np.flatnonzero(np.abs(r_ns[near] - l_ns) <= MAX_OFFSET * usual)
-        t_ns = np.maximum(l_ns, r_ns[near])[keep]
-        if not len(t_ns):
-            raise InputError(f"{self.rows.source} and {self._right.source}: no messages are near in time")
-        if lost := len(l_ns) - len(keep):
-            sentence = "{source}: {messages} messages have none of the right wheel near in time"
-            warnings.append(notice("unpaired_wheels", sentence, self.rows.source, lost))
-        alone = np.append(np.diff(t_ns) > 0, True)  # the last one of equal stamps
-        return t_ns[alone], np.hstack((left[keep], right[near[keep]]))[alone]
+def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
+    """Timestamps (N,), and the left and the right number (N, 2) of two topics, in pairs with the nearest stamps. A pair has the
+    later one, when both are known. InputError if the topics have no time in common."""
+    l_ns, left = lefts.in_order(("wheel",), warnings)
+    r_ns, right = rights.in_order(("wheel",), warnings)
+    later = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
+    earlier = np.maximum(later - 1, 0)
+    near = np.where(np.abs(r_ns[earlier] - l_ns) <= np.abs(r_ns[later] - l_ns), earlier, later)
+    usual = float(np.median(np.diff(l_ns))) if len(l_ns) > 1 else 0.0
+    keep = np.flatnonzero(np.abs(r_ns[near] - l_ns) <= MAX_OFFSET * usual)
+    t_ns = np.maximum(l_ns, r_ns[near])[keep]
+    if not len(t_ns):
+        raise InputError(f"{lefts.source} and {rights.source}: no messages are near in time")
+    if lost := len(l_ns) - len(keep):
+        sentence = "{source}: {messages} messages have none of the right wheel near in time"
+        warnings.append(notice("unpaired_wheels", sentence, lefts.source, lost))
+    alone = np.append(np.diff(t_ns) > 0, True)  # the last one of equal stamps
+    return t_ns[alone], np.hstack((left[keep], right[near[keep]]))[alone]
 
 
 class OdometryTopic(PoseTopic):
@@ -203,21 +199,21 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
             f"{bag.path} {options.topic}: odometry.wheels.right_topic is given: remove rear_left and rear_right"
         )
     are_speeds = options.use == "twist"
-    rows: JointRows | TwoWheels
+    rows: Motion
     if wheels.right_topic is None:
         collector = JointRows(bag, options.topic, wheels, "velocity" if are_speeds else "position")
-        rows = listeners.listen(options, collector)
+        rows = listeners.listen(options, collector).pairs
     else:
         of_right = options.model_copy(update={"topic": wheels.right_topic})
         left = listeners.listen(options, _wheel(bag, options.topic, wheels.left))
-        rows = TwoWheels(left, listeners.listen(of_right, _wheel(bag, wheels.right_topic, wheels.right)))
+        rows = partial(paired, left, listeners.listen(of_right, _wheel(bag, wheels.right_topic, wheels.right)))
 
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
-        source = rows.rows.source
+        source = f"{bag.path} {options.topic}"
         size = wheels.metres(source, "odometry.wheels", turns=wheels.unit != "m")
         if isinstance(wheels.unit, float):
             size *= wheels.unit
-        t_ns, numbers = rows.pairs(warnings)
+        t_ns, numbers = rows(warnings)
         if are_speeds:
             return t_ns, motions.of_speeds(source, t_ns, size * numbers, wheels, warnings)
         scales = np.full(numbers.shape[1], size)
