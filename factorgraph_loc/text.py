@@ -4,11 +4,9 @@ import json
 import math
 import reprlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from string import Formatter
 from typing import Any
-
-from pydantic_core import to_jsonable_python
 
 MESSAGE = 300  # characters of a message at most
 NAME = 120  # characters of a name, a path or a foreign message
@@ -120,7 +118,15 @@ def error_text(error: BaseException) -> str:
 
 def plain_values(value: Any) -> Any:
     """A value as in JSON: dictionaries for data classes and mappings, lists for arrays and tuples, null for NaN and infinity."""
-    return to_jsonable_python(value, inf_nan_mode="null", fallback=lambda array: array.tolist())
+    if is_dataclass(value):
+        return {name: plain_values(getattr(value, name)) for name in value.__dataclass_fields__}
+    if hasattr(value, "tolist"):  # an array
+        return plain_values(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): plain_values(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_values(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def json_text(content: Any) -> str:
