@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -50,8 +51,9 @@ def named(module: str, *, at_once: bool = False) -> frozenset[tuple[str, str]]:
 
 @cache
 def names_in(path: Path, *, at_once: bool = False) -> frozenset[tuple[str, str]]:
-    """Those of a file, see :func:`named`."""
-    tree = ast.parse(path.read_text())
+    """Those of a file, see :func:`named`; of a page, those of the Python files that it shows."""
+    shown = re.findall(r"```python\n# \S+\.py\n(.*?)```", path.read_text(), re.DOTALL)
+    tree = ast.parse("\n".join(shown) if path.suffix == ".md" else path.read_text())
     found: set[tuple[str, str]] = set()
     for node in tree.body if at_once else ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:

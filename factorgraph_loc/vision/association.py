@@ -6,7 +6,7 @@ occluded points. The most similar feature in its gate is accepted if it passes t
 views of one point are similar.
 
 Without a prediction, the image is compared with a whole small map, or with the most similar keyframes of a large one
-(:mod:`~factorgraph_loc.vision.relocalization`, :mod:`~factorgraph_loc.vision.relocalization`).
+(:mod:`~factorgraph_loc.vision.relocalization`).
 """
 
 import math
