@@ -183,6 +183,15 @@ def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Intege
         raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
+# stamps since 1970 [the unit] that are larger have that unit; none of this century is below the last
+SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
+
+
+def unit_since_1970(stamp: float) -> str | None:
+    """The unit of a timestamp since 1970, by its size; None if it is too small."""
+    return next((unit for unit, least in SINCE_1970.items() if abs(stamp) > least), None)
+
+
 def number(
     name: str,
     units: Mapping[str, float],

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_loc.files.column_mapping import parsed, split_comments
-from factorgraph_loc.files.columns import LENGTH, RATE, SPEED, STAMPS
+from factorgraph_loc.files.columns import LENGTH, RATE, SPEED, STAMPS, unit_since_1970
 from factorgraph_loc.files.models import read_text
 from factorgraph_loc.files.tables import iso_nanoseconds
 from factorgraph_loc.text import quoted
@@ -262,10 +262,8 @@ def _add_time(out: Guess) -> None:
 
 def _unit_of_times(values: Array) -> str:
     """The unit of timestamps, by their size since 1970, or by the steps of a clock that begins with the log."""
-    first = float(np.abs(values[0]))
-    for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
-        if first > least:
-            return unit
+    if (unit := unit_since_1970(float(values[0]))) is not None:
+        return unit
     step = float(np.median(np.diff(np.unique(values))))
     whole = bool(np.all(values == np.floor(values)))
     return "s" if not whole or step <= 1.0 else "ms" if step < 1e4 else "us" if step < 1e7 else "ns"

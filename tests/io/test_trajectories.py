@@ -46,6 +46,15 @@ def test_bad_files_are_refused_in_a_line(tmp_path, name, text, message):
     refusal(lambda: read_trajectory(tmp_path / name), message)
 
 
+@pytest.mark.parametrize(("unit", "per_second"), [("ns", 10**9), ("us", 10**6), ("ms", 10**3)])
+def test_stamps_are_read_in_the_unit_that_their_size_shows(tmp_path, unit, per_second):
+    stamps = [1_403_715_529 * per_second, 1_403_715_530 * per_second]
+    (tmp_path / "a.tum").write_text("".join(f"{stamp} 0 0 0 0 0 0 1\n" for stamp in stamps))
+    found = read_trajectory(tmp_path / "a.tum")
+    assert found.t_ns.tolist() == [1_403_715_529 * 10**9, 1_403_715_530 * 10**9]
+    assert found.warnings[0].fields["unit"] == unit
+
+
 def test_rows_of_one_stamp_give_a_warning(tmp_path):
     (tmp_path / "a.tum").write_text(TUM + "1 5 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
     found = read_trajectory(tmp_path / "a.tum")

@@ -14,12 +14,12 @@ import numpy as np
 from factorgraph_loc.errors import InputError, bad_field, require
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
-from factorgraph_loc.files.columns import POSES, PURE, within
+from factorgraph_loc.files.columns import POSES, PURE, unit_since_1970, within
 from factorgraph_loc.files.models import FARTHEST, read_text
 from factorgraph_loc.files.tables import Cells
 from factorgraph_loc.model.planar import rotations_of
 from factorgraph_loc.model.pose_path import PosePath
-from factorgraph_loc.text import Notice
+from factorgraph_loc.text import Notice, notice
 from factors.camera import model as reprojection
 from factors.se2 import Array, Integers
 
@@ -92,13 +92,26 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
         matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
     warnings: list[Notice] = []
-    cells = _read(path, EUROC, ",", "ns") if detected == "euroc" else _read(path, TUM, " ", "s")
+    columns, separator, usual = (EUROC, ",", "ns") if detected == "euroc" else (TUM, " ", "s")
+    unit = _unit(first, separator) or usual
+    if unit != usual:
+        sentence = "{source}: the stamps are read in {unit}, by their size, not in {usual}"
+        warnings.append(notice("unit_of_stamps", sentence, path.name, unit, usual))
+    cells = _read(path, columns, separator, unit)
     cells = replace(cells, labels={})  # names of columns say more than numbers
     table = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[1:]])
     t_ns = cells.stamps("t")
     rotations = rotations_of(path, cells.rows, table[:, 3:])
     keep = checks.in_order(path, cells.rows, t_ns, warnings)
     return replace(PosePath(str(path), table[:, :3], rotations, t_ns).rows(keep), warnings=tuple(warnings))
+
+
+def _unit(first: str, separator: str) -> str | None:
+    """The unit of the timestamp of a row, by its size; None if it is no time since 1970."""
+    try:
+        return unit_since_1970(float(first.replace(separator, " ").split()[0]))
+    except ValueError:
+        return None
 
 
 def is_pose_file(path: Path) -> bool:
