@@ -98,10 +98,7 @@ def inverse(covariances: Array) -> Array:
 
 def squared(errors: Array, covariances: Array) -> Array:
     """Squared Mahalanobis distances (...) of ``errors`` (..., D) under covariances (..., D, D)."""
-    try:
-        return np.asarray(np.sum(errors * np.linalg.solve(covariances, errors[..., None])[..., 0], axis=-1))
-    except np.linalg.LinAlgError:
-        return np.asarray(np.sum((_whitener(covariances) @ errors[..., None])[..., 0] ** 2, axis=-1))
+    return np.asarray(np.sum(errors * solve(covariances, errors[..., None])[..., 0], axis=-1))
 
 
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:

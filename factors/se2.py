@@ -100,31 +100,8 @@ def log(pose: Array) -> Array:
 def adjoint(pose: Array) -> Array:
     """The adjoint matrix ``(..., 3, 3)``: ``pose * exp(xi) = exp(adjoint(pose) xi) * pose``."""
     pose = np.asarray(pose, dtype=float)
-    if pose.ndim == 1:
-        return adjoint_one(np.array(pose))
     out = _rotation3(pose[..., 2])
     out[..., 0, 2], out[..., 1, 2] = pose[..., 1], -pose[..., 0]
-    return out
-
-
-def right_jacobian(xi: Array) -> Array:
-    """Right Jacobian ``(..., 3, 3)`` of :func:`exp`: ``exp(xi + d) ~ exp(xi) * exp(right_jacobian(xi) d)``."""
-    xi = np.asarray(xi, dtype=float)
-    if xi.ndim == 1:
-        return right_jacobian_one(np.array(xi))
-    phi = xi[..., 2]
-    a, b = _arc_coefficients(phi)
-    small = np.abs(phi) < SMALL
-    safe = np.where(small, 1.0, phi)
-    # (1 - a) / phi and b / phi, with their series at zero
-    c = np.where(small, phi / 6.0, (1.0 - a) / safe)
-    d = np.where(small, 0.5 - phi**2 / 24.0, b / safe)
-    out = np.zeros((*xi.shape[:-1], 3, 3))
-    out[..., 0, 0], out[..., 0, 1] = a, b
-    out[..., 1, 0], out[..., 1, 1] = -b, a
-    out[..., 0, 2] = c * xi[..., 0] - d * xi[..., 1]
-    out[..., 1, 2] = d * xi[..., 0] + c * xi[..., 1]
-    out[..., 2, 2] = 1.0
     return out
 
 
@@ -266,15 +243,8 @@ def between_one(a: Array, b: Array) -> Array:
 
 
 @compiled
-def adjoint_one(pose: Array) -> Array:
-    """:func:`adjoint` of one pose (3,)."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.array(((c, -s, pose[1]), (s, c, -pose[0]), (0.0, 0.0, 1.0)))
-
-
-@compiled
-def right_jacobian_one(xi: Array) -> Array:
-    """:func:`right_jacobian` of one twist (3,)."""
+def right_jacobian(xi: Array) -> Array:
+    """Right Jacobian (3, 3) of :func:`exp` at one twist (3,): ``exp(xi + d) ~ exp(xi) * exp(right_jacobian(xi) d)``."""
     angle = xi[2]
     p, q = arc_coefficients(angle)
     r, s = (angle / 6.0, 0.5 - angle * angle / 24.0) if abs(angle) < SMALL else ((1.0 - p) / angle, q / angle)
@@ -283,8 +253,8 @@ def right_jacobian_one(xi: Array) -> Array:
 
 @compiled
 def inverse_right_jacobian(xi: Array) -> Array:
-    """The inverse (3, 3) of :func:`right_jacobian_one`."""
-    j = right_jacobian_one(xi)
+    """The inverse (3, 3) of :func:`right_jacobian`."""
+    j = right_jacobian(xi)
     p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
     scale = 1.0 / (p * p + q * q)
     first = scale * p, -scale * q, -scale * (p * u - q * v)

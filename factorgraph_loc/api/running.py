@@ -6,8 +6,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from factorgraph_loc.calibration.learn import Knowledge
-from factorgraph_loc.calibration.turns import TURNS, learn_by_turns
+from factorgraph_loc.calibration.learn import TURNS, Knowledge, learn_by_turns
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.evaluation.plots import write_plots
 from factorgraph_loc.experiments import output

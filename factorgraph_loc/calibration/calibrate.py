@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from factorgraph_loc.calibration.held_out import Run, Trial, folds_of, refusal, trials_of
-from factorgraph_loc.calibration.learn import Knowledge, has_heading, learn, senses, sensing
-from factorgraph_loc.calibration.turns import learn_by_turns
+from factorgraph_loc.calibration.learn import Knowledge, has_heading, learn, learn_by_turns, senses, sensing
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import are_alike

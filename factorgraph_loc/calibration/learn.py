@@ -1,19 +1,34 @@
-"""Learning of a rig from logs along given trajectories, by the calibrators of all sensors."""
+"""Learning of a rig from logs along given trajectories, by the calibrators of all sensors; without a reference by turns.
 
-from collections.abc import Mapping, Sequence
+Each turn smooths the logs with the current rig, and learns a rig from the smoothed trajectories and their covariances:
+expectation-maximisation (Dempster, Laird and Rubin, JRSS B 39, 1977; with a smoother: Shumway and Stoffer, "An approach to time
+series smoothing and forecasting using the EM algorithm", 1982). It ends when a turn changes all values by less than a fraction of
+their standard errors.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Calibrator, SensorKnowledge
 from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.sensors.smoothed import Traced
 from factorgraph_loc.text import Notice, notice
 
+Smooth = Callable[[Log], RunResult]
+"""Runs the smoother on a log, with the log's rig."""
+
 SETTLED = 0.3  # standard errors that the last turn may change
+TURNS = 8
+TOO_VAGUE = 1.0  # m; a trajectory with a larger standard deviation is not used
 
 
 @dataclass(frozen=True)
@@ -82,3 +97,61 @@ def sensing(rig: Rig, log: Log) -> Rig:
 def has_heading(log: Log) -> bool:
     """Whether the log's reference has meaningful headings."""
     return log.reference is not None and log.reference.has_heading
+
+
+def learn_by_turns(
+    logs: Sequence[Log],
+    start: Rig,
+    smooth: Smooth,
+    grids: Path | None = None,
+    progress: Callable[[float, float], None] | None = None,
+) -> Knowledge:
+    """Learn a rig from ``logs``, whose references are not used, beginning with the rig ``start``.
+
+    ``grids``: path prefix of files that may be written; ``progress``: called with the number of runs done and of all that there
+    may be. InputError if a log contains too little information.
+    """
+    rig, turns, fitted = start, list[float](), dict[tuple[str, str], float]()
+    while True:
+        for calibrator in calibrators().values():
+            rig = calibrator.with_priors(rig, start)
+        smoothed = []
+        for log in logs:
+            smoothed.append(_smoothed(replace(log, rig=rig, reference=None), smooth))
+            if progress is not None:
+                progress(len(turns) * len(logs) + len(smoothed), TURNS * len(logs))
+        knowledge = learn(smoothed, rig, start, grids)
+        if not knowledge.constants and not knowledge.notes:
+            raise InputError(
+                f"{logs[0].name}: nothing of the rig {start.name} can be learnt without a reference: it has no detection model, "
+                "and no constant with an uncertainty, that the log's sensors use"
+            )
+        rig = knowledge.rig
+        turns.append(max((_change(constant, fitted) for constant in knowledge.constants), default=0.0))
+        fitted = {(c.sensor, c.name): c.fitted for c in knowledge.constants}
+        if len(turns) == TURNS or turns[-1] < SETTLED:
+            return replace(knowledge, turns=tuple(turns))
+
+
+def _smoothed(log: Log, smooth: Smooth) -> Traced:
+    """The log with its smoothed trajectory as reference."""
+    result = smooth(log)
+    final = result.final
+    if result.first_localized() is None or len(final) < 2 or final.covariances is None:
+        raise InputError(
+            f"{log.name}: the smoother did not localize the robot, so that nothing can be learnt without a reference"
+        )
+    vague = float(np.sqrt(np.median(np.trace(final.covariances[:, :2, :2], axis1=1, axis2=2))))
+    if vague > TOO_VAGUE:
+        raise InputError(
+            f"{log.name}: the smoother estimates the position with a standard deviation of {vague:.1f} m (median), expected "
+            f"{TOO_VAGUE:g} m or less to learn from it without a reference"
+        )
+    doubted = frozenset[str]().union(*result.diagnostics.doubted.values())
+    return Traced(replace(log, reference=final), result.learnt.values, doubted)
+
+
+def _change(constant: FittedConstant, fitted: Mapping[tuple[str, str], float]) -> float:
+    """The change of a constant in a turn, in standard errors."""
+    change = abs(constant.fitted - fitted.get((constant.sensor, constant.name), constant.initial))
+    return change / constant.error if change > 0.0 else 0.0

@@ -29,8 +29,8 @@ from factorgraph_loc.text import listed
 from factors import se2
 from factors.graph import Factor, PriorFactor, Values, VectorPriorFactor, constants_key, landmark_key, pose_key
 from factors.motion import Increment
+from factors.odometry import kernels
 from factors.odometry.factor import OdometryFactor
-from factors.odometry.model import PARAMETERS, recalibrated
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.factor import RfidFactor, RfidTagFactor
 from factors.rfid.model import RfidModel
@@ -171,6 +171,7 @@ class _Problem:
     def __init__(self, log: Log, observations: TagObservations, prior: PosePrior, known: NDArray[np.bool_]) -> None:
         self._looks, self._prior, self._known = observations, prior, known
         self._constants = log.rig.estimated("odometry")
+        self._places = np.array(self._constants.indices, dtype=np.int64)
         wheels = moving(log.streams)
         motion = whole_motion(log, (*wheels, *(name for name in moving(log.rig.sensors, TURN) if not moving((name,)))))
         last = max(float(observations.t[-1]), prior.t)
@@ -247,8 +248,10 @@ class _Problem:
     def _recalibrated(self, increment: Increment) -> Array:
         if not self._constants.names:
             return increment.delta
-        changes = self._constants.full(self._values[constants_key(0)], len(PARAMETERS))
-        return recalibrated(increment, changes)[0]
+        delta: Array = kernels.recalibrated(
+            increment.delta, increment.moving, self._values[constants_key(0)], self._places
+        )
+        return delta
 
     def _problem(self) -> Problem:
         body = se2.world_to_body(self._prior.pose, self._prior.covariance)

@@ -71,19 +71,14 @@ class Sensors:
     def of(
         world: World,
         rig: Rig,
-        settings: Any = None,
-        speed: float = SPEED,
-        turn_rate: float = SPEED / METRES_PER_RADIAN,
-        only: Collection[str] | None = None,
+        settings: Any,
+        speed: float,
+        turn_rate: float,
+        only: Collection[str],
     ) -> Sensors:
-        """All sensors of a rig that observe objects in the world, or ``only`` those with these names, with the rates in a
-        simulation's ``settings``.
-        """
-        made = [
-            forecast(world, rig, speed, settings)
-            for name, forecast in functions("forecast")
-            if only is None or name in only
-        ]
+        """The sensors of a rig with the names ``only`` that observe objects in the world, with the rates in a simulation's
+        ``settings``."""
+        made = [forecast(world, rig, speed, settings) for name, forecast in functions("forecast") if name in only]
         # those with goals first: the order affects the rounding of sums
         forecasts = sorted((f for f in made if f is not None), key=lambda f: not len(f.goals))
         return Sensors(odometry_model(rig, constants_as_noise=True), tuple(forecasts), speed / turn_rate)

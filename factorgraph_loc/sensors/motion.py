@@ -122,7 +122,7 @@ class Motion(OdometryChain):
 
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
         """Poses (R, 3) at times (R,) relative to the pose at ``start``, for ``constants`` (P,), linearised as in
-        :func:`factors.odometry.model.recalibrated`."""
+        :func:`factors.odometry.kernels.recalibrate`."""
         states = self.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:

@@ -108,14 +108,15 @@ def pooled_constants(
     return settings.model_copy(update=values | {"uncertainty": uncertainty}), out
 
 
-def possible_poses(trajectory: Trajectory, t: Array, max_gap: float) -> Array:
+def possible_poses(trajectory: Trajectory, t: Array) -> Array:
     """A pose (N, 3) at each time (N,) of a trajectory with covariances, drawn from the six cubature points of its distribution:
-    so means over many times are also means over what the trajectory leaves open. NaN outside and in gaps longer than ``max_gap``.
+    so means over many times are also means over what the trajectory leaves open. NaN outside and in gaps longer than
+    :data:`REFERENCE_GAP`.
 
     Cubature: Arasaratnam and Haykin, "Cubature Kalman filters", IEEE TAC 54(6), 2009. Always the same draws.
     """
-    poses = trajectory.at(t, max_gap=max_gap)
-    covariances = np.nan_to_num(trajectory.covariances_at(t, max_gap=max_gap)) + 1e-12 * np.eye(3)
+    poses = trajectory.at(t, max_gap=REFERENCE_GAP)
+    covariances = np.nan_to_num(trajectory.covariances_at(t, max_gap=REFERENCE_GAP)) + 1e-12 * np.eye(3)
     rng = np.random.default_rng(0)
     axis, sign = rng.integers(0, 3, len(t)), rng.choice((-1.0, 1.0), len(t))
     root = np.linalg.cholesky(covariances)[np.arange(len(t)), :, axis]

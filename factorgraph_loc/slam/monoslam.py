@@ -25,8 +25,7 @@ from factorgraph_loc.model.belief import Learnt, LearntPoint, PoseEstimate, Pose
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.model.setup import MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.camera.known_points import CAMERAS
-from factorgraph_loc.sensors.camera.measurement import Pixels
+from factorgraph_loc.sensors.camera.measurement import CAMERAS, Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.slam.monoslam_invariance import carried
 from factorgraph_loc.slam.monoslam_map import counted, pruned, settled, with_point

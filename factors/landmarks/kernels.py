@@ -123,12 +123,12 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
 
 @compiled
 def weigh(error: Array, jacobian: Array, robust: float) -> None:
-    """Multiply what :func:`linearize` found by the roots of the robust weights."""
+    """Multiply residuals (K, 2) and their Jacobian (K, 2, D) by the roots of the robust weights."""
     for k in range(len(error)):
         root = math.sqrt(geman_mcclure_weight(error[k, 0] ** 2 + error[k, 1] ** 2, robust))
         for i in range(2):
             error[k, i] *= root
-            for j in range(WIDTH):
+            for j in range(jacobian.shape[2]):
                 jacobian[k, i, j] *= root
 
 
@@ -139,13 +139,8 @@ def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit
     error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
     linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
     for k in range(count):
-        a, b, c = 1.0, 0.0, 1.0
-        for i in range(3):
-            for j in range(3):
-                a += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 0, j]
-                b += by_pose[k, 0, i] * covariance[i, j] * by_pose[k, 1, j]
-                c += by_pose[k, 1, i] * covariance[i, j] * by_pose[k, 1, j]
-        x, y = error[k, 0], error[k, 1]
+        a, b, c = _carried(by_pose[k], covariance)
+        a, c, x, y = 1.0 + a, 1.0 + c, error[k, 0], error[k, 1]
         # rounding may take all of the difference, which is never less than that
         determinant = max(a * c - b * b, 0.5 * (a + c))
         outliers += (c * x * x - 2.0 * b * x * y + a * y * y) / determinant > limit
@@ -252,17 +247,9 @@ def weighted(
     count, wide = len(packed[0]), len(indices)
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
     _linearized(model, packed, pose, values, indices, residual, jacobian)
-    out, by_pose, by_values = np.empty(2 * count), np.empty((2 * count, 3)), np.empty((2 * count, wide))
-    for k in range(count):
-        root = math.sqrt(geman_mcclure_weight(residual[k, 0] ** 2 + residual[k, 1] ** 2, model[ROBUST]))
-        for i in range(2):
-            row = 2 * k + i
-            out[row] = root * residual[k, i]
-            for j in range(3):
-                by_pose[row, j] = root * jacobian[k, i, j]
-            for j in range(wide):
-                by_values[row, j] = root * jacobian[k, i, 3 + j]
-    return out, by_pose, by_values
+    weigh(residual, jacobian, model[ROBUST])
+    by_all = jacobian.reshape(2 * count, 3 + wide)
+    return residual.reshape(2 * count), by_all[:, :3].copy(), by_all[:, 3:].copy()
 
 
 @compiled(error_model="numpy")

@@ -101,19 +101,9 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
 
 def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> BearingRangeModel:
     """The model with corrections (6,) of :data:`PARAMETERS`: relative for the range scale; the time offset is ignored."""
-    x, y, bearing_bias, range_scale, depth_axis, _ = parameters
-    m = model
-    return BearingRangeModel(
-        (m.mounting[0] + x, m.mounting[1] + y, m.mounting[2]),
-        m.range_scale * (1.0 + range_scale),
-        m.depth,
-        m.depth_axis + depth_axis,
-        m.range_sigma,
-        m.range_sigma_relative,
-        m.bearing_bias + bearing_bias,
-        m.bearing_sigma,
-        m.robust,
-    )
+    x, y, bearing_bias, range_scale, depth_axis = _constants(model, np.array(parameters)).tolist()
+    constants = {"bearing_bias": bearing_bias, "range_scale": range_scale, "depth_axis": depth_axis}
+    return replace(model, mounting=(x, y, model.mounting[2]), **constants)
 
 
 @lru_cache(maxsize=64)

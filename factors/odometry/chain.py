@@ -116,7 +116,14 @@ class OdometryChain:
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
         """Add rows (N,), in order of time and after all others; rows with equal timestamps are composed."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
-        self._extend(t[last], INCREMENT, se2.log(moves))
+        if not len(last):
+            return
+        self._reserve(len(last))
+        n, end = self._count, self._count + len(last)
+        self._rows[n:end, 0], self._rows[n:end, 1], self._rows[n:end, 2:] = t[last], INCREMENT, se2.log(moves)
+        integrate(self._rows, self._knots, n, end, self._constants)
+        count = without_old(self._rows, self._knots, end, self.horizon)
+        self._now_has(count, forgets=count < end)
 
     def state(self, t: float) -> ChainState:
         """The state of the chain at ``t``; before the first knot the motion is unknown and the pose constant. ValueError if the
@@ -234,25 +241,12 @@ class OdometryChain:
         self._now_has(count, forgets=count <= self._count)
         return True
 
-    def _extend(self, t: Array, kind: float, values: Array) -> None:
-        self._reserve(len(t))
-        n, end = self._count, self._count + len(t)
-        self._rows[n:end, 0], self._rows[n:end, 1], self._rows[n:end, 2:] = t, kind, values
-        self._count = end
-        integrate(self._rows, self._knots, n, end, self._constants)
-        if len(t):
-            self._forget()
-
     def _reserve(self, rows: int) -> None:
         capacity = len(self._rows)
         if self._count + rows > capacity:
             more = max(capacity, rows)
             self._rows = np.concatenate((self._rows, np.zeros((more, ROW))))
             self._knots = np.concatenate((self._knots, np.zeros((more, KNOT))))
-
-    def _forget(self) -> None:
-        count = without_old(self._rows, self._knots, self._count, self.horizon)
-        self._now_has(count, forgets=count < self._count)
 
     def _now_has(self, count: int, *, forgets: bool) -> None:
         self._count = count

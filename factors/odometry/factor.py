@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Hashable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,15 @@ from factors.odometry.kernels import NO_CONSTANTS, ROUNDING, all_changes, change
 from factors.se2 import Array, Integers, between_one, inverse_right_jacobian, twist_to
 
 
+class Steps(NamedTuple):
+    """K increments for compiled code: :attr:`OdometryFactor.packed` of each, stacked."""
+
+    deltas: Array
+    twists: Array
+    moving: Array
+    whiteners: Array
+
+
 class OdometryStack:
     """Increments ``factors``, each between the pose ``first`` (K,) by number and the next one. All have the same constants
     estimated, which are the parameters from ``column`` on."""
@@ -20,10 +30,8 @@ class OdometryStack:
     def __init__(self, factors: Sequence["OdometryFactor"], first: Sequence[int], column: int) -> None:
         self._first, self._column = np.array(first, dtype=np.int64), column
         self._indices = np.array(factors[0].estimated, dtype=np.int64)
-        packed = [f.packed for f in factors]
-        self._deltas, self._twists = np.array([p[0] for p in packed]), np.array([p[1] for p in packed])
-        self._moving, self._whiteners = np.array([p[2] for p in packed]), np.array([p[3] for p in packed])
-        self.rows = 3 * len(packed)
+        self._steps = Steps(*map(np.array, zip(*(f.packed for f in factors), strict=True)))
+        self.rows = 3 * len(factors)
 
     @property
     def first(self) -> Integers:
@@ -32,13 +40,12 @@ class OdometryStack:
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
         """Fill ``residual`` (3 K,) and ``jacobian`` (3 K, 6 + P), see :mod:`factors.chain`."""
-        given = self._deltas, self._twists, self._moving, self._constants(parameters), self._indices, self._whiteners
+        given = self._steps, self._constants(parameters), self._indices
         linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
 
     def cost(self, poses: Array, parameters: Array) -> float:
         """Half the sum of the squared residuals."""
-        given = self._deltas, self._twists, self._moving, self._constants(parameters), self._indices, self._whiteners
-        return float(cost_of_all(poses, self._first, *given))
+        return float(cost_of_all(poses, self._first, self._steps, self._constants(parameters), self._indices))
 
     def _constants(self, parameters: Array) -> Array:
         return np.ascontiguousarray(parameters[self._column : self._column + len(self._indices)])
@@ -181,18 +188,16 @@ def linearize_as_reported(
 def linearize_all(
     poses: Array,
     first: Integers,
-    deltas: Array,
-    twists: Array,
-    moving: Array,
+    steps: Steps,
     constants: Array,
     indices: Integers,
-    whiteners: Array,
     jacobian: Array,
     residual: Array,
     column: int,
 ) -> None:
     """Residuals (3 K,) of K increments and their Jacobian (3 K, 6 + P), see :mod:`factors.chain`, between the poses ``first`` (K,)
     and those that follow; ``column``: of the constants."""
+    deltas, twists, moving, whiteners = steps
     for k in range(len(first)):
         start, end, row = poses[first[k]], poses[first[k] + 1], 3 * k
         if len(indices):
@@ -212,20 +217,17 @@ def linearize_all(
 def cost_of_all(
     poses: Array,
     first: Integers,
-    deltas: Array,
-    twists: Array,
-    moving: Array,
+    steps: Steps,
     constants: Array,
     indices: Integers,
-    whiteners: Array,
 ) -> float:
     """Half the sum of the squared residuals of :func:`linearize_all`."""
     total = 0.0
     for k in range(len(first)):
-        delta = deltas[k]
+        delta = steps.deltas[k]
         if len(indices):
-            delta, _ = recalibrate(twists[k], moving[k], all_changes(constants, indices))
-        error, w = twist_to(delta, between_one(poses[first[k]], poses[first[k] + 1])), whiteners[k]
+            delta, _ = recalibrate(steps.twists[k], steps.moving[k], all_changes(constants, indices))
+        error, w = twist_to(delta, between_one(poses[first[k]], poses[first[k] + 1])), steps.whiteners[k]
         total += (w[0, 0] * error[0]) ** 2 + (w[1, 0] * error[0] + w[1, 1] * error[1]) ** 2
         total += (w[2, 0] * error[0] + w[2, 1] * error[1] + w[2, 2] * error[2]) ** 2
     return 0.5 * total

@@ -11,7 +11,7 @@ from factors.se2 import (
     arc_coefficients,
     exp_scalars,
     log_scalars,
-    right_jacobian_one,
+    right_jacobian,
     wrap_scalar,
 )
 
@@ -164,8 +164,7 @@ def _widen(covariance: Array) -> None:
 
 @compiled
 def recalibrated(delta: Array, moving: float, constants: Array, indices: Integers) -> Array:
-    """``delta`` (3,) of :func:`factors.odometry.model.recalibrated`, for corrections ``constants`` (P,) with ``indices`` (P,) among
-    all constants."""
+    """The increment ``delta`` (3,) as :func:`recalibrate` corrects it for ``constants`` (P,) with ``indices`` (P,) among all."""
     changes = all_changes(constants, indices)
     x, y, phi = log_scalars(delta[0], delta[1], delta[2])
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
@@ -174,13 +173,17 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
 
 @compiled
 def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
-    """See :func:`factors.odometry.model.recalibrated`; ``twist`` (3,): log of the increment, ``moving``: its time in motion."""
+    """An increment with corrected constants, as one arc, which is exact at constant curvature; and its Jacobian (3, 4).
+
+    ``twist`` (3,): log of the increment; ``moving`` [s]: its time in motion. ``changes`` (4,): relative changes of the scales of
+    distance and rotation, additional heading-rate bias [rad/s] in motion, additional heading drift [rad/m].
+    """
     x, y, phi = twist[0], twist[1], twist[2]
     distance = math.hypot(x, y)
     cx, cy = x + changes[0] * x, y + changes[0] * y
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * distance
     p, q = arc_coefficients(turn)
-    jacobian = right_jacobian_one(np.array((cx, cy, turn)))
+    jacobian = right_jacobian(np.array((cx, cy, turn)))
     by_changes = np.zeros((3, 4))
     for i in range(3):
         by_changes[i, 0] = jacobian[i, 0] * x + jacobian[i, 1] * y

@@ -20,7 +20,6 @@ from factors.motion import ChainState, Increment
 from factors.odometry.kernels import (
     SHORTEST,
     Noise,
-    recalibrate,
     relative,
 )
 from factors.se2 import Array
@@ -50,10 +49,6 @@ class Growth:
             math.hypot(self.per_rotation, per_rotation),
             math.hypot(self.per_time, per_time),
         )
-
-    def variance(self, distance: float, rotation: float, duration: float) -> float:
-        """The variance after ``distance`` metres, ``rotation`` radians (both unsigned) and ``duration`` seconds."""
-        return self.per_distance**2 * distance + self.per_rotation**2 * rotation + self.per_time**2 * duration
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,26 +114,8 @@ def slip(model: OdometryModel, increment: Increment, *, use_gyro: bool) -> tuple
     return covariance, -math.log(-math.expm1(-SLIPS * duration))
 
 
-# the constants that recalibrated() changes
+# the constants that an increment can be corrected for: see `factors.odometry.kernels.recalibrate`
 PARAMETERS = ("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift")
-
-
-def recalibrated(increment: Increment, parameters: Array) -> tuple[Array, Array]:
-    """The increment with corrected constants, and its Jacobian.
-
-    ``parameters`` (..., 4): relative change of the distance scale, relative change of the rotation scale, additional heading-rate
-    bias [rad/s] in motion, additional heading drift [rad/m]. Returns ``delta`` (..., 3) and the Jacobian (..., 3, 4) of its
-    body-frame perturbation. The increment is treated as one arc, which is exact at constant curvature.
-    """
-    arc = se2.log(increment.delta)
-    parameters = np.asarray(parameters, dtype=float)
-    if parameters.ndim == 1:
-        delta, jacobian = recalibrate(arc, increment.moving, parameters)
-        return delta, jacobian
-    x, y, phi = arc.tolist()
-    by_parameter = np.array([[x, 0.0, 0.0, 0.0], [y, 0.0, 0.0, 0.0], [0.0, phi, -increment.moving, math.hypot(x, y)]])
-    changed = arc + parameters @ by_parameter.T
-    return se2.exp(changed), se2.right_jacobian(changed) @ by_parameter
 
 
 def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int64], Array]:

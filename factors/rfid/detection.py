@@ -46,7 +46,7 @@ class TagReadCounts:
 
     ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``twists`` (K, 3): its
     velocity [m/s, rad/s] there, 0 by default; ``antennas`` (K,): indices in the model; ``rounds`` (K,): inventory rounds.
-    ``tags`` (C,): places in the map, ascending, of the tags that are listed; None, the default, if all of the map are.
+    ``tags`` (C,): places in the map, ascending, of the tags that are listed; by default all of the map.
     ``hits`` (K, C): number of rounds that read each of them; the others were not read.
     ``odds`` (C,): prior log-odds that each is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as
     surveyed, the default; ``unlisted_odds``: those of the other tags. ``elsewhere`` (C,): tempered log-likelihood of a tag's reads
@@ -59,11 +59,13 @@ class TagReadCounts:
     hits: NDArray[np.int64]
     odds: Array = field(default_factory=lambda: np.empty(0))
     elsewhere: Array = field(default_factory=lambda: np.empty(0))
-    tags: Integers | None = None
+    tags: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     unlisted_odds: float = -np.inf
     twists: Array = field(default_factory=lambda: np.empty((0, 3)))
 
     def __post_init__(self) -> None:
+        if not len(self.tags):
+            object.__setattr__(self, "tags", np.arange(self.hits.shape[1]))
         if not len(self.odds):
             object.__setattr__(self, "odds", np.full(self.hits.shape[1], -np.inf))
         if not len(self.elsewhere):
@@ -75,25 +77,20 @@ class TagReadCounts:
     def packed(self) -> Counts:
         """The counts for compiled code."""
         counts = self.offsets, self.antennas, self.rounds, self.hits
-        return (*counts, self.odds, self.elsewhere, self.listed, self.unlisted_odds, self.twists)
-
-    @cached_property
-    def listed(self) -> Integers:
-        """Places (C,) in the map of the tags that are listed."""
-        return np.arange(self.hits.shape[1]) if self.tags is None else self.tags
+        return (*counts, self.odds, self.elsewhere, self.tags, self.unlisted_odds, self.twists)
 
     @property
     def read_tags(self) -> Integers:
         """Places in the map of the tags that were read, ascending."""
-        return np.asarray(self.listed[self.hits.any(axis=0)])
+        return np.asarray(self.tags[self.hits.any(axis=0)])
 
     def with_states(self, tags: Integers, odds: Array, elsewhere: Array) -> TagReadCounts:
         """The counts with ``tags`` (U,) listed too, which have these ``odds`` (U,) and ``elsewhere`` (U,)."""
-        both = np.union1d(self.listed, tags)
+        both = np.union1d(self.tags, tags)
         hits = np.zeros((len(self.hits), len(both)), dtype=np.int64)
         all_odds, all_elsewhere = np.full(len(both), self.unlisted_odds), np.zeros(len(both))
-        rows = (self.listed, self.odds, self.elsewhere), (tags, odds, elsewhere)
-        hits[:, np.searchsorted(both, self.listed)] = self.hits
+        rows = (self.tags, self.odds, self.elsewhere), (tags, odds, elsewhere)
+        hits[:, np.searchsorted(both, self.tags)] = self.hits
         for chosen, own_odds, own_elsewhere in rows:
             at = np.searchsorted(both, chosen)
             all_odds[at], all_elsewhere[at] = own_odds, own_elsewhere
@@ -110,19 +107,18 @@ def merged(parts: list[TagReadCounts]) -> TagReadCounts:
     first = parts[0]
     if len(parts) == 1:
         return first
-    tags = first.listed if first.tags is None else np.unique(np.concatenate([p.listed for p in parts]))
+    tags = np.unique(np.concatenate([p.tags for p in parts]))
     odds, elsewhere, hits = np.full(len(tags), first.unlisted_odds), np.zeros(len(tags)), []
     for part in reversed(parts):
-        at, own = np.searchsorted(tags, part.listed), np.zeros((len(part.hits), len(tags)), dtype=np.int64)
+        at, own = np.searchsorted(tags, part.tags), np.zeros((len(part.hits), len(tags)), dtype=np.int64)
         own[:, at] = part.hits
         odds[at] = part.odds
         elsewhere[at] += part.elsewhere
         hits.append(own)
     rows = zip(*[(p.offsets, p.antennas, p.rounds, p.twists) for p in parts], strict=True)
     offsets, antennas, rounds, twists = map(np.concatenate, rows)
-    listed = None if first.tags is None else tags
     counts = offsets, antennas, rounds, np.concatenate(hits[::-1])
-    return TagReadCounts(*counts, odds, elsewhere, listed, first.unlisted_odds, twists)
+    return TagReadCounts(*counts, odds, elsewhere, tags, first.unlisted_odds, twists)
 
 
 class Score(NamedTuple):

@@ -94,11 +94,6 @@ class RfidFactor:
             return self.likelihood.work(self.reads)
         return len(self.reads.antennas)
 
-    @property
-    def is_phase(self) -> bool:
-        """Whether it is a phase likelihood, which has many local optima, centimetres apart."""
-        return isinstance(self.likelihood, PhaseLikelihood)
-
     def fixed(self, values: Array) -> RfidFactor:
         """The same on the pose alone, with the ``values`` (P,) of what is estimated."""
         if not isinstance(self.likelihood, RfidLikelihood):

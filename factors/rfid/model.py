@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.compiled import compiled
+from factors.rfid.knots import cubic_weights
 from factors.se2 import Array
 
 BEAM, LOGISTIC, GRID = 0, 1, 2
@@ -326,19 +327,8 @@ def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, 
 
 
 @compiled
-def _cubic(f: float) -> tuple[float, float, float, float]:
-    """Weights of four knots for a position ``f`` in [0, 1] between the middle ones."""
-    return (
-        ((-0.5 * f + 1.0) * f - 0.5) * f,
-        (1.5 * f - 2.5) * f * f + 1.0,
-        ((-1.5 * f + 2.0) * f + 0.5) * f,
-        (0.5 * f - 0.5) * f * f,
-    )
-
-
-@compiled
 def _slope(f: float) -> tuple[float, float, float, float]:
-    """Derivatives of the weights of :func:`_cubic`."""
+    """Derivatives of the :func:`cubic_weights`."""
     return (
         (-1.5 * f + 2.0) * f - 0.5,
         (4.5 * f - 5.0) * f,
@@ -368,7 +358,8 @@ def _grid(
     j, fy, in_y = _place((y - y0) / cell, ny)
     k, fc, in_c = _place((c + 1.0) / 2.0 * (nf - 1), nf)
     m, fz, in_z = _place((z - z0) / dz, nh)
-    wx, dx, wy, dy, wc, dc = _cubic(fx), _slope(fx), _cubic(fy), _slope(fy), _cubic(fc), _slope(fc)
+    wx, wy, wc = cubic_weights(fx), cubic_weights(fy), cubic_weights(fc)
+    dx, dy, dc = _slope(fx), _slope(fy), _slope(fc)
     value = by_x = by_y = by_z = by_c = 0.0
     for a in range(2 if nh > 1 else 1):
         w_z = 1.0

@@ -10,7 +10,7 @@ from factorgraph_loc.api.running import run_and_learn
 from factorgraph_loc.calibration import report
 from factorgraph_loc.calibration.calibrate import calibrate, check
 from factorgraph_loc.calibration.held_out import growth
-from factorgraph_loc.calibration.turns import learn_by_turns
+from factorgraph_loc.calibration.learn import learn_by_turns
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run

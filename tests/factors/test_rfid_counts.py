@@ -41,7 +41,7 @@ def displaced(likelihood, poses, looks):
 def test_few_tags_are_looked_at():
     likelihood, _, some = scene()
     near = likelihood.expected(POSE, some, likelihood.parameters).tags
-    assert len(some.listed) < len(near) < 200
+    assert len(some.tags) < len(near) < 200
     reachable = displaced(likelihood, POSE[None], some)[0]
     assert 10 < len(reachable) < 150
 
@@ -102,13 +102,13 @@ def test_what_scans_tell_of_tags_is_the_same():
 def test_merged_counts_list_what_any_of_them_lists():
     _, whole, some = scene(0)
     _, other, fewer = scene(1)
-    fewer = replace(fewer, odds=np.full(len(fewer.listed), 3.0))
+    fewer = replace(fewer, odds=np.full(len(fewer.tags), 3.0))
     whole_of_two, of_two = merged([whole, other]), merged([some, fewer])
-    assert set(of_two.listed) == set(some.listed) | set(fewer.listed)
-    at = np.searchsorted(of_two.listed, some.listed)
+    assert set(of_two.tags) == set(some.tags) | set(fewer.tags)
+    at = np.searchsorted(of_two.tags, some.tags)
     assert np.array_equal(of_two.odds[at], some.odds)
-    assert np.array_equal(of_two.hits, whole_of_two.hits[:, of_two.listed])
-    assert of_two.elsewhere == pytest.approx(whole_of_two.elsewhere[of_two.listed])
+    assert np.array_equal(of_two.hits, whole_of_two.hits[:, of_two.tags])
+    assert of_two.elsewhere == pytest.approx(whole_of_two.elsewhere[of_two.tags])
     assert set(of_two.read_tags) == set(np.flatnonzero(whole_of_two.hits.any(axis=0)))
 
 

@@ -48,7 +48,7 @@ def test_arrays_give_what_single_poses_give(pairs):
     a, b = np.array([p for p, _ in pairs]), np.array([q for _, q in pairs])
     for function in (se2.compose, se2.between):
         np.testing.assert_allclose(function(a, b), [function(p, q) for p, q in pairs], atol=1e-9)
-    for function in (se2.inverse, se2.exp, se2.log, se2.right_jacobian):
+    for function in (se2.inverse, se2.exp, se2.log, se2.adjoint):
         np.testing.assert_allclose(function(a), [function(p) for p, _ in pairs], atol=1e-9)
 
 
@@ -118,8 +118,6 @@ def test_moments():
 
 def test_single_poses():
     for pose, other, twist in zip(MANY, MANY[::-1], WAYS, strict=True):
-        np.testing.assert_allclose(se2.adjoint_one(pose), se2.adjoint(pose), atol=1e-12)
-        np.testing.assert_allclose(se2.right_jacobian_one(twist), se2.right_jacobian(twist), atol=1e-12)
         inverse = se2.inverse_right_jacobian(twist)
         np.testing.assert_allclose(inverse @ se2.right_jacobian(twist), np.eye(3), atol=1e-9)
         same_poses(se2.compose_one(pose, other)[None], se2.compose(pose, other)[None])

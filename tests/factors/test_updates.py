@@ -6,6 +6,7 @@ from dataclasses import replace
 import mounted_camera
 import numpy as np
 import pytest
+from drives import variance
 from scipy import optimize
 
 from factorgraph_loc.sensors.base import ResidualObservation, Term
@@ -24,7 +25,6 @@ from factors.odometry.model import (
     MINIMUM_POSITION_VARIANCE,
     Growth,
     OdometryModel,
-    recalibrated,
     relative_motion,
 )
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
@@ -212,11 +212,11 @@ def test_relative_motion(start, end):
     delta = se2.between(np.array(start[1:4]), np.array(end[1:4]))
     way = abs(end.path - start.path), abs(end.turn - start.turn), abs(end.t - start.t)
     unknown = max(0.0, end.unknown - start.unknown)
-    along, lateral = (g.variance(*way) + MODEL.unknown_distance**2 * unknown for g in (MODEL.along, MODEL.lateral))
+    along, lateral = (variance(g, *way) + MODEL.unknown_distance**2 * unknown for g in (MODEL.along, MODEL.lateral))
     along += (
         unknown * (way[0] / max(way[2], 1e-6)) ** 2 / 12.0
     )  # a share of the way that is uniform over a width of one
-    heading = MODEL.heading.variance(*way) + MODEL.unknown_rotation**2 * unknown
+    heading = variance(MODEL.heading, *way) + MODEL.unknown_rotation**2 * unknown
     travel = MODEL.direction - delta[2] / 2.0
     turn = np.array(((math.cos(travel), -math.sin(travel)), (math.sin(travel), math.cos(travel))))
     # the heading's walk displaces the end across the chord, as seen from the end
@@ -234,8 +234,9 @@ def test_relative_motion(start, end):
 
 def test_an_increment_alone_is_recalibrated_as_with_its_jacobian(rng):
     increment, changes = relative_motion(MODEL, START, END), 0.1 * rng.standard_normal(4)
-    alone = odometry_kernels.recalibrated(increment.delta, increment.duration, changes, np.arange(4))
-    np.testing.assert_allclose(alone, recalibrated(increment, changes)[0], atol=1e-12)
+    alone = odometry_kernels.recalibrated(increment.delta, increment.moving, changes, np.arange(4))
+    delta, _ = odometry_kernels.recalibrate(se2.log(increment.delta), increment.moving, changes)
+    np.testing.assert_allclose(alone, delta, atol=1e-12)
 
 
 CAMERA = replace(mounted_camera.MODEL, sigma=1.3, tempering=0.6)

@@ -131,7 +131,7 @@ def test_a_state_of_many_points_is_bounded():
 
 
 def test_tags_are_trusted_by_their_survey():
-    assert trust(np.zeros(3), 0.1) == 1.0
-    assert trust(np.full(3, 0.019), 0.1) == 1.0
-    assert trust(np.full(3, 0.1), 0.1) == pytest.approx(0.5)
-    assert trust(np.array((0.0, 0.1)), 0.1) == pytest.approx(0.75)
+    assert trust(np.zeros(3)) == 1.0
+    assert trust(np.full(3, 0.019)) == 1.0
+    assert trust(np.full(3, 0.1)) == pytest.approx(0.5)
+    assert trust(np.array((0.0, 0.1))) == pytest.approx(0.75)

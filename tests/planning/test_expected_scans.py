@@ -11,6 +11,8 @@ from factorgraph_loc import Landmark, Rig, Tag, World
 from factorgraph_loc.planning import particle_kernels
 from factorgraph_loc.planning.information import (
     FINEST,
+    METRES_PER_RADIAN,
+    SPEED,
     Sensors,
     expected_covariance,
     expected_gain,
@@ -21,6 +23,7 @@ from factorgraph_loc.planning.paths import Path, primitives
 from factorgraph_loc.sensors.landmarks.measurement import SightingSettings
 from factorgraph_loc.sensors.landmarks.simulation import LandmarkForecast
 from factorgraph_loc.sensors.rfid import forecast as expected_scans
+from factorgraph_loc.simulation import preset
 from factorgraph_loc.simulation.settings import RACKHAM_RIG
 from factors import se2
 from factors.landmarks import model as bearing_range
@@ -151,12 +154,19 @@ def test_noise_on_the_way_adds_up_as_small_motions_do():
 
 RIG = Rig.model_validate(RACKHAM_RIG)
 MEAN = np.array((1.0, 2.0, 0.7))
-NOTHING = Sensors.of(World(), RIG)
+
+
+def sensors_of(world):
+    settings, turn_rate = preset("office"), SPEED / METRES_PER_RADIAN
+    return Sensors.of(world, RIG, settings, SPEED, turn_rate, ("rfid", "landmarks"))
+
+
+NOTHING = sensors_of(World())
 
 
 def forecast_of(*points, walls=()):
     world = World(landmarks={f"L{i}": Landmark(x=x, y=y) for i, (x, y) in enumerate(points)}, walls=walls)
-    (only,) = Sensors.of(world, RIG).forecasts
+    (only,) = sensors_of(world).forecasts
     return only
 
 
@@ -271,7 +281,7 @@ def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow():
     """As narrow as the sensors are nearly linear, with tags at the end of their reach. What the Monte-Carlo gain does not count, as
     too fine, is added to the closed covariances too. The order of the paths is the same."""
     world, paths = tagged((4.8, 3.0), (-1.5, 5.5)), [p for p in primitives(1.5) if p.length > 1.4][::5]
-    sensors = replace(Sensors.of(world, RIG), odometry=NOISE)
+    sensors = replace(sensors_of(world), odometry=NOISE)
     covariance = np.diag((0.3**2, 0.3**2, 0.15**2))
     rng = np.random.default_rng(0)
     particles = rng.multivariate_normal(MEAN, covariance, 2000)
@@ -287,7 +297,7 @@ def test_it_agrees_with_the_monte_carlo_gain_where_the_belief_is_narrow():
 
 
 def test_the_gain_is_the_fall_of_entropy():
-    sensors = Sensors.of(tagged((4.8, 3.0), (-1.5, 5.5)), RIG)
+    sensors = sensors_of(tagged((4.8, 3.0), (-1.5, 5.5)))
     (gain,) = fisher_gain(MEAN, COVARIANCE, [STRAIGHT], sensors)
     after = expected_covariance(MEAN, COVARIANCE, STRAIGHT, sensors)
     # of what is not finer than counts
@@ -298,7 +308,7 @@ def test_the_gain_is_the_fall_of_entropy():
 
 
 def test_only_sensors_that_find_something_are_taken():
-    nothing = Sensors.of(World(), RIG)
+    nothing = sensors_of(World())
     assert nothing.forecasts == ()
     (gain,) = fisher_gain(MEAN, COVARIANCE, [STRAIGHT], nothing)
     assert gain < 0.0

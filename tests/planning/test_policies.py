@@ -11,7 +11,9 @@ from factorgraph_loc import Rig, World
 from factorgraph_loc.maps.free_space import free_space
 from factorgraph_loc.model.belief import Mode
 from factorgraph_loc.planning.information import (
+    METRES_PER_RADIAN,
     POSITION,
+    SPEED,
     Sensors,
     expected_gain,
     gaussian_entropy,
@@ -147,7 +149,7 @@ def test_a_far_tag_that_both_places_would_read_alike_tells_nothing():
 def test_they_go_where_landmarks_are():
     """Without a tag: two landmarks to the left, 9 m away, that are seen from 6 m."""
     world = World(landmarks={"A": {"x": 19.0, "y": 29.0}, "B": {"x": 21.0, "y": 29.0}})
-    sensors = Sensors.of(world, RIG)
+    sensors = Sensors.of(world, RIG, preset("office"), SPEED, SPEED / METRES_PER_RADIAN, ("landmarks",))
     choice = policy("information")(replace(situation(), sensors=sensors))
     assert abs(direction(choice) - math.pi / 2.0) < 0.8
 

@@ -19,10 +19,15 @@ def driven(steps, start=(0.0, 0.0, 0.0)):
     return np.array(poses)
 
 
+def variance(growth, distance, rotation, duration):
+    """The variance that an error grows to over a distance [m], a rotation [rad] and a duration [s]."""
+    return growth.per_distance**2 * distance + growth.per_rotation**2 * rotation + growth.per_time**2 * duration
+
+
 def slipped(v, w, seconds, noise, rng):
     """The moves (N, 3) of a robot that slips off what its wheels report, v [m/s] and w [rad/s] for ``seconds`` each."""
     growth = [g.model() for g in (noise.along, noise.lateral, noise.heading)]
     ways, turns = np.abs(v) * seconds, np.abs(w) * seconds
-    variance = [[g.variance(way, turn, seconds) for g in growth] for way, turn in zip(ways, turns, strict=True)]
-    off = rng.standard_normal((len(v), 3)) * np.sqrt(variance)
+    variances = [[variance(g, way, turn, seconds) for g in growth] for way, turn in zip(ways, turns, strict=True)]
+    off = rng.standard_normal((len(v), 3)) * np.sqrt(variances)
     return se2.compose(se2.exp(np.column_stack((v, 0.0 * v, w)) * seconds), se2.exp(off))

@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -102,17 +102,16 @@ def _features(
 ) -> list[_ImageFile]:
     """The features of N images, from the cache if possible."""
     about = f"{settings.model_dump_json()} {size} {code_version(FEATURE_CODE)} "
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading and hashing release the interpreter lock
-        images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
-    wanted = {image.key: image.file for image in images if image.found is None and not image.fault}
     new: dict[str, _ImageFile] = {}
-    if wanted:
-        progress(0.0)
-        for key, answer in zip(wanted, _computed(list(wanted.values()), settings, size), strict=True):
-            new[key] = answer if isinstance(answer, _ImageFile) else _ImageFile(wanted[key], key, decode(answer))
-            if isinstance(answer, bytes):
-                kept.write(key, answer)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading, hashing and detection release the interpreter lock
+        images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
+        wanted = {image.key: image.file for image in images if image.found is None and not image.fault}
+        if wanted:
+            progress(0.0)
+        for image in pool.map(lambda key: _find(wanted[key], key, settings, size, kept), wanted):
+            new[image.key] = image
             progress(len(new) / len(wanted))
+    if wanted:
         kept.trim()
     return [replace(new[image.key], file=image.file) if image.key in new else image for image in images]
 
@@ -127,22 +126,19 @@ def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
     return _ImageFile(file, key, None if stored is None else decode(stored))
 
 
-def _computed(files: list[Path], settings: FrontendSettings, size: Size) -> Iterator[bytes | _ImageFile]:
-    """The features of each file as bytes, or its fault, in the order of the files."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        yield from pool.map(lambda file: _find(file, settings, size), files)
-
-
-def _find(file: Path, settings: FrontendSettings, size: Size) -> bytes | _ImageFile:
+def _find(file: Path, key: str, settings: FrontendSettings, size: Size, kept: FeatureCache) -> _ImageFile:
+    """The features of an image, which are also written to the cache, or its fault."""
     try:
         image = read_image(file)
     except InputError as error:
-        return _ImageFile(file, fault=str(error))
+        return _ImageFile(file, key, fault=str(error))
     height, width = image.shape[:2]
     if (width, height) != size:
         fault = f"{file}: has {width} x {height} px, expected {size[0]} x {size[1]}"
-        return _ImageFile(file, fault=fault, other_size=(width, height))
-    return encode(*_extractor(settings).detectAndCompute(image))
+        return _ImageFile(file, key, fault=fault, other_size=(width, height))
+    content = encode(*_extractor(settings).detectAndCompute(image))
+    kept.write(key, content)
+    return _ImageFile(file, key, decode(content))
 
 
 _thread = threading.local()

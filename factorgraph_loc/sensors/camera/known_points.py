@@ -30,13 +30,13 @@ from factors.motion import Increment, propagate
 from factors.se2 import Array
 
 DISAGREES = "camera: does not agree with the others"  # reason of a rejection
-CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
 FEW_SHARE = 0.3  # of named points: with fewer inliers, points are missing
 FEW, MANY = 6, 20  # of matched points: fewer than FEW inliers where MANY are expected means that points are missing
 UNSURE = 1.0  # m: a prediction with a larger standard deviation may miss the map
 MOST = 100  # points used per image; more add little, as errors of neighbouring points are correlated
 STEEPEST = 0.06  # rad: what tilts by more is no robot on a floor, or its camera is not mounted as the rig says
-NEAR = 3.0  # m: from where `exact_survey` compares the survey of a point with a pixel
+# the survey of a named point is exact if its sigma is below this share of what `pixel_sigma` is at so many metres
+EXACT_SURVEY, NEAR = 0.2, 3.0
 EXACT = 0.1  # a map is treated as exact if its errors are below this share of a pixel's, seen from 1 m
 # Pixels are so precise that one step from a poor prediction does not reach the optimum
 ITERATIONS, SETTLED = 8, 1e-3  # m, rad: convergence limit of a step
@@ -98,7 +98,7 @@ class KnownPoints:
             worst = float(variances.max())
             pixel = settings.pixel_sigma / settings.fx
             self._map_matters = worst > (EXACT * pixel) ** 2
-            self._inexact = variances > 3.0 * (settings.exact_survey * NEAR * pixel) ** 2
+            self._inexact = variances > 3.0 * (EXACT_SURVEY * NEAR * pixel) ** 2
 
     @property
     def needs_twist(self) -> bool:

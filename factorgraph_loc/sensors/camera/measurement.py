@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from factorgraph_loc.files.tables import TableRows
 
 
+CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
+
+
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
     """Named points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down."""

@@ -18,8 +18,8 @@ from factorgraph_loc.model.belief import Mode, PosePrior
 from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.sensors.base import Binding, Blocks, Columns, NewVariable, ResidualObservation, Sensor, Term, View
-from factorgraph_loc.sensors.camera.known_points import CAMERAS, ITERATIONS, SETTLED, KnownPoints, Predicted
-from factorgraph_loc.sensors.camera.measurement import Pixels
+from factorgraph_loc.sensors.camera.known_points import ITERATIONS, SETTLED, KnownPoints, Predicted
+from factorgraph_loc.sensors.camera.measurement import CAMERAS, Pixels
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc.files.models import FileModel, InUnit
 from factorgraph_loc.maps.points import CommonError, Feature
-from factorgraph_loc.model.settings import Angle, Hertz, Metres, Offset, SensorSettings, Share
+from factorgraph_loc.model.settings import Angle, Hertz, Offset, SensorSettings, Share
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
@@ -103,8 +103,6 @@ class CameraSettings(SensorSettings):
     """scale of Huber's loss, in standard deviations"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.03
     """exponent of the likelihood of features matched with a map, whose errors are correlated between images"""
-    exact_survey: Annotated[float, Field(ge=0.0, le=10.0)] = 0.2
-    """named points whose survey has a sigma below this share of what pixel_sigma is at 3 m are not estimated"""
     frontend: FrontendSettings = FrontendSettings()
     """features that are detected in images"""
     uncertainty: CameraUncertainty = CameraUncertainty()
@@ -162,7 +160,5 @@ class PixelSettings(FileModel):
     """observations per second"""
     max_points: Annotated[int, Field(ge=1, le=10_000)] = 20
     """most points per image, chosen at random among the visible ones"""
-    max_depth: Metres = 10.0
-    """largest distance ahead of visible points"""
     wrong: Share = 0.0
     """share of points that are reported at a random pixel"""

@@ -15,7 +15,7 @@ from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
-NEAR = 0.3  # m of depth below which no point is detected
+NEAR, FAR = 0.3, 10.0  # m of depth within which points are detected
 OBLIQUE = math.radians(75.0)  # angle to a surface's normal above which nothing on it is detected
 
 
@@ -50,7 +50,7 @@ def pixel_stream(
         uv, depth = reprojection.predict(model, pose, positions)
         rays = cameras[i] - positions
         front = (rays[:, :2] * normals).sum(axis=1) >= math.cos(OBLIQUE) * np.linalg.norm(rays, axis=1)
-        k = np.flatnonzero(front & (depth >= NEAR) & (depth <= settings.max_depth) & model.contains(uv))
+        k = np.flatnonzero(front & (depth >= NEAR) & (depth <= FAR) & model.contains(uv))
         rows.append(np.full(len(k), i))
         columns.append(k)
         pixels.append(uv[k])

@@ -16,7 +16,7 @@ from factorgraph_loc.model.measurement import TURN, Measurement
 from factorgraph_loc.model.measurement import named as name_of
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.camera.measurement import CameraImage, FeatureStream, ImageStream
+from factorgraph_loc.sensors.camera.measurement import CAMERAS, CameraImage, FeatureStream, ImageStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings, FrontendSettings
 from factorgraph_loc.sensors.interfaces import Ending, Review, Use
 from factorgraph_loc.sensors.registry import moving
@@ -29,15 +29,12 @@ if TYPE_CHECKING:
     from factorgraph_loc.sensors.camera.frontend import LiveFrontend
 
 
-NAMES = ("camera", "sightings")
-
-
 def check(use: Use) -> Use:
     """The run, with points estimated where the map has none and no other sensor needs a map, unless the user's settings say what is
     done."""
     motion = moving(use.sensors, TURN)
     unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use)
-    if "landmarks" in use.given or not unmapped or any(name not in (*NAMES, *motion) for name in use.sensors):
+    if "landmarks" in use.given or not unmapped or any(name not in (*CAMERAS, *motion) for name in use.sensors):
         return use
     settings = use.settings.model_copy(update={"landmarks": "unknown"})
     sentence = "{log}: the map has nothing that the camera could find: it is estimated ({estimator}.landmarks=unknown)"
@@ -64,7 +61,7 @@ def _doubts(use: Use) -> Iterator[Notice]:
 
 
 def _uses_camera(use: Use) -> bool:
-    return "camera" in use.modalities and any(name in use.sensors for name in NAMES)
+    return "camera" in use.modalities and any(name in use.sensors for name in CAMERAS)
 
 
 def _has_points(use: Use) -> bool:

@@ -125,8 +125,6 @@ class BearingRangeSettings(SensorSettings):
     """standard deviation of a bearing"""
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
     """scale of the Geman-McClure loss, in standard deviations"""
-    exact_survey: Annotated[float, Field(ge=0.0, le=10.0)] = 0.2
-    """landmarks whose survey has a sigma below this share of range_sigma are exact, others are estimated"""
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
     """standard deviations of constants; those above 0 are estimated"""
 
@@ -184,17 +182,13 @@ LANDMARKS = Table(
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """The landmarks of a world file: inline, or in a foreign table with a mapping."""
+    """The landmarks of a world file: inline, or in a foreign table with a mapping to the fields landmark, x, y and optionally
+    sigma, or sigma_x and sigma_y; the larger one is used. InputError names file, row and field of an invalid value, or of a
+    duplicate name."""
     if not isinstance(content, dict) or not isinstance(content.get("file"), str):
         return content
-    mapping = parse_model(ColumnMapping, content, f"{source} [landmarks]")
-    return read_landmarks(inside(folder, mapping.file, source), mapping)
-
-
-def read_landmarks(path: Path, mapping: ColumnMapping) -> dict[str, Landmark]:
-    """Read a foreign table with the fields landmark, x, y and optionally sigma, or sigma_x and sigma_y; the larger one is
-    used. InputError names file, row and field of an invalid value, or of a duplicate name."""
-    position = ("landmark", "x", "y")
+    mapping, position = parse_model(ColumnMapping, content, f"{source} [landmarks]"), ("landmark", "x", "y")
+    path = inside(folder, mapping.file, source)
     cells = read_mapped(path, mapping, (position, (*position, "sigma"), (*position, "sigma_x", "sigma_y")))
     if "sigma_x" in cells.columns:
         larger = np.fmax(*(cells.numbers(name, LANDMARKS[name]) for name in ("sigma_x", "sigma_y")))

@@ -27,6 +27,7 @@ from factors.se2 import Array
 from factors.update import GATE, Correction
 
 NamedFactor = tuple[str, BearingRangeFactor]
+EXACT = 0.2  # landmarks whose survey has a sigma below this share of `range_sigma` are exact
 
 
 class KnownLandmarks:
@@ -50,7 +51,7 @@ class KnownLandmarks:
         self._model = settings.model()
         landmarks = {} if use == "unknown" else world.landmarks
         self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
-        limit = 2.0 * (settings.exact_survey * settings.range_sigma) ** 2
+        limit = 2.0 * (EXACT * settings.range_sigma) ** 2
         surveys = {name: m.spread() for name, m in landmarks.items()}
         self._surveys = {name: survey for name, survey in surveys.items() if np.trace(survey) > limit}
         self._carries = carries

@@ -148,12 +148,12 @@ class LandmarkForecast:
             _add(ranges, bearings, measured, sigmas, j, k, out)
 
 
-def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> LandmarkForecast | None:
+def forecast(world: World, rig: Rig, speed: float, settings: Any) -> LandmarkForecast | None:
     """The forecast for a robot with ``speed`` [m/s], with the settings of a simulation; None without a landmark sensor or
     landmarks."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
-    sightings = SightingSettings() if settings is None else settings.sightings
+    sightings = settings.sightings
     return LandmarkForecast(world, rig.of(BearingRangeSettings).model(), sightings.rate / speed, sightings)
 
 

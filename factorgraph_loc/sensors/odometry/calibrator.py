@@ -29,13 +29,11 @@ from factorgraph_loc.sensors.odometry.settings import (
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, Traced
 from factorgraph_loc.text import Notice, notice
 from factors import chi_squared, se2
-from factors.motion import ChainState
 from factors.odometry.model import (
     MINIMUM_HEADING_VARIANCE,
     MINIMUM_POSITION_VARIANCE,
     Growth,
     OdometryModel,
-    relative_motion,
 )
 from factors.se2 import Array
 
@@ -93,10 +91,8 @@ class Windows:
 
     def covariances(self, model: OdometryModel) -> Array:
         """The model's covariances (M, 3, 3) of the residuals."""
-        start, end = self.states(model)
-        pairs = zip(start.tolist(), end.tolist(), strict=True)
-        covariances = [relative_motion(model, ChainState(*a), ChainState(*b)).covariance for a, b in pairs]
-        return np.array(covariances).reshape(-1, 3, 3)
+        chain, no_constants = integrated(self.log, model), np.zeros(0)
+        return chain.relatives(chain.states(self.begin), chain.states(self.end), no_constants)[1]
 
 
 def cut(log: Log, length: float) -> Windows:

@@ -182,9 +182,6 @@ def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
     return k, min(uniform / p, 1.0)
 
 
-ROUNDS_PER_SECOND = 2.0  # default rate
-
-
 @dataclass(frozen=True, eq=False)
 class RfidForecast:
     """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` of inventory rounds, ``rounds_per_metre`` of each antenna."""
@@ -219,11 +216,9 @@ class RfidForecast:
         out += added
 
 
-def forecast(world: World, rig: Rig, speed: float, settings: Any = None) -> RfidForecast | None:
+def forecast(world: World, rig: Rig, speed: float, settings: Any) -> RfidForecast | None:
     """The forecast for a robot with ``speed`` [m/s], with the rates of a simulation; None without antennas or tags."""
     if rig.find(RfidSettings) is None or not world.tags:
         return None
-    rate = ROUNDS_PER_SECOND if settings is None else settings.rounds_per_second
-    return RfidForecast(
-        RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags), rate / speed
-    )
+    likelihood = RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags)
+    return RfidForecast(likelihood, settings.rounds_per_second / speed)

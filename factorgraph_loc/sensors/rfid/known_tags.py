@@ -9,13 +9,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.rfid.settings import SurveySettings
+from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import se2
 from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
@@ -37,17 +36,18 @@ CONFIRMED = (
 CLEAR = math.log(0.99 / 0.01)  # log-odds of a tag that is clearly not as surveyed
 WIDENED = 4.0  # factor of the pose's sigmas for evidence on tags, because consecutive scans share the pose error
 STANDING = np.zeros(3)  # velocity
-EXACT = 0.2  # a survey is exact if its sigma is below this share of `pass_sigma`
+PASS_SIGMA = 0.1  # m: accuracy of the pose from one pass of a tag
+EXACT = 0.2  # a survey is exact if its sigma is below this share of that
 
 
-def trust(sigmas: Array, pass_sigma: float) -> float:
+def trust(sigmas: Array) -> float:
     """The exponent of a likelihood of tags whose positions have standard deviations ``sigmas`` (T,) [m].
 
     The survey error is the same in all reads of a tag, so reads cannot average it out. A pass of a tag determines the pose with
-    variance ``pass_sigma`` squared, and with the sum of both variances if the survey is inexact.
+    variance :data:`PASS_SIGMA` squared, and with the sum of both variances if the survey is inexact.
     """
-    counted = np.where(sigmas > EXACT * pass_sigma, sigmas, 0.0)
-    return float(np.mean(1.0 / (1.0 + (counted / pass_sigma) ** 2))) if len(sigmas) else 1.0
+    counted = np.where(sigmas > EXACT * PASS_SIGMA, sigmas, 0.0)
+    return float(np.mean(1.0 / (1.0 + (counted / PASS_SIGMA) ** 2))) if len(sigmas) else 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,18 +110,14 @@ class KnownTags:
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
-        settings = setup.rig.rfid if "rfid" in setup.sensors else None
-        self._diagnostics = diagnostics
-        self._antennas = {} if settings is None else {name: i for i, name in enumerate(settings.all_antennas())}
+        settings, self._diagnostics = setup.rig.of(RfidSettings), diagnostics
+        self._antennas = {name: i for i, name in enumerate(settings.all_antennas())}
         self._rounds: dict[tuple[str, ...], tuple[list[int], Integers, Integers]] = {}
         self.map: TagMap = tag_map(setup.world, setup.rig.survey)
-        self.likelihood, self.trust, shares = None, 1.0, (0.0, 0.0, 0.0)
-        if settings is not None:
-            model, self.trust = settings.model(), trust(self.map.sigmas, settings.pass_sigma)
-            self._tempering = model.tempering
-            self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
-            shares = settings.dead_tags, settings.weak_tags, settings.moved_tags
-        self.states = TagStates(len(self.map.names), *shares)
+        model, self.trust = settings.model(), trust(self.map.sigmas)
+        self._tempering = model.tempering
+        self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
+        self.states = TagStates(len(self.map.names), settings.dead_tags, settings.weak_tags, settings.moved_tags)
         self._excluded: set[int | None] = set()  # antennas that are dead
         self._waiting: deque[tuple[float, Integers, Array]] = deque()  # evidence of reads since `CONFIRMED` ago
 
@@ -138,7 +134,6 @@ class KnownTags:
 
     def temper(self, tempering: float) -> None:
         """Use this exponent of the likelihood where it is less than that of the rig."""
-        assert self.likelihood is not None
         new = min(self._tempering, tempering) * self.trust
         if new != self.likelihood.model.tempering:
             self.likelihood = self.likelihood.tempered(new)
@@ -147,9 +142,6 @@ class KnownTags:
         """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time, with the robot's
         velocity ``twist`` (3,). Without ``count``, ignored reads are not counted, because the scan will be processed again."""
         diagnostics = self._diagnostics if count else Diagnostics()
-        if self.likelihood is None:
-            diagnostics.ignore("rfid", len(m.antennas))
-            return None
         if self._excluded:
             active = {self._antennas.get(m.antennas[i]) for i in set(m.antenna.tolist())}
             if not self._excluded.isdisjoint(active):
@@ -192,7 +184,6 @@ class KnownTags:
 
         ``pose`` (3,): predicted, with body-frame ``covariance`` (3, 3). ``parameters`` (Q,): of the likelihood, as estimated.
         """
-        assert self.likelihood is not None
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
         return TagEvidence(*self.likelihood.displaced(poses, counts, *places))
@@ -204,7 +195,7 @@ class KnownTags:
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
         """The counts with the effect of tags removed that are clearly not as surveyed."""
-        clear = self.states.odds[reads.listed] > CLEAR
+        clear = self.states.odds[reads.tags] > CLEAR
         if not clear.any():
             return reads
         return replace(
@@ -261,24 +252,19 @@ Row = tuple[float, int, int, float, float]  # time of the read, antenna, tag, ph
 
 
 class TagSignals:
-    """Turns scans into strength observations and windows of phases, if these sensors are used. InputError if the rig lacks a model.
+    """Turns scans into strength observations and windows of phases, if these sensors are used.
 
     Windows of the rig's ``window`` seconds end at least ``step`` seconds apart.
     """
 
     def __init__(self, setup: Setup, tags: KnownTags) -> None:
-        settings, self._tags = setup.rig.rfid, tags
-        for sensor in ("rssi", "phase"):
-            if sensor in setup.sensors and getattr(settings, sensor, None) is None:
-                raise InputError(f"the rig has no [rfid.{sensor}], which the sensor {sensor} needs")
+        settings, self._tags = setup.rig.of(RfidSettings), tags
         self.strength: RssiLikelihood | None = None
         self.phase: PhaseLikelihood | None = None
         self._rows: deque[tuple[float, Row]] = deque()  # with the scan's time
         self._ended: deque[float] = deque()
         self._window = self._step = 0.0
         self._newest = -np.inf
-        if settings is None or tags.likelihood is None:
-            return
         antennas = tags.likelihood.model.antennas
         if settings.rssi is not None and "rssi" in setup.sensors:
             self.strength = RssiLikelihood(_tempered(settings.rssi.model(antennas), tags.trust), tags.map.tags)

@@ -9,11 +9,9 @@ from typing import ClassVar, Self, cast
 
 import numpy as np
 
-from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.settings import NOTHING, Estimated
-from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
-from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.rfid.known_tags import STANDING, KnownTags, TagEvidence, TagSignals, extent
 from factorgraph_loc.sensors.rfid.monitor import (
     DURATION,
@@ -29,6 +27,7 @@ from factors import positive
 from factors.graph import Factor
 from factors.rfid.detection import RfidLikelihood, TagReadCounts, merged
 from factors.rfid.factor import ITERATIONS, NO_VALUES, RfidFactor
+from factors.rfid.signals import PhaseLikelihood
 from factors.se2 import Array
 from factors.update import Correction
 
@@ -126,18 +125,15 @@ class TagSensor(Sensor):
     gathers = True
     evidence_every = 0.0
 
-    def __init__(
-        self, setup: Setup, diagnostics: Diagnostics, constants: Estimated = NOTHING, motion: Motion | None = None
-    ) -> None:
-        super().__init__()
-        self.constants, self._wheels = constants, motion
+    def __init__(self, binding: Binding, constants: Estimated) -> None:
+        super().__init__(binding.name)
+        setup, diagnostics = binding.setup, binding.diagnostics
+        self.constants, self._wheels = constants, binding.motion
         self._blocks = (self.name,) if constants.names else ()
         self.tags = KnownTags(setup, diagnostics)
-        self.bounds = None
-        if self.tags.likelihood is not None:
-            self.tags.likelihood.prepare()
-            self.work = SCAN + round(self.tags.likelihood.reached)
-            self.bounds = extent(setup.world, self.tags.map.tags)
+        self.tags.likelihood.prepare()
+        self.work = SCAN + round(self.tags.likelihood.reached)
+        self.bounds = extent(setup.world, self.tags.map.tags)
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
@@ -147,10 +143,9 @@ class TagSensor(Sensor):
         self._confirmed = -math.inf  # time [s] after which a new track is accepted and models are learnt
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
-        is_late = "time_offset" in self.constants.names
-        twist = self._wheels.twist(m.t) if is_late and self._wheels is not None else STANDING
-        counts, likelihood = self.tags.read_counts(m, twist), self.tags.likelihood
-        if counts is None or likelihood is None:
+        twist = self._wheels.twist(m.t) if "time_offset" in self.constants.names else STANDING
+        counts = self.tags.read_counts(m, twist)
+        if counts is None:
             return
         relative = counts if view.offset is None else counts.moved(view.offset.delta)
         evidence = None
@@ -177,11 +172,9 @@ class TagSensor(Sensor):
     def _learns(self, t: float) -> bool:
         """Whether models and states of tags are learnt: not on a track that is suspicious, or that has just been found, or whose
         motion is unknown."""
-        slips = self._wheels is not None and self._wheels.is_slipping
-        return not slips and self.suspicious_since is None and t >= self._confirmed
+        return not self._wheels.is_slipping and self.suspicious_since is None and t >= self._confirmed
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, counts: TagReadCounts) -> TagObservation:
-        assert self.tags.likelihood is not None
         factor = RfidFactor(self.tags.likelihood, moved, self.constants.indices)
         return TagObservation(m.t, factor, int(counts.hits.sum()), counts, len(m.antennas), self._blocks)
 
@@ -202,7 +195,6 @@ class TagSensor(Sensor):
 
     def _count(self, observation: TagObservation, view: View) -> None:
         """Count reads and misses against what is expected of them, temper by how they go together, and doubt the models."""
-        assert self.tags.likelihood is not None
         assert isinstance(observation.factor.reads, TagReadCounts)
         t, looks, states = observation.t, observation.factor.reads, self.tags.states
         reads = self.tags.likelihood.expected(view.pose, looks, self._estimated(view))
@@ -229,7 +221,6 @@ class TagSensor(Sensor):
 
     def _estimated(self, view: View) -> Array:
         """The estimated parameters (Q,) of the likelihood."""
-        assert self.tags.likelihood is not None
         out = self.tags.likelihood.parameters.copy()
         for value in self._values(view).values():
             out[list(self.constants.indices)] = value
@@ -247,7 +238,7 @@ class TagSensor(Sensor):
 
     def evidence(self, m: RfidScan) -> TagObservation | None:
         counts = self.tags.read_counts(m, count=False)
-        if counts is None or self.tags.likelihood is None:
+        if counts is None:
             return None
         observation = self._detection(m, counts, counts)  # with the models of the rig
         return replace(observation, factor=replace(observation.factor, estimated=()), blocks=())
@@ -277,7 +268,7 @@ class TagSensor(Sensor):
                 counts.append(factor.reads)
             else:
                 terms.append(Term(factor, (), factor.rows))
-        if counts and self.tags.likelihood is not None:
+        if counts:
             factor, blocks = RfidFactor(self.tags.likelihood, merged(counts), self.constants.indices), self._blocks
             fixed = next((o.factor for o in observations if o.is_judged and not o.blocks), None)
             if blocks and fixed is not None:
@@ -287,9 +278,9 @@ class TagSensor(Sensor):
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
         """The factor without tags that have clearly moved or died. Others have the odds before their scan, so that no scan is
-        weighed by what was learnt from it. Phase, which has many local optima, is left out while losses are wide."""
+        weighed by what was learnt from it. Phase, which has local optima centimetres apart, is left out while losses are wide."""
         factor = cast(RfidFactor, factor)
-        if width > 1.0 and factor.is_phase:
+        if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None
         if not isinstance(factor.reads, TagReadCounts):
             return factor
@@ -308,11 +299,14 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """The sensor of a run; None where it is not used."""
-    settings = binding.setup.rig.rfid
-    constants = NOTHING
-    if settings is not None and binding.calibration != "none":
-        # strength and phase have the mounting of the rig: another one of the reads would contradict them
-        constants = settings.estimated(mounting=not {"rssi", "phase"} & set(binding.setup.sensors))
-    sensor = TagSensor(binding.setup, binding.diagnostics, constants, binding.motion)
-    return sensor if sensor.tags.likelihood is not None else None
+    """The sensor of a run; None where it is not used. InputError if the rig lacks a model that is used."""
+    settings, sensors = binding.setup.rig.rfid, binding.setup.sensors
+    signals = [signal for signal in ("rssi", "phase") if signal in sensors]
+    for signal in signals:
+        if getattr(settings, signal, None) is None:
+            raise InputError(f"the rig has no [rfid.{signal}], which the sensor {signal} needs")
+    if settings is None or TagSensor.modality not in sensors:
+        return None
+    # strength and phase have the mounting of the rig: another one of the reads would contradict them
+    constants = NOTHING if binding.calibration == "none" else settings.estimated(mounting=not signals)
+    return TagSensor(binding, constants)

@@ -14,7 +14,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import GRID, foreign, opened, require_size
 from factorgraph_loc.files.models import Coordinate, FileModel, InUnit, inside, replacing
-from factorgraph_loc.model.settings import Estimated, SensorSettings
+from factorgraph_loc.model.settings import Angle, Estimated, Offset, SensorSettings
 from factorgraph_loc.text import listed, quoted
 from factors import se2
 from factors.rfid.model import Antenna, BeamModel, DetectionModel, GridModel, LogisticModel, RfidModel
@@ -22,8 +22,6 @@ from factors.rfid.parameters import OF_MODEL
 from factors.rfid.signals import PhaseModel, RssiModel
 from factors.se2 import Array
 
-Angle = Annotated[float, Field(ge=-math.pi, le=math.pi), InUnit("rad")]
-Offset = Annotated[float, Field(ge=-10.0, le=10.0), InUnit("m")]
 Weight = Annotated[float, Field(ge=-1e6, le=1e6)]
 Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
@@ -216,8 +214,6 @@ class RfidSettings(SensorSettings):
     """exponent of the likelihood, below 1 for correlated reads"""
     round_gap: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("s")] = 0.05
     """gap between reads that ends an inventory round, if the log has no rounds"""
-    pass_sigma: Annotated[float, Field(ge=0.01, le=10.0), InUnit("m")] = 0.1
-    """accuracy of the pose from one pass of a tag, for tags with an inexact survey"""
     dead_tags: Share = 0.03
     """prior share of broken, hidden or missing tags of a map"""
     weak_tags: Share = 0.03

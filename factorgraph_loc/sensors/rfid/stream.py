@@ -183,12 +183,13 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
     for read in rows:
         if not isinstance(read, RfidRead):
             raise bad_field(where, "read", read, "an RfidRead")
+    times = [t if read.t is None else values.seconds_of(where, read.t, "time of a read") for read in rows]
     return RfidScan(
         t,
         antenna_names,
-        _rounds(where, t, antenna_names, rows),
+        _rounds(where, times, antenna_names, rows),
         tuple(read.epc for read in rows),
-        np.array([0.0 if read.t is None else t - values.seconds_of(where, read.t, "time of a read") for read in rows]),
+        t - np.array(times),
         *(
             values.numbers(where, name, [getattr(read, name) for read in rows])
             for name in ("rssi", "phase", "frequency")
@@ -196,9 +197,10 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
     )
 
 
-def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
+def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
     """The round of each read (R,). If a read does not name it: the first round of its antenna without a read of the tag, in order
     of time, or the last round."""
+    own = {name: [k for k, other in enumerate(names) if other == name] for name in names}
     out = np.full(len(reads), -1, dtype=np.int64)
     for i, read in enumerate(reads):
         if not isinstance(read.antenna, str) or read.antenna not in names:
@@ -207,19 +209,15 @@ def _rounds(where: str, t: float, names: tuple[str, ...], reads: Sequence[RfidRe
             raise bad_field(where, "epc", read.epc, RFID["epc"].doc)
         if read.round is None:
             continue
-        own = [k for k, name in enumerate(names) if name == read.antenna]
-        if not isinstance(read.round, (int, np.integer)) or read.round not in own:
-            expected = f"one of antenna {plain(read.antenna)}: {listed(own)}"
+        if not isinstance(read.round, (int, np.integer)) or read.round not in own[read.antenna]:
+            expected = f"one of antenna {plain(read.antenna)}: {listed(own[read.antenna])}"
             raise bad_field(where, "round", read.round, expected)
         out[i] = read.round
     taken = {(read.epc, int(k)) for read, k in zip(reads, out, strict=True) if k >= 0}
-    untold = [i for i in range(len(reads)) if out[i] < 0]
-    for i in sorted(
-        untold, key=lambda i: t if (at := reads[i].t) is None else values.seconds_of(where, at, "time of a read")
-    ):
-        mine = [k for k, name in enumerate(names) if name == reads[i].antenna]
-        out[i] = next((k for k in mine if (reads[i].epc, k) not in taken), mine[-1])
-        taken.add((reads[i].epc, int(out[i])))
+    for i in sorted(np.flatnonzero(out < 0).tolist(), key=times.__getitem__):
+        rounds, epc = own[reads[i].antenna], reads[i].epc
+        out[i] = next((k for k in rounds if (epc, k) not in taken), rounds[-1])
+        taken.add((epc, int(out[i])))
     return out
 
 

@@ -24,7 +24,7 @@ from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.smoothed import REFERENCE_GAP, possible_poses
+from factorgraph_loc.sensors.smoothed import possible_poses
 from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.rfid import kernels
 from factors.rfid.detection import ExpectedReads, RfidLikelihood
@@ -209,18 +209,13 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notic
         ("moved_tags", "are believed to have moved, as they were read from elsewhere than they should have been"),
     ):
         if suspects := diagnostics.doubted.get(kind):
+            ranked = sorted(suspects.items(), key=lambda row: -row[1])
+            names = listed((f"{name} ({_percent(probability)})" for name, probability in ranked), SHOWN)
             sentence = f"{{log}}: {{count}} of {{tags}} tags of the map {why}: {{suspects}}"
-            yield notice(kind, sentence, log.name, len(suspects), len(tags), suspected(suspects))
+            yield notice(kind, sentence, log.name, len(suspects), len(tags), names)
     settings = log.rig.find(RfidSettings)
     if settings is not None:
         yield from (what.about(log.name) for what in _differences(settings, learnt))
-
-
-def suspected(tags: Mapping[str, float]) -> str:
-    """Tags with their probabilities, the surest first."""
-    ranked = sorted(tags.items(), key=lambda row: -row[1])
-    names = ", ".join(f"{name} ({_percent(probability)})" for name, probability in ranked[:SHOWN])
-    return names + (f" and {len(ranked) - SHOWN} more" if len(ranked) > SHOWN else "")
 
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
@@ -316,7 +311,7 @@ def _observed(
     is_read = np.isin(block, block[hits.any(axis=1)])
     numbers = {name: i for i, name in enumerate(settings.all_antennas())}
     antenna = np.array([numbers.get(stream.antenna[i], -1) for i in first.tolist()], dtype=np.int64)
-    poses = possible_poses(final, t, REFERENCE_GAP)
+    poses = possible_poses(final, t)
     used = np.flatnonzero(np.isfinite(poses[:, 0]) & (antenna >= 0) & is_read)
     if len(used) > MOST_ROUNDS:
         used = used[np.linspace(0, len(used) - 1, MOST_ROUNDS).astype(np.int64)]

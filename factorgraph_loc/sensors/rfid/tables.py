@@ -115,12 +115,6 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
     return read_rounds(rows.get("rfid"), rows.get("inventories"), gap, reading.warnings).stream(reading.t0_ns)
 
 
-def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
-    """The columns of both tables."""
-    reads, inventories = tables_of(stream, writing.t0_ns)
-    return {"rfid": reads, "inventories": inventories}
-
-
 def read_rounds(
     reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[Notice]
 ) -> ReadsByRound:
@@ -182,32 +176,30 @@ def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Int
 def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> ReadsByRound:
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
-    rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in ("rssi", "phase", "frequency"))
+    rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in SIGNALS)
     return ReadsByRound(reads.t_ns[rows], number, epc, (rssi, phase, frequency), end_ns, antenna)
 
 
-def tables_of(stream: RfidStream, t0_ns: int) -> tuple[Columns, Columns]:
+def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
     """The columns of both tables, in the order of the rounds; a round lasts from its first read to its end."""
     number, first = stream.number, stream.first_rows
-    end_ns = np.rint(stream.t * 1e9).astype(np.int64) + t0_ns
+    end_ns = checks.absolute(stream.t, writing.t0_ns)
     age_ns = np.rint(stream.age * 1e9).astype(np.int64)
     order = np.argsort(number, kind="stable")
     reads = order[np.array([bool(stream.epc[i]) for i in order.tolist()], dtype=bool)]
     duration_ns = np.zeros(len(first), dtype=np.int64)
     np.maximum.at(duration_ns, number[reads], age_ns[reads])
-    return (
-        {
+    return {
+        "rfid": {
             "t_ns": end_ns[reads] - age_ns[reads],
             "antenna": [stream.antenna[i] for i in reads.tolist()],
             "epc": [stream.epc[i] for i in reads.tolist()],
-            "rssi": stream.rssi[reads],
-            "phase": stream.phase[reads],
-            "frequency": stream.frequency[reads],
+            **{name: getattr(stream, name)[reads] for name in SIGNALS},
             "inventory": number[reads] + 1,
         },
-        {
+        "inventories": {
             "t_ns": end_ns[first],
             "antenna": [stream.antenna[i] for i in first.tolist()],
             "duration": duration_ns / 1e9,
         },
-    )
+    }

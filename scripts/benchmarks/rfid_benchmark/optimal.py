@@ -60,8 +60,6 @@ def optimal_filter(log: Log) -> Trajectory:
     tags = KnownTags(Setup(log.rig, log.world, SENSORS, np.random.default_rng(0)), diagnostics)
     motion = Motion(log.rig, SENSORS, diagnostics, self_calibration=True)
     likelihood = tags.likelihood
-    if likelihood is None:
-        raise InputError(f"{log.name}: its rig has no RFID antennas")
     grid = GridFilter(prior, *extent(log.world, tags.map.tags))
     before = None
     t, means, covariances = [], [], []
@@ -70,14 +68,14 @@ def optimal_filter(log: Log) -> Trajectory:
             motion.add(m)
             if before is None:
                 before = motion.state(prior.t)
-        elif isinstance(m, RfidScan) and before is not None and (looks := tags.looks(m)) is not None:
+        elif isinstance(m, RfidScan) and before is not None and (looks := tags.read_counts(m)) is not None:
             state = motion.state(m.t)
             grid.predict(motion.relative(before, state))
             before = state
             mean, covariance = grid.moments()
-            told = tags.told(looks, mean, se2.world_to_body(mean, covariance), likelihood.parameters)
-            looks = tags.with_states(looks, told)
-            tags.learn(m.t, told)
+            evidence = tags.weigh_states(looks, mean, se2.world_to_body(mean, covariance), likelihood.parameters)
+            looks = tags.with_states(looks, evidence)
+            tags.learn(m.t, evidence)
             grid.update(partial(_log_likelihood, likelihood, looks))
             mean, covariance = grid.moments()
             t.append(m.t)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from drives import variance
 
 import factorgraph_loc as fgloc
 from factorgraph_loc import IncrementOdometry, Rig, Trajectory, VelocityOdometry, VelocityStream, YawRate
@@ -121,7 +122,7 @@ def test_noise_is_that_of_the_robot(simulate):
     """
     noise = fit_noise([simulate(seconds=1200.0, along=0.08, heading=0.06)], OdometryModel())
     speed, turn = 0.35, 0.35  # mean while it moves
-    sigma = {e: np.sqrt(g.variance(speed, turn, 1.0)) / noise.widened for e, g in noise.growth.items()}
+    sigma = {e: np.sqrt(variance(g, speed, turn, 1.0)) / noise.widened for e, g in noise.growth.items()}
     assert sigma["along"] == pytest.approx(0.08 * np.sqrt(speed), rel=0.25)
     assert sigma["heading"] == pytest.approx(0.06 * np.sqrt(turn), rel=0.4)
     assert sigma["lateral"] < 0.01

@@ -15,7 +15,7 @@ BURSTS = {"faults": {"fading": {"duration": 5.0, "share": 0.4}}}
 
 
 def reads(looks, p):
-    return ExpectedReads(looks.listed, looks.hits, p, np.zeros(p.shape))
+    return ExpectedReads(looks.tags, looks.hits, p, np.zeros(p.shape))
 
 
 def scans(seed, count, stays=0.0, share=0.6):

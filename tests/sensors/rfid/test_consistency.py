@@ -30,7 +30,7 @@ def scans(monitor, seed, count, chance, *, p=RIGHT, begin=0.0, stays=0.0, togeth
     for i in range(count):
         hits = np.where(rng.random(chance.shape) < stays, hits, rng.random(chance.shape) < chance)
         looks = TagReadCounts(np.zeros((ANTENNAS, 3)), np.arange(ANTENNAS), np.ones(ANTENNAS, int), hits.astype(int))
-        reads = ExpectedReads(looks.listed, looks.hits, p, DISTANCE)
+        reads = ExpectedReads(looks.tags, looks.hits, p, DISTANCE)
         monitor.add(begin + STEP * i, looks, reads, ALL, together)
         out.append(monitor.doubted)
     return np.array(out)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from factorgraph_loc import InputError, Log, RfidStream, Rig, Tag, Trajectory, World
-from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
-from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
+from factorgraph_loc.sensors.rfid.calibration.signals import PhaseFit, fit_phase, fit_rssi
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import (
     AntennaSettings,

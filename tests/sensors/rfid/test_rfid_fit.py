@@ -9,11 +9,11 @@ from changed_logs import with_rig
 from factorgraph_loc import InputError, read_rig, write_rig
 from factorgraph_loc.sensors.rfid.calibration import learn as rfid_learn
 from factorgraph_loc.sensors.rfid.calibration.fields import Kind, choose, design_of, fit_grid
-from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid, pose_share
+from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
 from factorgraph_loc.sensors.rfid.calibration.pairs import Floor, TagPairs, pairs_of, view_of
-from factorgraph_loc.sensors.rfid.calibration.parametric import FACING, beam, fit_model, logistic, place
-from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit
+from factorgraph_loc.sensors.rfid.calibration.parametric import FACING, beam, fit_model, logistic, place, pose_share
 from factorgraph_loc.sensors.rfid.calibration.rounds import rounds_of
+from factorgraph_loc.sensors.rfid.calibration.signals import PhaseFit
 from factorgraph_loc.sensors.rfid.settings import GridSettings, PhaseSettings, SurveySettings
 from factors.rfid.model import BeamModel, GridModel, LogisticModel, logits, probability
 

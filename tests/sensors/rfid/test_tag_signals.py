@@ -10,12 +10,16 @@ from by_hand import scan as scan_by_hand
 from factorgraph_loc import InputError, Rig, Tag, World
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.diagnostics import Diagnostics
+from factorgraph_loc.model.settings import NOTHING
 from factorgraph_loc.model.setup import Setup
+from factorgraph_loc.sensors.base import Binding
+from factorgraph_loc.sensors.motion import Motion
 from factorgraph_loc.sensors.rfid.known_tags import KnownTags, TagSignals
 from factorgraph_loc.sensors.rfid.sensor import TagSensor
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, PhaseSettings, RfidSettings, RssiSettings
 from factorgraph_loc.simulation import preset, simulate
 from factors import se2
+from factors.rfid.signals import PhaseLikelihood
 
 SENSORS = ("odometry", "rfid", "rssi", "phase")
 STRENGTH = RssiSettings(coefficients=(-50.0, 2.0, -8.0, 0.0, 2.0, 0.0), sigma=2.0, dof=4.0)
@@ -66,7 +70,7 @@ def test_a_window_is_a_factor_of_the_reads_that_are_near():
     offsets = np.zeros((len(kept.times()), 3))
     window = kept.phases(offsets, np.zeros(3))
     assert window is not None
-    assert window.is_phase
+    assert isinstance(window.likelihood, PhaseLikelihood)
     assert len(window.reads.phase) == 6
     assert kept.phases(offsets, np.array((5.0, 5.0, 0.0))) is None
 
@@ -94,7 +98,8 @@ def test_strengths_place_the_robot_but_are_no_evidence():
     found = {}
     for sensors in (SENSORS[:2], SENSORS[:3]):
         setup = Setup(Rig(rfid=rfid), WORLD, sensors, np.random.default_rng(1))
-        found[len(sensors)] = list(TagSensor(setup, Diagnostics()).observe(scan(0.5, "a", rssi=-45.0), view))
+        binding = Binding(setup, Motion(setup.rig, sensors, Diagnostics()), Diagnostics())
+        found[len(sensors)] = list(TagSensor(binding, NOTHING).observe(scan(0.5, "a", rssi=-45.0), view))
     (alone,), (detection, strength) = found.values()
     without, first = (one.correct(pose, covariance, {}, {}) for one in (alone, detection))
     assert first.evidence == pytest.approx(without.evidence)

@@ -1,3 +1,3 @@
 """Calibration of RFID readers and tags from logs with a reference."""
 
-__all__ = ["calibrator", "phase", "rounds", "rssi"]
+__all__ = ["calibrator", "rounds", "signals"]

@@ -1,17 +1,31 @@
-"""The calibrator of RFID, from reads and misses along trajectories."""
+"""The calibrator of RFID, from reads and misses along trajectories, and its picture of the field of the detection models."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from factorgraph_loc.drawing.pages import Part
+import numpy as np
+
+from factorgraph_loc.drawing.figures import COLOURS, grid, png
+from factorgraph_loc.drawing.pages import Part, Picture
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import Calibrator, SensorKnowledge
 from factorgraph_loc.sensors.rfid.calibration.learn import RfidFit, learn_rfid, relearn_rfid
-from factorgraph_loc.sensors.rfid.calibration.report import field_figure
 from factorgraph_loc.sensors.rfid.settings import PriorSettings, default_models
 from factorgraph_loc.sensors.smoothed import Traced
+from factors.rfid.model import probability
+from factors.se2 import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+
+VIEW = 6.0  # m around the antenna
+STEP = 0.1  # m
 
 
 class RfidCalibrator(Calibrator):
@@ -58,3 +72,34 @@ class RfidCalibrator(Calibrator):
 
 
 CALIBRATOR = RfidCalibrator()
+
+
+def field_figure(fit: RfidFit) -> Picture:
+    """Probability of a read around the antenna: observed, and by each model for tags facing towards and away from it."""
+    facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in fit.models) else (0.0,)
+    figure, axes = grid(len(fit.models), 1 + len(facings), 5.0 * len(fit.models))
+    axis = np.arange(-VIEW, VIEW + 1e-9, STEP)
+    edges = np.append(axis - 0.5 * STEP, axis[-1] + 0.5 * STEP)
+    grid_points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    for row, model in enumerate(fit.models):
+        pairs = fit.pairs.part(np.asarray(fit.which)[fit.pairs.antenna] == row)
+        owners = ", ".join(a for a, w in zip(fit.antennas, fit.which, strict=True) if w == row)
+        z = float(np.median(pairs.points[:, 2])) if len(pairs.points) else 0.0
+        x, y = pairs.points[:, :2].T
+        count, hits = (np.histogram2d(x, y, [edges, edges], weights=w)[0] for w in (pairs.count, pairs.hits))
+        image = _draw(axes[row, 0], axis, np.where(count > 0.0, hits / np.maximum(count, 1e-9), np.nan))
+        axes[row, 0].set_title(f"share of rounds with a read ({owners})")
+        points = np.column_stack((grid_points, np.full(len(grid_points), z)))
+        for panel, facing in zip(axes[row, 1:], facings, strict=True):
+            _draw(panel, axis, probability(model, points, facing).reshape(len(axis), -1))
+            panel.set_title(f"model, tag {z:+.1f} m high" + (f", facing {facing:+.0f}" if len(facings) > 1 else ""))
+        figure.colorbar(image, ax=axes[row, -1], label="probability of a read in a round")
+    return png(figure)
+
+
+def _draw(panel: Axes, axis: Array, values: Array) -> QuadMesh:
+    image = panel.pcolormesh(axis, axis, values.T, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
+    panel.plot(0.0, 0.0, ">", color=COLOURS[1], markersize=9)
+    panel.set_aspect("equal")
+    panel.set(xlabel="x, along the boresight [m]", ylabel="y, to the left [m]")
+    return image

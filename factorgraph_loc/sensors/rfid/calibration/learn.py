@@ -15,23 +15,22 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import file_name
-from factorgraph_loc.fitting.posterior import FittedConstant, by_block, independent_share
+from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.sensors.calibrating import SensorKnowledge
 from factorgraph_loc.sensors.rfid.calibration.fields import Kind, choose, fit
-from factorgraph_loc.sensors.rfid.calibration.pairs import (
-    Floor,
-    TagPairs,
-    modelled,
-    nearby,
-    pairs_of,
-    terms,
+from factorgraph_loc.sensors.rfid.calibration.pairs import Floor, TagPairs, modelled, pairs_of
+from factorgraph_loc.sensors.rfid.calibration.parametric import (
+    SURVEY,
+    family_of,
+    fit_model,
+    place,
+    places_of,
+    pose_share,
 )
-from factorgraph_loc.sensors.rfid.calibration.parametric import STEP, SURVEY, family_of, fit_model, place, places_of
-from factorgraph_loc.sensors.rfid.calibration.phase import PhaseFit, fit_phase
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, overdispersion, rounds_of
-from factorgraph_loc.sensors.rfid.calibration.rssi import fit_rssi
+from factorgraph_loc.sensors.rfid.calibration.signals import PhaseFit, fit_phase, fit_rssi
 from factorgraph_loc.sensors.rfid.settings import (
     BeamSettings,
     GridSettings,
@@ -44,7 +43,6 @@ from factorgraph_loc.sensors.rfid.settings import (
     write_grid,
 )
 from factorgraph_loc.sensors.smoothed import (
-    REFERENCE_GAP,
     Traced,
     corrections_of,
     pooled,
@@ -59,7 +57,6 @@ from factors.se2 import Array
 
 DEFAULT = "default"
 CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)  # between the days of one installation
-WINDOW = 10.0  # s; reads in different windows are independent
 MIN_READS = 100.0  # weighted reads that a model is learnt from
 COEFFICIENT = "coefficient of "
 VAGUE = 0.5  # relative standard error of a parameter that is not determined
@@ -221,7 +218,7 @@ def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
     assert trace.log.reference is not None
     return replace(
         rounds,
-        poses=possible_poses(trace.log.reference, rounds.t, REFERENCE_GAP),
+        poses=possible_poses(trace.log.reference, rounds.t),
         hits=rounds.hits[:, kept],
         tags=replace(rounds.tags, points=rounds.tags.points[kept], facing=rounds.tags.facing[kept]),
         names=tuple(name for name, keep in zip(rounds.names, kept, strict=True) if keep),
@@ -231,27 +228,6 @@ def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
 def _bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
     """:func:`.overdispersion` of pairs with these logits (M,)."""
     return overdispersion(pairs.hits, pairs.count, floor.probability(logit), pairs.antenna, pairs.tag, pairs.block)
-
-
-def pose_share(
-    logs: Sequence[Rounds],
-    settings: RfidSettings,
-    survey: SurveySettings,
-    models: Sequence[DetectionModel],
-    which: Sequence[int],
-    floor: Floor,
-) -> float:
-    """The share of independent information on the pose in the reads of unmerged rounds."""
-    within = [nearby(log, settings, survey) for log in logs]
-    pairs = pairs_of(logs, settings, survey, within, WINDOW)
-    logit, columns = modelled(models, which, pairs), []
-    for step in STEP * np.eye(3):
-        stepped = [replace(log, poses=se2.compose(log.poses, step)) for log in logs]
-        columns.append((modelled(models, which, pairs_of(stepped, settings, survey, within)) - logit) / STEP)
-    jacobian = np.column_stack(columns)
-    likelihood = terms(logit, pairs.hits, pairs.count, floor)
-    information = jacobian.T @ (likelihood.information[:, None] * jacobian)
-    return independent_share(by_block(likelihood.gradient[:, None] * jacobian, pairs.block), information)
 
 
 def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:

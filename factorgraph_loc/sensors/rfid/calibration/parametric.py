@@ -17,27 +17,22 @@ from factorgraph_loc.fitting.posterior import (
     Parameter,
     Posterior,
     by_block,
+    independent_share,
     maximise,
 )
-from factorgraph_loc.sensors.rfid.calibration.pairs import (
-    REACH,
-    Floor,
-    TagPairs,
-    nearby,
-    pairs_of,
-    terms,
-)
+from factorgraph_loc.sensors.rfid.calibration.pairs import REACH, Floor, TagPairs, modelled, nearby, pairs_of, terms
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings, SurveySettings
 from factors import se2
 from factors.rfid.model import FEATURES, NEAR, BeamModel, DetectionModel, GridModel, LogisticModel, logits
 from factors.rfid.parameters import MOST_CERTAIN, OF_MODEL, rate_of
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
 FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)
 EDGE = 5.0  # pseudo-rounds without reads at the maximum range, so that extrapolations do not grow with distance
 VAGUE = 1e3  # standard deviation of the prior of a constant without any
 STEP = 1e-4  # of numerical derivatives
+WINDOW = 10.0  # s; reads in different windows are independent
 MOST_PAIRS = 60000  # per log, for survey and mounting
 BEAM = {"p0": (0.05, 0.999), "r_max": (0.3, 2.0 * REACH), "s_r": (0.05, 5.0), "sigma_phi": (0.1, 9.0)}  # bounds
 SURVEY = {"survey.x": 0.1, "survey.y": 0.1, "survey.heading": 0.05}  # m, rad; standard deviations of the priors
@@ -131,7 +126,7 @@ def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionM
     def at(values: Array) -> LikelihoodTerms:
         logit = logits(family.built(values), data.points, data.facing)[0]
         jacobian = family.jacobian(values, data.points, data.facing) if design is None else design
-        return _evidence(logit, jacobian, data, floor)
+        return _evidence(logit, jacobian, data, floor, data.tag)  # some tags are stronger than others
 
     posterior = maximise(family.parameters, at)
     return family.built(posterior.values), posterior
@@ -197,7 +192,7 @@ def place(
                 antenna = kinds[i][1]
                 columns[:, i] = change * (data.antenna == names.index(antenna)) if antenna else change
         jacobian = np.hstack((columns, family.jacobian(values[number:], data.points, data.facing)))
-        return _evidence(logit, jacobian, data, floor)
+        return _evidence(logit, jacobian, data, floor, data.tag)  # some tags are stronger than others
 
     covariance = np.diag([p.sigma**2 for p in (*places, *family.parameters)])
     covariance[:number, :number] = prior
@@ -224,11 +219,30 @@ def moved(
     return settings.model_copy(update={"antennas": antennas, "preset": None}), survey
 
 
-def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor) -> LikelihoodTerms:
-    """The likelihood of reads. Those of a tag are correlated: some tags are stronger than others."""
+def pose_share(
+    logs: Sequence[Rounds],
+    settings: RfidSettings,
+    survey: SurveySettings,
+    models: Sequence[DetectionModel],
+    which: Sequence[int],
+    floor: Floor,
+) -> float:
+    """The share of independent information on the pose in the reads of unmerged rounds."""
+    within = [nearby(log, settings, survey) for log in logs]
+    pairs = pairs_of(logs, settings, survey, within, WINDOW)
+    logit, columns = modelled(models, which, pairs), []
+    for step in STEP * np.eye(3):
+        stepped = [replace(log, poses=se2.compose(log.poses, step)) for log in logs]
+        columns.append((modelled(models, which, pairs_of(stepped, settings, survey, within)) - logit) / STEP)
+    evidence = _evidence(logit, np.column_stack(columns), pairs, floor, pairs.block)
+    return independent_share(evidence.scores, evidence.information)
+
+
+def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, block: Integers) -> LikelihoodTerms:
+    """The likelihood of reads; those of one ``block`` (M,) are correlated."""
     likelihood = terms(logit, pairs.hits, pairs.count, floor)
     information = jacobian.T @ (likelihood.information[:, None] * jacobian)
-    scores = by_block(likelihood.gradient[:, None] * jacobian, pairs.tag)
+    scores = by_block(likelihood.gradient[:, None] * jacobian, block)
     return LikelihoodTerms(float(np.sum(likelihood.nll)), scores, information)
 
 
