@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.evaluation.trajectories.page import FILES, write_score
@@ -157,6 +157,8 @@ def score(
     max_diff: float = MAX_DIFF,
     max_gap: float = MAX_GAP,
     all_pairs: bool = False,
+    align_poses: int | None = None,
+    delta: Sequence[str] = (),
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> TrajectoryScore:
@@ -169,7 +171,8 @@ def score(
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)
     paths = _path(estimate, "estimate"), _path(reference, "reference")
-    result = score_paths(*paths, align, associate, max_diff=max_diff, max_gap=max_gap, all_pairs=all_pairs)
+    pieces: dict[str, Any] = {"all_pairs": all_pairs, "align_poses": align_poses, "delta": delta}
+    result = score_paths(*paths, align, associate, max_diff=max_diff, max_gap=max_gap, **pieces)
     if out is not None:
         write_score(result, Path(out))
     return result

@@ -24,7 +24,7 @@ class ScoreOptions:
         Alignment,
         typer.Option(
             help="How the estimate is moved onto the reference first: not at all, first pose onto first pose, or by least "
-            "squares in the plane, in space, or in space with a scale."
+            "squares in the plane, about the vertical and along it, in space, or in space with a scale."
         ),
     ] = "none"
     associate: Annotated[
@@ -44,6 +44,13 @@ class ScoreOptions:
             "--all-pairs", help="Relative errors over pieces from each pose on, instead of one after the other."
         ),
     ] = False
+    align_poses: Annotated[
+        int | None, typer.Option(metavar="N", help="Align by the first N poses; by default by all.")
+    ] = None
+    delta: Annotated[
+        list[str] | None,
+        typer.Option(metavar="5m|2s", help="Relative errors over this distance or duration too; may be repeated."),
+    ] = None
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; without it they are printed."),
@@ -62,6 +69,7 @@ def score(
         ),
     ],
     reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Another one, of any of these kinds.")],
+    aligned: Annotated[bool, typer.Option("-a", help="As in evo: --align se3.")] = False,
     *,
     options: ScoreOptions,
     json: Json = False,
@@ -73,7 +81,10 @@ def score(
     from factorgraph_loc.api import results
     from factorgraph_loc.evaluation.trajectories.page import errors_table, extents
 
-    result = results.score(estimate, reference, **vars(options))
+    if aligned and options.align not in ("none", "se3"):
+        raise InputError(f"-a is --align se3, but --align is {options.align}: give one of them")
+    given = vars(options) | {"delta": options.delta or (), "align": "se3" if aligned else options.align}
+    result = results.score(estimate, reference, **given)
     show.warnings(result.warnings)
     if json:
         show.document(result.document())

@@ -14,8 +14,8 @@ from factorgraph_loc.text import quoted
 KINDS = ("causal", "final")  # of the estimates of a run
 MAX_GAP = 0.5  # s between estimates across which scoring interpolates
 MAX_DIFF = 0.01  # s between stamps that are taken for one
-Alignment = Literal["none", "origin", "se2", "se3", "sim3"]
-ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "se3", "sim3")
+Alignment = Literal["none", "origin", "se2", "yaw", "se3", "sim3"]
+ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "yaw", "se3", "sim3")
 Association = Literal["nearest", "interpolate"]
 ASSOCIATIONS: tuple[Association, ...] = ("nearest", "interpolate")
 NAMED_PRIORS = ("reference", "log", "unknown")

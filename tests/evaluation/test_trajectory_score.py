@@ -12,13 +12,13 @@ from evo.core.metrics import PoseRelation, Unit
 from evo.core.trajectory import Plane
 from evo.tools import file_interface
 from pose_files import T0, wander, write
+from refusal import refusal
 from scipy.spatial.transform import Rotation
 from tum_files import read_tum
 
 from factorgraph_loc import InputError, PosePath, Trajectory, score
 from factorgraph_loc.evaluation import metrics
 from factorgraph_loc.files.checks import absolute
-from factorgraph_loc.model.scoring import ALIGNMENTS
 
 OPTIONS = {
     "none": {},
@@ -69,7 +69,7 @@ def check(found, expected):
 
 
 @pytest.mark.parametrize("suffix", READ)
-@pytest.mark.parametrize("align", ALIGNMENTS)
+@pytest.mark.parametrize("align", OPTIONS)
 def test_the_figures_are_those_of_evo(tmp_path, align, suffix):
     reference, estimate = wander(3, flat=align == "se2")
     paths = write(tmp_path / f"estimate{suffix}", estimate), write(tmp_path / f"reference{suffix}", reference)
@@ -136,6 +136,37 @@ def test_the_alignment_is_that_of_the_frames():
     assert found.transform.rotation == pytest.approx(turn)
     assert found.transform.translation == pytest.approx((1.0, 2.0, 3.0))
     assert found.figures["ape.position_max"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_an_alignment_by_yaw_turns_about_the_vertical_alone():
+    """Of a path that is turned, moved and raised nothing is left; of one that is tilted the tilt is left."""
+    space = in_space(*curve())
+    turn, tilt = (Rotation.from_rotvec(v).as_matrix() for v in ((0.0, 0.0, 1.0), (0.1, 0.0, 0.0)))
+    moved = replace(space, positions=space.positions @ turn.T + (1.0, 2.0, 3.0), rotations=turn @ space.rotations)
+    assert score(space, moved, align="yaw").figures["ape.position_max"] == pytest.approx(0.0, abs=1e-12)
+    tilted = replace(space, positions=space.positions @ tilt.T, rotations=tilt @ space.rotations)
+    figures = score(space, tilted, align="yaw").figures
+    assert figures["ape.rotation_max"] == pytest.approx(0.1, abs=0.02)
+    assert figures["ape.position_rmse"] > score(space, tilted, align="se3").figures["ape.position_rmse"] + 1e-3
+
+
+def test_an_alignment_by_the_first_poses():
+    """A path that is half as long again after its fifth second is right until then."""
+    truth, drifting = along_x(1.0, 10.0), along_x(1.0, 10.0)
+    late = np.maximum(drifting.t - 5.0, 0.0)
+    poses = drifting.poses + np.column_stack((0.5 * late + 3.0, 0.0 * late, 0.0 * late))
+    found = score(replace(drifting, poses=poses), truth, align="se2", align_poses=50)
+    assert found.transform.translation[0] == pytest.approx(-3.0)
+    assert found.figures["ape.position_max"] == pytest.approx(2.5)
+    refusal(lambda: score(drifting, truth, align_poses=50), "align_poses is 50")
+
+
+def test_relative_errors_over_other_pieces():
+    figures = score(along_x(1.1), along_x(1.0), delta=["5m", "2s"]).figures
+    assert figures["rpe_5m.position_rmse"] == pytest.approx(0.5, abs=0.05)
+    assert figures["rpe_2s.position_rmse"] == pytest.approx(0.2)
+    assert figures["rpe_2s.pieces"] == 5
+    refusal(lambda: score(along_x(), along_x(), delta=["2 h"]), "delta is '2 h'")
 
 
 def in_space(t, positions, rotations):

@@ -141,15 +141,16 @@ IDENTITY = Similarity(np.eye(3), np.zeros(3))
 def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Similarity:
     """The similarity that moves the ``estimate`` onto the ``reference``, poses of equal number N.
 
-    ``none``: the identity. ``origin``: of the first pose onto the first. ``se2``, ``se3`` and ``sim3``: least squares of the
-    positions, by a planar motion, a motion in space, and one with a scale. InputError if the poses do not determine it.
+    ``none``: the identity. ``origin``: of the first pose onto the first. ``se2``, ``yaw``, ``se3`` and ``sim3``: least squares of
+    the positions, by a planar motion, one in space that turns about the vertical, any motion in space, and one with a scale.
+    InputError if the poses do not determine it.
     """
     if how == "none":
         return IDENTITY
     if how == "origin":
         if without := next((path for path in (estimate, reference) if not path.has_rotations), None):
             raise InputError(
-                f"{without.name}: has no headings, which --align origin needs: expected none, se2, se3 or sim3"
+                f"{without.name}: has no headings, which --align origin needs: expected none, se2, yaw, se3 or sim3"
             )
         rotation = reference.rotations[0] @ estimate.rotations[0].T
         return Similarity(rotation, reference.positions[0] - rotation @ estimate.positions[0])
@@ -157,20 +158,22 @@ def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Simila
         raise InputError(
             f"{estimate.name}: {len(estimate)} poses are paired with {reference.name}, expected at least {FEWEST} for --align {how}"
         )
-    if how == "se2":
-        return _planar(estimate, reference)
+    if how in ("se2", "yaw"):
+        return _planar(estimate, reference, how)
     return _umeyama(estimate, reference, with_scale=how == "sim3")
 
 
-def _planar(estimate: PosePath, reference: PosePath) -> Similarity:
+def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similarity:
+    """The motion in the plane; with ``yaw`` also along the vertical."""
     points, targets = estimate.positions[:, :2], reference.positions[:, :2]
     for path, places in ((estimate, points), (reference, targets)):
         if np.abs(places - places[0]).max() <= _DEGENERATE * max(1.0, float(np.abs(places).max())):
             raise InputError(
-                f"{path.name}: all positions are one, which --align se2 cannot turn, expected a robot that moves"
+                f"{path.name}: all positions are one, which --align {how} cannot turn, expected a robot that moves"
             )
     x, y, angle = align_points(points, targets)
-    return Similarity(upright(np.array([angle]))[0], np.array((x, y, 0.0)))
+    rise = float(np.mean(reference.positions[:, 2] - estimate.positions[:, 2])) if how == "yaw" else 0.0
+    return Similarity(upright(np.array([angle]))[0], np.array((x, y, rise)))
 
 
 def _umeyama(estimate: PosePath, reference: PosePath, *, with_scale: bool) -> Similarity:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 ESTIMATE, REFERENCE = "estimate", "reference"
 TITLES = {"rmse": "RMSE", "p95": "95 %"}
+UNITS = {"position": "m", "rotation": "rad"}
 ERRORS = {
     "absolute position [m]": "ape.position",
     "absolute rotation [rad]": "ape.rotation",
@@ -72,8 +73,9 @@ def _trajectories(score: TrajectoryScore) -> Figure:
 def _errors(score: TrajectoryScore) -> Figure:
     """Each error over time, and the distribution of the absolute ones."""
     kinds = {"absolute": score.ape, "over 1 m of path": score.rpe_per_m, "over 1 s": score.rpe_per_s}
+    kinds |= {f"over {delta}": errors for delta, errors in score.rpe.items()}
     known = {name: errors for name, errors in kinds.items() if errors is not None and len(errors.position)}
-    units = {"position": "m"} if score.ape.rotation is None else {"position": "m", "rotation": "rad"}
+    units = {"position": "m"} if score.ape.rotation is None else UNITS
     figure, axes = grid(len(units), len(known) + 1, 3.5 * len(units), "errors")
     x, label = _abscissa(score)
     for row, (what, unit) in zip(axes, units.items(), strict=True):
@@ -98,10 +100,12 @@ def _abscissa(score: TrajectoryScore) -> tuple[Array, str]:
 
 def errors_table(score: TrajectoryScore) -> Rows:
     """The statistics of the errors that are defined, a row for each kind."""
-    figures = score.figures
+    figures, titles = score.figures, dict(ERRORS)
+    for delta in score.rpe:
+        titles |= {f"{what} per {delta} [{unit}]": f"rpe_{delta}.{what}" for what, unit in UNITS.items()}
     rows = [
         (title, *(number(figures[f"{key}_{how}"]) for how in HOW))
-        for title, key in ERRORS.items()
+        for title, key in titles.items()
         if figures[f"{key}_rmse"] is not None
     ]
     return ("error", *(TITLES.get(how, how) for how in HOW)), rows

@@ -7,6 +7,7 @@ package evo.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -60,8 +61,9 @@ class TrajectoryScore:
 
     ``estimate`` (aligned), ``reference``: N associated poses each. ``transform``: from the frame of the estimate to that of the
     reference. ``ape``: absolute errors (N,). ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a
-    second; None without rotations or stamps. ``lengths`` [m] and ``poses`` of the whole estimate and of the whole reference.
-    ``settings``: of association and alignment. ``warnings``: one for each doubt.
+    second; None without rotations or stamps. ``rpe``: by other distances and durations, such as ``5m``. ``lengths`` [m] and
+    ``poses`` of the whole estimate and of the whole reference. ``settings``: of association and alignment. ``warnings``: one for
+    each doubt.
     """
 
     estimate: PosePath
@@ -70,6 +72,7 @@ class TrajectoryScore:
     ape: PoseErrors
     rpe_per_m: PoseErrors | None
     rpe_per_s: PoseErrors | None
+    rpe: Mapping[str, PoseErrors]
     lengths: tuple[float, float]
     poses: tuple[int, int]
     settings: dict[str, Any]
@@ -85,7 +88,8 @@ class TrajectoryScore:
         """
         figures: dict[str, float | None] = {"pairs": len(self.estimate)}
         figures |= self.ape.figures("ape")
-        for name, errors in (("rpe_per_m", self.rpe_per_m), ("rpe_per_s", self.rpe_per_s)):
+        others = [(f"rpe_{delta}", errors) for delta, errors in self.rpe.items()]
+        for name, errors in (("rpe_per_m", self.rpe_per_m), ("rpe_per_s", self.rpe_per_s), *others):
             known = errors or _NONE
             figures |= known.figures(name) | {f"{name}.pieces": len(known.position) if errors else None}
         return figures
@@ -126,27 +130,42 @@ def score_paths(
     max_diff: float = MAX_DIFF,
     max_gap: float = MAX_GAP,
     all_pairs: bool = False,
+    align_poses: int | None = None,
+    delta: Sequence[str] = (),
 ) -> TrajectoryScore:
     """Compare an estimate with a reference.
 
     ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`; ``se2`` compares both seen from above.
+    ``align_poses``: number of the first poses that determine the alignment, by default all. ``delta``: further distances and
+    durations of relative errors, such as ``5m`` or ``2s``.
     ``associate_by``, ``max_diff``, ``max_gap``: see :func:`~factorgraph_loc.evaluation.trajectories.association.associate`.
     ``all_pairs``: relative errors over all pairs of poses about as far apart, not over pieces one after the other. InputError if
     the two have nothing in common, or do not determine the alignment.
     """
     _check(align, associate_by, max_diff, max_gap)
+    if align_poses is not None and (align_poses < 1 or align in ("none", "origin")):
+        raise InputError(f"align_poses is {align_poses}, expected 1 or more, and align se2, yaw, se3 or sim3")
+    deltas = {text: _delta(text) for text in delta}
     require_poses(estimate)
     require_poses(reference)
     pair = associate(estimate, reference, associate_by, max_diff=max_diff, max_gap=max_gap)
     aligned, truth = pair.estimate, pair.reference
     if align == "se2":
         aligned, truth = aligned.seen_from_above(), truth.seen_from_above()
-    transform = alignment(aligned, truth, align)
+    first = np.arange(len(aligned))[:align_poses]
+    transform = alignment(aligned.rows(first), truth.rows(first), align)
     aligned = transform.of(aligned)
     settings: dict[str, Any] = {"align": align, "associate": associate_by, "all_pairs": all_pairs}
+    settings |= {} if align_poses is None else {"align_poses": align_poses}
     if aligned.t_ns is not None and truth.t_ns is not None:
         settings |= {"max_diff": max_diff} if associate_by == "nearest" else {"max_gap": max_gap}
-    errors = pose_errors(replace(pair, estimate=aligned, reference=truth), all_pairs=all_pairs)
+    moved = replace(pair, estimate=aligned, reference=truth)
+    errors = pose_errors(moved, all_pairs=all_pairs)
+    others = {
+        text: found
+        for text, (length, unit) in deltas.items()
+        if (found := relative_errors(moved, length, unit, all_pairs=all_pairs)) is not None
+    }
     lengths = float(_steps(estimate).sum()), float(_steps(reference).sum())
     poses = len(estimate), len(reference)
     warnings = [*estimate.warnings, *reference.warnings, *_doubts(estimate, reference, associate_by, align)]
@@ -157,7 +176,7 @@ def score_paths(
         )
         values = estimate.name, len(aligned), min(poses), max_diff, reference.name
         warnings.append(notice("few_pairs", sentence, *values))
-    return TrajectoryScore(aligned, truth, transform, *errors, lengths, poses, settings, tuple(warnings))
+    return TrajectoryScore(aligned, truth, transform, *errors, others, lengths, poses, settings, tuple(warnings))
 
 
 def pose_errors(
@@ -167,15 +186,35 @@ def pose_errors(
     estimate, truth = pair.estimate, pair.reference
     distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
     ape = PoseErrors(distance, None, np.arange(len(estimate)))
+    if estimate.has_rotations and truth.has_rotations:
+        ape = replace(ape, rotation=_angles(estimate.rotations.transpose(0, 2, 1) @ truth.rotations))
+    per_m, per_s = (relative_errors(pair, DELTA, unit, all_pairs=all_pairs) for unit in "ms")
+    return ape, per_m, per_s
+
+
+def relative_errors(pair: Associated, length: float, unit: str, *, all_pairs: bool = False) -> PoseErrors | None:
+    """Relative errors over pieces of a ``length`` in a ``unit``, m of path or s; None without rotations, or without stamps."""
+    estimate, truth = pair.estimate, pair.reference
     if not (estimate.has_rotations and truth.has_rotations):
-        return ape, None, None
-    ape = replace(ape, rotation=_angles(estimate.rotations.transpose(0, 2, 1) @ truth.rotations))
-    path = _steps(truth if pair.from_reference else estimate)
-    per_m = _relative(estimate, truth, path, DELTA, pair.gaps, all_pairs=all_pairs)
+        return None
+    if unit == "m":
+        path = _steps(truth if pair.from_reference else estimate)
+        return _relative(estimate, truth, path, length, pair.gaps, all_pairs=all_pairs)
     if (t := _seconds(estimate, truth)) is None:
-        return ape, per_m, None
+        return None
     gaps = np.union1d(pair.gaps, pauses(t))
-    return ape, per_m, _relative(estimate, truth, np.diff(t), DELTA - TOLERANCE, gaps, all_pairs=all_pairs)
+    return _relative(estimate, truth, np.diff(t), length - TOLERANCE, gaps, all_pairs=all_pairs)
+
+
+def _delta(text: str) -> tuple[float, str]:
+    """The length and unit of a distance or duration such as ``5m`` or ``0.5s``; InputError for other text."""
+    try:
+        length = float(text[:-1])
+    except ValueError:
+        length = np.nan
+    if text[-1:] not in ("m", "s") or not 0.0 < length < np.inf:
+        raise InputError(f"delta is {quoted(text)}, expected a distance or a duration, such as 5m or 2s")
+    return length, text[-1]
 
 
 def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> None:

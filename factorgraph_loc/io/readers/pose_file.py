@@ -92,7 +92,8 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
         matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
     warnings: list[Notice] = []
-    columns, separator, usual = (EUROC, ",", "ns") if detected == "euroc" else (TUM, " ", "s")
+    columns, usual = (EUROC, "ns") if detected == "euroc" else (TUM, "s")
+    separator: Literal[" ", ","] = "," if detected == "euroc" else " "
     unit = _unit(first, separator) or usual
     if unit != usual:
         sentence = "{source}: the stamps are read in {unit}, by their size, not in {usual}"
