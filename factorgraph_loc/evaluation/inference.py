@@ -227,15 +227,15 @@ def independent_count(values: Array) -> float:
     return max(1.0, min(float(n), n / max(time, 1.0)))
 
 
-def mean_nees_band(counts: Sequence[float], dof: float) -> tuple[float, float]:
-    """The 95 % band of a consistent estimator: mean over logs of the mean NEES per degree of freedom.
+def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float, float]:
+    """The 95 % band of the mean over logs of the mean NEES, for a consistent estimator.
 
-    ``counts``: effective number of independent values of each log. The mean over logs is approximated by a chi-square
-    distribution with matched variance.
-    """
-    matched = dof * len(counts) ** 2 / float(np.sum(1.0 / np.asarray(counts, dtype=float)))
+    ``counts``: effective number of independent values of each log; ``dofs``: its degrees of freedom. The band is that of a
+    chi-square distribution with the same mean and variance."""
+    expected = float(np.mean(dofs))
+    matched = (expected * len(dofs)) ** 2 / float(np.sum(np.asarray(dofs) / np.asarray(counts, dtype=float)))
     tail = (1.0 - CONFIDENCE) / 2.0
-    low, high = chi_squared.quantile((tail, 1.0 - tail), matched) / matched
+    low, high = expected * chi_squared.quantile((tail, 1.0 - tail), matched) / matched
     return float(low), float(high)
 
 

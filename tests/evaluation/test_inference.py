@@ -130,11 +130,11 @@ def test_independent_count_of_an_autoregression(memory):
 
 
 def test_band_holds_the_mean_of_consistent_logs():
-    """Three logs of unequal length: 95 % of 2000 means lie within; fewer than 1850 or more than 1950 in one of 10^4."""
+    """Three unequal logs, one without headings: 95 % of 2000 means lie within; fewer than 1850 or more than 1950 in one of 10^4."""
     rng = np.random.default_rng(3)
-    counts, dof = (20, 60, 400), 3
-    low, high = mean_nees_band(counts, dof)
-    means = np.mean([rng.chisquare(dof, (2000, n)).mean(axis=1) / dof for n in counts], axis=0)
+    counts, dofs = (20, 60, 400), (3, 2, 3)
+    low, high = mean_nees_band(counts, dofs)
+    means = np.mean([rng.chisquare(dof, (2000, n)).mean(axis=1) for n, dof in zip(counts, dofs, strict=True)], axis=0)
     assert 1850 <= np.sum((low <= means) & (means <= high)) <= 1950
 
 

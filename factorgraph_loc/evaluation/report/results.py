@@ -42,9 +42,9 @@ class RunData:
     """The data read from all runs.
 
     ``tracks``: by log, its scene and thinned trajectories, as plain values. ``errors``: by kind, then by variant and log,
-    quantiles of the position error [m]. ``nees``: by variant and log, mean NEES of the causal poses per degree of freedom;
-    ``trust``: by variant, the mean over logs and its 95 % band for correct covariances. ``configs``: the configuration of each
-    drawn run, by its description.
+    quantiles of the position error [m]. ``nees``: by variant and log, mean NEES of the causal poses; ``trust``: by variant, the
+    mean over logs and its 95 % band for correct covariances. ``configs``: the configuration of each drawn run, by its
+    description.
     """
 
     tracks: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -99,7 +99,7 @@ def read_runs(results: Results, metric: str, runs: Runs) -> RunData:
             left -= len(drawn)
     for variant, values in counts.items():
         means, independent, dofs = zip(*values, strict=True)
-        band = mean_nees_band(independent, sum(dofs) / len(dofs))
+        band = mean_nees_band(independent, dofs)
         data.trust[variant] = (sum(means) / len(means), *band)
     return data
 

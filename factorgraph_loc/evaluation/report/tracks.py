@@ -98,10 +98,10 @@ def quantiles(errors: Sequence[Array]) -> Array:
 
 
 def consistency(estimates: Estimates) -> tuple[float, float, int] | None:
-    """Mean NEES per degree of freedom, its effective number of independent values, and the degrees of freedom; None without any."""
+    """Mean NEES, its effective number of independent values, and the degrees of freedom; None without any."""
     nees = _known(estimates.errors["nees"])
     dof = 3 if len(_known(estimates.errors["error_heading"])) else 2
-    return (float(np.mean(nees)) / dof, independent_count(nees), dof) if len(nees) > 1 else None
+    return (float(np.mean(nees)), independent_count(nees), dof) if len(nees) > 1 else None
 
 
 def _known(values: Array) -> Array:
