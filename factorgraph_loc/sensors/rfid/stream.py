@@ -227,10 +227,10 @@ def check(m: RfidScan, where: str) -> dict[str, Any]:
     antenna = values.integers(where, PLACE, m.antenna, len(tags))
     if np.any((antenna < 0) | (antenna >= len(antennas))):
         raise bad_field(where, "antenna", antenna.tolist(), f"indices of its {len(antennas)} antennas, from 0")
-    told = {
+    columns = {
         column.name: values.within(where, column, getattr(m, column.name), (len(tags),)) for column in READS.columns
     }
-    return {"tags": tags, "antennas": antennas, "antenna": antenna, **told}
+    return {"tags": tags, "antennas": antennas, "antenna": antenna, **columns}
 
 
 def along_reference(
