@@ -20,7 +20,7 @@ from factors.se2 import Integers
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
 
-EpcCase = Literal["as written", "upper", "lower"]
+EpcCase = Literal["as written", "upper", "lower", "ascii-hex"]
 Alternatives = tuple[str, ...]  # columns; one of them is required
 Value = bool | int | str
 
@@ -33,7 +33,7 @@ class ReadNames(FileModel):
     antennas: dict[str, str] = Field(default_factory=dict)
     """names in the rig of those of the reads"""
     epc_case: EpcCase = "as written"
-    """letter case of EPCs when they are compared with the map"""
+    """letter case of EPCs when they are compared with the map; ascii-hex if they are hexadecimal digits of a text"""
 
 
 class ColumnMapping(FileModel):
@@ -175,10 +175,20 @@ class TableFolder:
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
-    """EPCs in the letter case of the comparison with the map."""
+    """EPCs in the letter case of the comparison with the map, or decoded; those that cannot be decoded are unchanged."""
     if case == "as written":
         return list(epcs)
+    if case == "ascii-hex":
+        return [text_of_hex(epc) or epc for epc in epcs]
     return [epc.upper() if case == "upper" else epc.lower() for epc in epcs]
+
+
+def text_of_hex(digits: str) -> str:
+    """The ASCII text whose bytes are these hexadecimal digits; "" for others."""
+    try:
+        return bytes.fromhex(digits).decode("ascii").rstrip("\0")
+    except ValueError:
+        return ""
 
 
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
@@ -291,4 +301,10 @@ def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
         entries = content if isinstance(content, list) else [content]
         if not all(isinstance(entry, dict) for entry in entries):
             raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
-        yield from ((row, dict(flattened(entry))) for entry in entries)
+        # old versions of sllurp write each number as a list of one
+        yield from ((row, {name: _alone(value) for name, value in flattened(entry)}) for entry in entries)
+
+
+def _alone(value: Any) -> Any:
+    """The element of a list of one; any other value itself."""
+    return value[0] if isinstance(value, list) and len(value) == 1 else value

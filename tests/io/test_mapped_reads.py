@@ -7,6 +7,9 @@ import pytest
 from mapped_hall import MANIFEST, READS, WHEELS
 from recorded_logs import recorded_log
 
+from factorgraph_loc import Tag, World
+from factorgraph_loc.evaluation.inspect import inspect
+
 
 def test_events_of_an_r700_as_json_lines(hall, with_options, one):
     def event(t, antenna):
@@ -63,6 +66,19 @@ def test_events_of_an_r700_with_epcs_in_base64(hall, with_options, one, refused)
     refused(manifest({"epc": "a"}), "events.json:1", "tagInventoryEvent.epc is 'a', expected an EPC in base64")
     refused(manifest({}, {"epc": ""}), "events.json:2", "tagInventoryEvent.epc is '', expected the EPC of a tag")
     refused(manifest({"epc": None}), "no object has 'tagInventoryEvent.epcHex', the first has eventType, hostname")
+
+
+def test_epcs_that_are_digits_of_a_text(hall, with_options, one):
+    """Digits that are no text are EPCs as they are; a line has lists of one, as old versions of sllurp write them."""
+    lines = [{"EPC-96": epc, "AntennaID": [1], "LastSeenTimestampUTC": [1_500_000]} for epc in ("453230303031", "E2FF")]
+    (hall.parent / "run" / "old.json").write_text("\n".join(map(json.dumps, lines)))
+    columns = 'columns = { epc = "EPC-96", antenna = "AntennaID", t = "LastSeenTimestampUTC" }\nunits = { t = "us" }'
+    options = f'{WHEELS}\n[options.rfid]\nfile = "old.json"\nepc_case = "ascii-hex"\n{columns}\n'
+    assert one(with_options(options)).streams["rfid"].epc == ["E20001", "E2FF"]
+    read = one(
+        with_options(options.replace('epc_case = "ascii-hex"', "")), world=World(tags={"E20001": Tag(x=1.0, y=2.0)})
+    )
+    assert "coded_epcs" in [problem.kind for problem in inspect(read).problems]
 
 
 def test_phases_and_channels_in_rows_of_sllurp(hall, with_options, one):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_loc.files.column_mapping import text_of_hex
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
@@ -138,6 +139,9 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
     if misspelt := in_other_case(found.unknown, found.unread):
         sentence = "tags are in the map with other capital letters: {names}: set epc_case for reads or map"
         out.append(notice("other_case", sentence, listed(misspelt, SHOWN)))
+    if coded := [epc for epc in found.unknown if text_of_hex(epc) in log.world.tags]:
+        sentence = 'reads have the text of tags as hexadecimal digits: {names}: set epc_case = "ascii-hex"'
+        out.append(notice("coded_epcs", sentence, listed(coded, SHOWN)))
     carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
         notice("unknown_antenna", UNKNOWN_ANTENNA, name, antenna.reads, antenna.rounds)
