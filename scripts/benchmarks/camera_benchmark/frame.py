@@ -56,6 +56,6 @@ def sentence(known: Sequence[FrameKnown]) -> str:
     least = np.sqrt(np.mean([one.least**2 for one in known]))
     return (
         f"The starts have a mean NEES of {np.mean([one.nees for one in known]):.2f} (95 % of such draws: {low:.2f} to {high:.2f}), "
-        "which without tags is part of that of all poses. With tags and the exact shape of the path the error would still be "
+        "and without tags all poses of a run have this error. With tags and the exact shape of the path the error would still be "
         f"{least:.4f} m (Cramer-Rao bound)."
     )

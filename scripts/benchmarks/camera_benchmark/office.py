@@ -72,8 +72,8 @@ def accuracy(report: Report, found: Attempts) -> None:
 
 def comparisons(report: Report, found: Attempts) -> None:
     report.say(
-        "Final position RMSE over that of the smoother with all sensors, with a 95 % interval over the offices, and the largest "
-        "ratio of one office."
+        "Final position RMSE, divided by that of the smoother with all sensors. In brackets: 95 % interval over offices. "
+        "*Largest*: ratio of one office."
     )
     rows = []
     for label in (*CONFIGS, *SLOW):

@@ -72,8 +72,8 @@ def accuracy(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
 
 def unknown_starts(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
     report.say(
-        "Unknown start with detections: seconds from the first scan until the error is below "
-        f"{POSITION} m for {HOLD:.0f} s, for each odometry seed."
+        "With an unknown start and detections, the error is below "
+        f"{POSITION} m for {HOLD:.0f} s after this time from the first scan, for each odometry seed."
     )
     rows = []
     for estimator in ESTIMATORS:

@@ -68,8 +68,8 @@ def section(options: Options) -> Report:
         rows.append((case.what, *values, *ratio_cells(mine, theirs), *anees))
     report.say(
         f"`office`, {DURATION:.0f} s, learnt on seeds {LEARNT_ON[0]} to {LEARNT_ON[-1]}, tried on {seeds[0]} to {seeds[-1]}. "
-        "*Ratio*: causal error of the smoother with the learnt rig over that with the rig of the simulation, with a 95 % "
-        "interval over worlds. *Worst*: the largest of a single world."
+        "*Ratio*: causal error of the smoother with the learnt rig, divided by its error with the rig of the simulation. In "
+        "brackets: 95 % interval over worlds. *Worst*: the largest ratio of a single world."
     )
     heads = (
         "rig at hand",

@@ -61,7 +61,7 @@ def section(options: Options) -> Report:
     outcomes = report.collect(measured, {(job.what, job.tags, job.seed): (job,) for job in jobs})
     report.say(
         f"{len(seeds)} runs of each kind in a hall of 100 x 60 m, each in a new world. *Right in time*: within {START:.0f} s of an "
-        f"unknown start, within {RETURN:.0f} s of each of two kidnappings, and for 10 s from then on. *Busy*: processor time of a "
+        f"unknown start, or within {RETURN:.0f} s of a kidnapping, and for 10 s from then on. *Busy*: processor time of a "
         "tenth of a second of the log with at most one scan, 99.9th percentile and largest."
     )
     rows: list[tuple[str, ...]] = []

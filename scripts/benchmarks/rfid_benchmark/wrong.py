@@ -68,9 +68,9 @@ def section(options: Options) -> Report:
                 unsure = np.mean([1.0 - run.share("localized") for run in mine])
                 rows.append((case.what, name, *causal, *anees, f"{100 * unsure:.0f} %"))
     report.say(
-        f"`office`, {len(seeds)} worlds of {DURATION:.0f} s. *Ratio*: causal error over that of an estimator with the right "
-        "range, read probability and tags, and a tempering for bursts, with a 95 % interval over worlds. *Worst*: the largest of "
-        "a single world. *ANEES, knowing*: of that estimator."
+        f"`office`, {len(seeds)} worlds of {DURATION:.0f} s. *Ratio*: causal error, divided by that of a knowing estimator. It "
+        "has the right range, read probability and tags, and a tempering for bursts. In brackets: 95 % interval over worlds. "
+        "*Worst*: the largest ratio of a single world. *ANEES, knowing*: of the knowing estimator."
     )
     heads = ("wrong", "estimator", "ratio", "worst", "ANEES", "ANEES, knowing", "not localized")
     report.table(heads, rows)
