@@ -13,6 +13,7 @@ from factors.landmarks import kernels
 from factors.landmarks.model import (
     CONSTANTS,
     EXACT,
+    HEIGHT,
     PARAMETERS,
     POINT,
     TIME_OFFSET,
@@ -37,10 +38,11 @@ LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolut
 class BearingRangeFactor:
     """K landmarks seen at one time, as a factor on the robot's pose at that time or shortly before.
 
-    ``points`` (K, 2): positions of the landmarks; ``point_covariances`` (K, 2, 2) of an inexact map are added to the noise.
-    ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose, from odometry; its body-frame
-    covariance ``offset_covariance`` (3, 3) is added to the noise. This error is common to all landmarks of the measurement;
-    ``in_look``: their number including those in other factors, by default K. ``twist`` (3,): the robot's velocity at that time.
+    ``points`` (K, 2): positions of the landmarks, or (K, 3) with their heights above the sensor; ``point_covariances`` (K, 2, 2) of
+    an inexact map are added to the noise. ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose,
+    from odometry; its body-frame covariance ``offset_covariance`` (3, 3) is added to the noise. This error is common to all
+    landmarks of the measurement; ``in_look``: their number including those in other factors, by default K. ``twist`` (3,): the
+    robot's velocity at that time.
 
     The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
     if any; and, if ``free``, the position (2,) of the one landmark, instead of ``points``.
@@ -128,7 +130,7 @@ class BearingRangeFactor:
         if self.estimated:
             changes[list(self.estimated)] = values[1]
         if self.free:
-            packed = (np.reshape(values[-1], (1, 2)), *packed[1:])
+            packed = (self._placed(values[-1]), *packed[1:])
         error, jacobian = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
         kernels.linearize(self.model.packed, values[0], changes, packed, error, jacobian)
         blocks = [jacobian[..., :POINT]]
@@ -148,8 +150,12 @@ class BearingRangeFactor:
             model = recalibrated(model, [changes.get(i, 0.0) for i in range(len(PARAMETERS))])
             offset = delayed(offset, self.twist, changes.get(TIME_OFFSET, 0.0))
         noises, measured = (self.offset_covariance, self.point_covariances), (self.ranges, self.bearings)
-        points = self.points if point is None else point[None]
+        points = self.points if point is None else self._placed(point)
         return BearingRangeFactor(model, points, *measured, offset, *noises, twist=self.twist, in_look=self.in_look)
+
+    def _placed(self, point: Array) -> Array:
+        """The one landmark at ``point`` (2,), with its height if it has one."""
+        return np.concatenate((np.reshape(point, (1, 2)), self.points[:1, HEIGHT:]), axis=1)
 
     def dof(self) -> int:
         """Number of measured ranges and bearings."""

@@ -1,5 +1,6 @@
 """The measurement model of identified landmarks: bearing and range, or range only (ranging beacons).
 
+Ranges are slant ranges where landmarks have a height above the sensor.
 The sensor is mounted on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and ``bearing =
 direction in the sensor frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 6.40). A camera
 that measures range by apparent size reports depth instead of distance: the distance times the cosine of the direction. The noise is
@@ -26,6 +27,7 @@ POINT, CONSTANTS, WIDTH = 3, 5, 11
 EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
 # indices in ``packed``, after the constants that PARAMETERS change
 TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST = range(TIME_OFFSET, TIME_OFFSET + 6)
+HEIGHT = 2  # column of the height above the sensor in points that have one
 MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
 
 
@@ -58,14 +60,25 @@ class BearingRangeModel:
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:
-    """Predicted range [m] and bearing [rad] of ``points`` (..., 2) in the world from ``poses`` (..., 3)."""
+    """Predicted range [m] and bearing [rad] of ``points`` (..., 2) in the world from ``poses`` (..., 3); or of points (..., 3)
+    whose last coordinate is their height above the sensor."""
     sensors = se2.compose(poses, np.array(model.mounting))
-    local = se2.transform_to(sensors, points)
+    local = se2.transform_to(sensors, points[..., :2])
     distance = np.hypot(local[..., 0], local[..., 1])
+    if points.shape[-1] > HEIGHT:
+        distance = np.hypot(distance, points[..., HEIGHT])
     if model.depth:
         distance = math.cos(model.depth_axis) * local[..., 0] + math.sin(model.depth_axis) * local[..., 1]
     bearing = np.arctan2(local[..., 1], local[..., 0])
     return model.range_scale * distance, se2.wrap(bearing + model.bearing_bias)
+
+
+def on_floor(model: BearingRangeModel, points: Array, ranges: Array) -> Array:
+    """Ranges (K,) to points (K, 3) with heights as ranges along the floor, or those to points (K, 2) unchanged."""
+    if points.shape[1] <= HEIGHT:
+        return ranges
+    squared = np.square(ranges / model.range_scale) - np.square(points[:, HEIGHT])
+    return np.asarray(model.range_scale * np.sqrt(np.maximum(squared, 0.0)))
 
 
 def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
@@ -145,15 +158,16 @@ def whitened_into(
         dx, dy = points[k, 0] - pose[0], points[k, 1] - pose[1]
         px, py = c * dx + s * dy, c * dy - s * dx  # in the robot frame
         sx, sy = px - mounting[0], py - mounting[1]
-        error[k, 0], error[k, 1], distance, vx, vy, weight = _whitened(
-            sx, sy, mounting[2], model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
+        height = points[k, HEIGHT] if points.shape[1] > HEIGHT else 0.0
+        error[k, 0], error[k, 1], distance, vx, vy, reach, weight = _whitened(
+            sx, sy, height, mounting[2], model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
         )
         ux, uy = sx / distance, sy / distance
         if not math.isnan(ranges[k]):
             weight *= range_scale
             jacobian[k, 0, 0], jacobian[k, 0, 1] = -vx * weight, -vy * weight
             jacobian[k, 0, 2] = (vx * py - vy * px) * weight
-            jacobian[k, 0, CONSTANTS + 3] = (vx * sx + vy * sy) * weight
+            jacobian[k, 0, CONSTANTS + 3] = reach * weight
             jacobian[k, 0, CONSTANTS + 4] = (ahead_x * sy - ahead_y * sx) * weight if depth else 0.0
         if not math.isnan(bearings[k]):
             weight = 1.0 / (distance * bearing_sigma)
@@ -171,6 +185,7 @@ def whitened_into(
 def _whitened(
     sx: float,
     sy: float,
+    height: float,
     turn: float,
     model: tuple[float, float, float, float, float],
     depth: bool,
@@ -178,20 +193,28 @@ def _whitened(
     ahead_y: float,
     measured_range: float,
     measured_bearing: float,
-) -> tuple[float, float, float, float, float, float]:
-    """Whitened errors of range and bearing, zero if missing, of a point at (sx, sy) from the sensor in the robot's axes; its
-    distance; the gradient direction of the range; and the inverse standard deviation of the range."""
+) -> tuple[float, float, float, float, float, float, float]:
+    """Whitened errors of range and bearing, zero if missing, of a point at (sx, sy, height) from the sensor in robot axes; its
+    distance on the floor; the gradient of the range by sx and sy; the unscaled range; and the inverse standard deviation of the
+    range."""
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0
     distance = max(math.sqrt(sx * sx + sy * sy), 1e-6)
-    vx, vy = (ahead_x, ahead_y) if depth else (sx / distance, sy / distance)
+    if depth:
+        vx, vy, reach = ahead_x, ahead_y, ahead_x * sx + ahead_y * sy
+    elif height == 0.0:
+        vx, vy = sx / distance, sy / distance
+        reach = vx * sx + vy * sy
+    else:
+        reach = math.sqrt(sx * sx + sy * sy + height * height)
+        vx, vy = sx / reach, sy / reach
     if not math.isnan(measured_range):
         weight = 1.0 / math.sqrt(range_sigma**2 + (range_sigma_relative * measured_range) ** 2)
-        range_error = (range_scale * (vx * sx + vy * sy) - measured_range) * weight
+        range_error = (range_scale * reach - measured_range) * weight
     if not math.isnan(measured_bearing):
         angle = math.atan2(sy, sx) - turn + bearing_bias - measured_bearing
         bearing_error = (angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))) / bearing_sigma
-    return range_error, bearing_error, distance, vx, vy, weight
+    return range_error, bearing_error, distance, vx, vy, reach, weight
 
 
 def log_likelihood(
@@ -252,8 +275,9 @@ def _squared(
         for k in range(len(points)):
             dx, dy = points[k, 0] - poses[i, 0], points[k, 1] - poses[i, 1]
             sx, sy = c * dx + s * dy - x, c * dy - s * dx - y
-            range_error, bearing_error, distance, vx, vy, weight = _whitened(
-                sx, sy, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
+            height = points[k, HEIGHT] if points.shape[1] > HEIGHT else 0.0
+            range_error, bearing_error, distance, vx, vy, _, weight = _whitened(
+                sx, sy, height, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
             )
             squared[i, k] = range_error**2 + bearing_error**2
             if len(covariances):

@@ -80,7 +80,11 @@ def test_a_mounting_that_is_off_is_no_clock(log):
         ahead = replace(SETTINGS.model(), mounting=(forward, 0.0, 0.0))
         ranges, bearings = bearing_range.predict(ahead, log.reference.at(sightings.t), places)
         moved = replace(sightings, range=np.hypot(ranges, height), bearing=bearings)
-        assert motion_problems(replace(log, streams=log.streams | {"bearing_range": moved})) == []
+        assert [
+            p
+            for p in motion_problems(replace(log, streams=log.streams | {"bearing_range": moved}))
+            if p.kind != "height"
+        ] == []
 
 
 def test_at_constant_speed_no_clock_can_be_off(log):

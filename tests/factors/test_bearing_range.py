@@ -92,7 +92,7 @@ def test_the_compiled_function_gives_what_its_plain_twins_give(model, pose, seed
     assert not jacobian[1, 0].any()
     assert not jacobian[2, 1].any()
     for found, by_itself in zip((error, jacobian), each, strict=True):
-        np.testing.assert_array_equal(found, by_itself)
+        np.testing.assert_allclose(found, by_itself, rtol=1e-12, atol=1e-12)
 
 
 def test_depth_is_the_distance_along_the_axis():

@@ -92,13 +92,12 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
         matrices = read_matrices(path)
         return PosePath(str(path), matrices[:, :, 3], matrices[:, :, :3], None)
     warnings: list[Notice] = []
-    columns, usual = (EUROC, "ns") if detected == "euroc" else (TUM, "s")
-    separator: Literal[" ", ","] = "," if detected == "euroc" else " "
-    unit = _unit(first, separator) or usual
-    if unit != usual:
-        sentence = "{source}: the stamps are read in {unit}, by their size, not in {usual}"
-        warnings.append(notice("unit_of_stamps", sentence, path.name, unit, usual))
-    cells = _read(path, columns, separator, unit)
+    unit = "s" if detected == "tum" else "ns"
+    if detected == "tum" and (larger := _unit(first)) not in (None, "s"):
+        unit = str(larger)
+        sentence = "{source}: the stamps are read in {unit}, by their size, not in seconds"
+        warnings.append(notice("unit_of_stamps", sentence, path.name, unit))
+    cells = _read(path, TUM, " ", unit) if detected == "tum" else _read(path, EUROC, ",", unit)
     cells = replace(cells, labels={})  # names of columns say more than numbers
     table = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[1:]])
     t_ns = cells.stamps("t")
@@ -107,10 +106,10 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
     return replace(PosePath(str(path), table[:, :3], rotations, t_ns).rows(keep), warnings=tuple(warnings))
 
 
-def _unit(first: str, separator: str) -> str | None:
+def _unit(first: str) -> str | None:
     """The unit of the timestamp of a row, by its size; None if it is no time since 1970."""
     try:
-        return unit_since_1970(float(first.replace(separator, " ").split()[0]))
+        return unit_since_1970(float(first.split(maxsplit=1)[0]))
     except ValueError:
         return None
 

@@ -23,6 +23,7 @@ from factorgraph_loc.sensors.calibrating import ConstantsCalibrator, Residuals, 
 from factorgraph_loc.sensors.landmarks.measurement import (
     BearingRangeSettings,
     BearingRangeStream,
+    points_of,
 )
 from factorgraph_loc.sensors.smoothed import REFERENCE_GAP
 from factors import se2
@@ -43,7 +44,7 @@ FIRST = BearingRangeSettings(range_sigma=0.1)  # settings of an unknown sensor
 
 @dataclass(frozen=True)
 class Sightings:
-    """K sightings of landmarks of the map: timestamps ``t`` (K,) by the sensor's clock, ``points`` (K, 2), ``ranges`` and
+    """K sightings of landmarks of the map: timestamps ``t`` (K,) by the sensor's clock, ``points`` (K, 2) or (K, 3), ``ranges`` and
     ``bearings`` (K,). ``sound`` (K, 2): probability of range and bearing not to be gross errors."""
 
     log: Log
@@ -132,7 +133,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
             )
         stamp = np.unique(stream.t[good], return_inverse=True)[1]
         rows = np.flatnonzero(good)[stamp % max(1, round(count / MOST_SIGHTINGS)) == 0]
-        points = log.world.positions()[landmark[rows]]
+        settings = log.rig.find(BearingRangeSettings) or FIRST
+        points = points_of(log.world.landmarks.values(), settings.z)[landmark[rows]]
         return Sightings(log, stream.t[rows], points, stream.range[rows], bearings[rows], np.ones((len(rows), 2)))
 
     def parameters(self, parts: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:

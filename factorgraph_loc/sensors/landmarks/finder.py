@@ -26,7 +26,7 @@ from factorgraph_loc.sensors.landmarks.window import Sighting, SightingWindow
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
 from factors.landmarks.factor import BearingRangeFactor
-from factors.landmarks.model import BearingRangeModel
+from factors.landmarks.model import HEIGHT, BearingRangeModel, on_floor
 from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
@@ -127,8 +127,9 @@ class LandmarkFinder:
     def add(self, odometry: ChainState, factor: BearingRangeFactor) -> None:
         """Add landmarks seen at ``odometry``; late and repeated sightings are accepted."""
         self._model = factor.model
-        places, values = factor.points.tolist(), zip(factor.ranges.tolist(), factor.bearings.tolist(), strict=True)
-        for point, (x, y), (distance, bearing) in zip(factor.points, places, values, strict=True):
+        points, ranges = factor.points[:, :HEIGHT], on_floor(factor.model, factor.points, factor.ranges)
+        places, values = points.tolist(), zip(ranges.tolist(), factor.bearings.tolist(), strict=True)
+        for point, (x, y), (distance, bearing) in zip(points, places, values, strict=True):
             _insert(self._sightings.setdefault((x, y), []), Sighting(odometry, point, distance, bearing))
         self.forget(odometry.t - DURATION)
 

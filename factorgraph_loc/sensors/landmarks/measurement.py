@@ -1,6 +1,6 @@
 """Measurements of identified landmarks, their stream, and its table."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -107,6 +107,8 @@ class BearingRangeSettings(SensorSettings):
     """position of the sensor on the robot, forward"""
     y: Offset = 0.0
     """position of the sensor on the robot, to the left"""
+    z: Offset = 0.0
+    """height of the sensor, by which ranges to landmarks with another height are slant ranges"""
     heading: Angle = 0.0
     """direction of the sensor on the robot"""
     bearing_bias: Angle = 0.0
@@ -154,19 +156,26 @@ class SightingSettings(FileModel):
 
 
 class Landmark(FileModel):
-    """A point landmark: position [m] in the world frame and its uncertainty.
+    """A point landmark: position [m] in the world frame, its height ``z``, and its uncertainty.
 
     ``sigma``: standard deviation of the survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], instead of ``sigma``.
     """
 
     x: Coordinate
     y: Coordinate
+    z: Coordinate = 0.0
     sigma: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     covariance: Covariance | None = None
 
     def spread(self) -> Array:
         """The covariance (2, 2) of the position [m^2]."""
         return spread_of(self.sigma, self.covariance)
+
+
+def points_of(landmarks: Iterable[Landmark], z: float) -> Array:
+    """Positions (K, 2) of landmarks, or (K, 3) with their heights above a sensor at ``z`` [m] if any has another height."""
+    places = np.array([(mark.x, mark.y, mark.z - z) for mark in landmarks]).reshape(-1, 3)
+    return places if places[:, 2].any() else np.ascontiguousarray(places[:, :2])
 
 
 SIGMAS = ("sigma", "sigma_x", "sigma_y")
@@ -176,18 +185,20 @@ LANDMARKS = Table(
         named("landmark", "the name of a landmark"),
         within("x", LENGTH, FARTHEST, "position in the world"),
         within("y", LENGTH, FARTHEST, "position in the world"),
+        within("z", LENGTH, FARTHEST, "height"),
         *(number(name, LENGTH, 0.0, 100.0, "standard deviation of the survey", may_lack=True) for name in SIGMAS),
     ),
 )
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """The landmarks of a world file: inline, or in a foreign table with a mapping to the fields landmark, x, y and optionally
-    sigma, or sigma_x and sigma_y; the larger one is used. InputError names file, row and field of an invalid value, or of a
+    """The landmarks of a world file: inline, or in a foreign table with a mapping to the fields landmark, x, y and optionally z,
+    and sigma, or sigma_x and sigma_y; the larger one is used. InputError names file, row and field of an invalid value, or of a
     duplicate name."""
     if not isinstance(content, dict) or not isinstance(content.get("file"), str):
         return content
-    mapping, position = parse_model(ColumnMapping, content, f"{source} [landmarks]"), ("landmark", "x", "y")
+    mapping = parse_model(ColumnMapping, content, f"{source} [landmarks]")
+    position = ("landmark", "x", "y", *(("z",) if "z" in mapping.columns else ()))
     path = inside(folder, mapping.file, source)
     cells = read_mapped(path, mapping, (position, (*position, "sigma"), (*position, "sigma_x", "sigma_y")))
     if "sigma_x" in cells.columns:

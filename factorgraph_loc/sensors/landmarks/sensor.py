@@ -16,7 +16,7 @@ from factorgraph_loc.model.setup import MapUse
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.base import Binding, Blocks, Columns, NewVariable, ResidualObservation, Sensor, Term, View
 from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings, points_of
 from factors import positive
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
@@ -27,6 +27,7 @@ from factors.se2 import Array
 from factors.update import GATE, Correction
 
 NamedFactor = tuple[str, BearingRangeFactor]
+NOWHERE = np.zeros(2)  # of a landmark that is not in the map
 EXACT = 0.2  # landmarks whose survey has a sigma below this share of `range_sigma` are exact
 
 
@@ -50,7 +51,7 @@ class KnownLandmarks:
     ) -> None:
         self._model = settings.model()
         landmarks = {} if use == "unknown" else world.landmarks
-        self._positions = {name: np.array((m.x, m.y)) for name, m in landmarks.items()}
+        self._positions = dict(zip(landmarks, points_of(landmarks.values(), settings.z), strict=True))
         limit = 2.0 * (EXACT * settings.range_sigma) ** 2
         surveys = {name: m.spread() for name, m in landmarks.items()}
         self._surveys = {name: survey for name, survey in surveys.items() if np.trace(survey) > limit}
@@ -101,7 +102,10 @@ class KnownLandmarks:
             )
 
         of_surveyed, of_unknown = (
-            [(m.landmarks[i], replace(of_rows([i], np.zeros((1, 2))), free=True)) for i in rows]
+            [
+                (m.landmarks[i], replace(of_rows([i], self._positions.get(m.landmarks[i], NOWHERE)[None]), free=True))
+                for i in rows
+            ]
             for rows in (surveyed, unknown)
         )
         if not fixed:
@@ -115,7 +119,7 @@ class KnownLandmarks:
 
     def survey(self, name: str) -> tuple[Array, Array]:
         """Position (2,) and covariance (2, 2) of a landmark in the map."""
-        return self._positions[name], self._surveys[name]
+        return self._positions[name][:2], self._surveys[name]
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
@@ -270,7 +274,7 @@ class LandmarkSensor(Sensor):
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
             if view.value(block) is None:  # the estimator does not estimate it
-                prior = replace(factor, points=position[None], point_covariances=spread[None], free=False)
+                prior = replace(factor, point_covariances=spread[None], free=False)
                 terms.append(Term(prior, self._shared, 2))
             else:
                 terms.append(Term(factor, (*self._shared, block), 2))

@@ -19,6 +19,7 @@ from factorgraph_loc.sensors.landmarks.measurement import (
     BearingRangeSettings,
     BearingRangeStream,
     SightingSettings,
+    points_of,
 )
 from factors import se2
 from factors.compiled import compiled
@@ -33,10 +34,9 @@ def simulate(ride: Ride) -> Simulated:
     if not ride.world.landmarks:
         return Simulated()
     settings, times = ride.settings.sightings, ride.times(ride.settings.sightings.rate)
-    model, poses = ride.rig.of(BearingRangeSettings).model(), ride.truth.at(times)
-    return Simulated(
-        {"bearing_range": sighting_stream(model, ride.world, times, poses, settings, ride.rng("landmarks"))}
-    )
+    sensor, poses = ride.rig.of(BearingRangeSettings), ride.truth.at(times)
+    look = times, poses, settings, ride.rng("landmarks"), sensor.z
+    return Simulated({"bearing_range": sighting_stream(sensor.model(), ride.world, *look)})
 
 
 def looks(settings: Any) -> dict[str, float]:
@@ -53,9 +53,11 @@ def sighting_stream(
     poses: Array,
     settings: SightingSettings,
     rng: np.random.Generator,
+    z: float = 0.0,
 ) -> BearingRangeStream:
-    """Sightings at ``times`` (N,) from ``poses`` (N, 3): the landmarks in range, in the field of view and not behind a wall."""
-    points, names = world.positions(), list(world.landmarks)
+    """Sightings at ``times`` (N,) from ``poses`` (N, 3): the landmarks in range, in the field of view and not behind a wall, of a
+    sensor at ``z`` [m]."""
+    points, names = points_of(world.landmarks.values(), z), list(world.landmarks)
     n, k = in_sight(model, world, poses, settings)
     ranges, bearings = bearing_range.predict(model, poses[n], points[k])
     sigma = bearing_range.sigmas(model, ranges)

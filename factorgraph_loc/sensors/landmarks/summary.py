@@ -32,7 +32,7 @@ from factorgraph_loc.sensors.interfaces import (
     Use,
     in_other_case,
 )
-from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, points_of
 from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.landmarks import model as bearing_range
@@ -44,6 +44,7 @@ MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
 MIN_PASSES = 3
 PASS = 10.0  # s; errors within a pass are correlated, so passes are counted, not sightings
 MOST = 2000  # sightings that are compared at time shifts
+TALL = 0.5  # m; minimum difference of heights that is reported
 MOUNTING = (0.5, 0.0, 0.0, 0.0)  # m, m, m, rad: initial height, x, y and turn of a sensor whose mounting is estimated
 _REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
 
@@ -125,8 +126,8 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
         or not isinstance(stream, BearingRangeStream)
     ):
         return {}
-    model = log.rig.of(BearingRangeSettings).model()
-    t = stream.t + log.rig.time_offset("bearing_range")
+    settings = log.rig.of(BearingRangeSettings)
+    model, t = settings.model(), stream.t + log.rig.time_offset("bearing_range")
     sensors = se2.compose(log.reference.at(t, max_gap=_REFERENCE_GAP + ROUNDING), np.array(model.mounting))
     ranges = stream.range / model.range_scale
     bearings = stream.bearing - model.bearing_bias
@@ -135,9 +136,10 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
     names = np.array(stream.landmark, dtype=str)
     usable = np.isfinite(sensors[:, :2]).all(axis=1) & np.isfinite(ranges)
     out = {}
-    for name in log.world.landmarks:
+    for name, mark in log.world.landmarks.items():
         rows = usable & (names == name)
-        out[name] = _Seen(t[rows], sensors[rows], ranges[rows], bearings[rows])
+        along_floor = np.sqrt(np.maximum(np.square(ranges[rows]) - (mark.z - settings.z) ** 2, 0.0))
+        out[name] = _Seen(t[rows], sensors[rows], along_floor, bearings[rows])
     return out
 
 
@@ -209,9 +211,9 @@ def _shifted(log: Log) -> list[Notice]:
     if len(rows) < FEWEST:
         return []
     rows = rows[:: max(1, len(rows) // MOST)]
-    marks = [log.world.landmarks[stream.landmark[i]] for i in rows.tolist()]
-    places = np.array([(mark.x, mark.y) for mark in marks])
-    model, t = log.rig.of(BearingRangeSettings).model(), stream.t[rows] + log.rig.time_offset("bearing_range")
+    settings, t = log.rig.of(BearingRangeSettings), stream.t[rows] + log.rig.time_offset("bearing_range")
+    places = points_of((log.world.landmarks[stream.landmark[i]] for i in rows.tolist()), settings.z)
+    model = settings.model()
 
     def errors(shift: float, height: float = 0.0, x: float = 0.0, y: float = 0.0, turn: float = 0.0) -> Array:
         """Errors (N, 2) in standard deviations, NaN if unknown, after a shift [s] and changes of the mounting [m, rad]."""
@@ -221,19 +223,25 @@ def _shifted(log: Log) -> list[Notice]:
         aside = se2.wrap(bearings - stream.bearing[rows]) / model.bearing_sigma
         return np.column_stack((far, aside if reference.has_heading else np.full_like(far, np.nan)))
 
-    def cost_with_mounting(shift: float) -> float:
-        """The cost at a shift, with the mounting and height that fit best."""
+    def fitted(shift: float) -> tuple[float, float]:
+        """The cost at a shift with the mounting and height that fit best, and that height [m]."""
         start = np.array(MOUNTING if reference.has_heading else MOUNTING[:1])
         fit = scipy.optimize.least_squares(
             lambda mounting: np.nan_to_num(errors(shift, *mounting)).ravel(), start, loss="soft_l1"
         )
-        return _cost(errors(shift, *fit.x.tolist()))
+        return _cost(errors(shift, *fit.x.tolist())), abs(float(fit.x[0]))
 
     shifts = (STEP * SHIFTS).tolist()
-    best = min(shifts, key=lambda shift: _cost(errors(shift)))
-    if abs(best) < LARGE or not cost_with_mounting(best) < BETTER * cost_with_mounting(0.0):
-        return []
-    return [interfaces.line("bearing_range", best, "the reference", "bearing_range", -best)]
+    best, (cost, height) = min(shifts, key=lambda shift: _cost(errors(shift))), fitted(0.0)
+    if abs(best) >= LARGE and fitted(best)[0] < BETTER * cost:
+        return [interfaces.line("bearing_range", best, "the reference", "bearing_range", -best)]
+    if height > TALL and _cost(errors(0.0, height)) < BETTER * _cost(errors(0.0)):
+        sentence = (
+            "ranges near landmarks are too long, as if these were {height:.1f} m above or below the sensor: give z of the "
+            "landmarks, and bearing_range.z of the rig"
+        )
+        return [notice("height", sentence, height)]
+    return []
 
 
 def _cost(errors: Array) -> float:
