@@ -100,8 +100,8 @@ def check(logs: Sequence[Log], *, blind: bool = False) -> None:
             raise InputError(f"{log.name}: has no reference, expected one to calibrate against{more}")
         if not any(_has(log, name) for name in moving(log.streams)):
             raise InputError(f"{log.name}: has no odometry, expected one in every log to calibrate from")
-        if not any(_has(log, sensor) for sensor in senses()) and not has_heading(log):
-            lacking = " and ".join(f"no {sensor}" for sensor in senses())
+        if not any(_has(log, sensor) for sensor in senses(log.rig)) and not has_heading(log):
+            lacking = " and ".join(f"no {sensor}" for sensor in senses(log.rig))
             raise InputError(
                 f"{log.name}: has {lacking}, expected one of them, or headings in the reference, to calibrate wheels alone"
             )
@@ -113,7 +113,7 @@ def check(logs: Sequence[Log], *, blind: bool = False) -> None:
 
 def _check_alike(first: Log, log: Log) -> None:
     """Raise InputError if two logs have other sensors, or streams of other kinds."""
-    for sensor in senses():
+    for sensor in senses(first.rig):
         for one_log, other_log in ((first, log), (log, first)):
             if _has(one_log, sensor) and not _has(other_log, sensor):
                 raise InputError(f"{other_log.name}: has no {sensor}, expected one in every log to calibrate from")

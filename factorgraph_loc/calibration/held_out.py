@@ -70,7 +70,7 @@ def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
 
 def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list[Trial]:
     """Both estimators on held-out stretches, with both rigs. A rig that lacks what its sensors need is not tried."""
-    complete = all(calibrator.is_complete(initial) for calibrator in calibrators().values())
+    complete = all(calibrator.is_complete(initial) for calibrator in calibrators(initial).values())
     rigs = {"learnt": learnt} | ({"input": initial} if complete else {})
     out = []
     for test in tests:

@@ -8,7 +8,6 @@ their standard errors.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,8 @@ from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.sensors.calibrating import Calibrator, SensorKnowledge
+from factorgraph_loc.model.sections import kind_of
+from factorgraph_loc.sensors.calibrating import Calibrator, OneOfSeveral, SensorKnowledge
 from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.sensors.smoothed import Traced
 from factorgraph_loc.text import Notice, notice
@@ -57,15 +57,17 @@ class Knowledge:
         return tuple(notes)
 
 
-@cache
-def calibrators() -> Mapping[str, Calibrator]:
-    """The calibrators of all sensors that have one, by name."""
-    return dict(functions("calibrator"))
+def calibrators(rig: Rig) -> Mapping[str, Calibrator]:
+    """The calibrators of all sensors that have one, by name; each of several of a kind in the ``rig`` has its own."""
+    return {
+        name: calibrator if kind_of(name) == name else OneOfSeveral(calibrator, name)
+        for name, calibrator in functions("calibrator", rig)
+    }
 
 
-def senses() -> tuple[str, ...]:
+def senses(rig: Rig) -> tuple[str, ...]:
     """The exteroceptive channels that can be calibrated."""
-    return tuple(calibrator.channel for calibrator in calibrators().values() if calibrator.senses)
+    return tuple(calibrator.channel for calibrator in calibrators(rig).values() if calibrator.senses)
 
 
 def learn(
@@ -80,7 +82,7 @@ def learn(
     that each is a problem of its own."""
     traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]
     sensors, learnt = {}, rig
-    for name, calibrator in calibrators().items():
+    for name, calibrator in calibrators(rig).items():
         known = None if like is None else like.sensors.get(name)
         sensors[name] = calibrator.learn(traced, rig, first or rig, grids, known)
         learnt = learnt.model_copy(update=dict(sensors[name].sections))
@@ -89,8 +91,9 @@ def learn(
 
 def sensing(rig: Rig, log: Log) -> Rig:
     """``rig`` with exactly the exteroceptive sensors that the log has, among those that are used."""
-    kept = [name for name in rig.sensors if name not in senses() or name in log.streams]
-    added = [name for name in senses() if name in log.streams and name not in kept]
+    sensed = senses(rig)
+    kept = [name for name in rig.sensors if name not in sensed or name in log.streams]
+    added = [name for name in sensed if name in log.streams and name not in kept]
     return rig.model_copy(update={"sensors": (*kept, *added)})
 
 
@@ -113,7 +116,7 @@ def learn_by_turns(
     """
     rig, turns, fitted = start, list[float](), dict[tuple[str, str], float]()
     while True:
-        for calibrator in calibrators().values():
+        for calibrator in calibrators(start).values():
             rig = calibrator.with_priors(rig, start)
         smoothed = []
         for log in logs:

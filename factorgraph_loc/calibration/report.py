@@ -15,7 +15,7 @@ from factorgraph_loc.drawing.pages import Part, Picture, Rows, sectioned
 from factorgraph_loc.files.settings import settings_in
 from factorgraph_loc.fitting.posterior import FittedConstant
 from factorgraph_loc.model.scoring import KINDS
-from factorgraph_loc.model.sections import sections
+from factorgraph_loc.model.sections import kind_of, sections
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.calibrating import Residuals
 from factorgraph_loc.text import listed, number
@@ -121,7 +121,7 @@ def page(calibration: Calibration) -> str:
         )
         content["Accuracy"] = [explained, accuracy_table(calibration)]
     for name, sensor in calibration.knowledge.sensors.items():
-        parts = [*_tables(sensor.figures), *calibrators()[name].pictures(sensor)]
+        parts = [*_tables(sensor.figures), *calibrators(calibration.rig)[name].pictures(sensor)]
         if sensor.residuals:
             parts.append(_residuals_figure(sensor.residuals))
         if parts:
@@ -180,8 +180,9 @@ def _residuals_figure(logs: Sequence[Residuals]) -> Picture:
 
 
 def _correlations(calibration: Calibration) -> list[tuple[str, str, float]]:
+    known = {name: calibrator.section for name, calibrator in calibrators(calibration.rig).items()}
     return [
-        (f"{calibrators()[name].section}.{a}", f"{calibrators()[name].section}.{b}", rho)
+        (f"{known[name]}.{a}", f"{known[name]}.{b}", rho)
         for name, sensor in calibration.knowledge.sensors.items()
         for a, b, rho in sensor.correlations
     ]
@@ -196,6 +197,6 @@ def _name(c: FittedConstant) -> str:
 
 
 def _label(c: FittedConstant) -> str:
-    settings = settings_in(load(sections()[c.sensor].kind))
+    settings = settings_in(load(sections()[kind_of(c.sensor)].kind))
     unit = next((setting.unit for setting in settings if setting.key == c.name), "")
     return f"{_name(c)} [{unit}]" if unit else _name(c)

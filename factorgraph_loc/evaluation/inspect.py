@@ -1,13 +1,14 @@
 """Inspection of a log: its content and its problems."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from factorgraph_loc.io.checks import gap_warnings, long_gaps
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.sensors.interfaces import Summary
 from factorgraph_loc.sensors.registry import functions
 from factorgraph_loc.text import Notice, notice
@@ -36,8 +37,11 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The results of all sensors, by key (``unseen``, ``rfid``, ...)."""
-        return {key: value for summary in self.sensors.values() for key, value in summary.found.items()}
+        """The results of all sensors, by key (``unseen``, ``rfid``, ...); those of one of several below its name."""
+        entries: dict[str, Any] = {}
+        for name, summary in self.sensors.items():
+            entries |= summary.found if kind_of(name) == name else {name: dict(summary.found)}
+        return entries
 
     @property
     def in_map(self) -> dict[str, int]:
@@ -56,9 +60,24 @@ def inspect(log: Log) -> Inspection:
     problems += [notice("empty_stream", "{stream} is empty", name) for name in empty]
     for name, summary in (*streams.items(), *([("reference", reference)] if reference else [])):
         problems += gap_warnings(name, summary.gaps)
-    sensors = {name: summarize(log) for name, summarize in functions("summarize")}
-    problems += [problem for summary in sensors.values() for problem in summary.problems]
+    sensors = {name: _about(name, summarize(log.alone(name))) for name, summarize in functions("summarize", log.rig)}
+    problems += [problem for name in sensors for problem in _problems(name, sensors)]
     return Inspection(streams, reference, tuple(dict.fromkeys(problems)), sensors)
+
+
+def _about(name: str, summary: Summary) -> Summary:
+    """A summary whose lines begin with the name of the sensor if it is one of several."""
+    if kind_of(name) == name:
+        return summary
+    text = [replace(paragraph, line=f"{name}: {paragraph.line}") for paragraph in summary.text]
+    return replace(summary, problems=[problem.about(name) for problem in summary.problems], text=text)
+
+
+def _problems(name: str, sensors: Mapping[str, Summary]) -> list[Notice]:
+    """The problems of a sensor. What it does not detect is one only if no other of its kind does."""
+    of_kind = [summary for each, summary in sensors.items() if kind_of(each) == kind_of(name)]
+    undetected = [each for each in sensors[name].undetected if all(each in summary.undetected for summary in of_kind)]
+    return [*sensors[name].problems, *undetected]
 
 
 def _summary(t: Array) -> StreamSummary:

@@ -26,6 +26,7 @@ from factorgraph_loc.mapping.tag_mapping import MadeTags
 from factorgraph_loc.model.belief import EXACT_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log, StartPose
 from factorgraph_loc.model.scoring import RunConfig
+from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import MAP_ESTIMATORS
 from factorgraph_loc.sensors.camera.frontend import with_features
@@ -153,7 +154,8 @@ def _mappable(log: Log) -> set[str]:
     return {
         sensor.detects
         for sensor in sensors().values()
-        if sensor.detects and (first := sensor.channels[0].name) in log.streams and not lacking_section(log.rig, first)
+        for name in log.streams
+        if sensor.detects and kind_of(name) == sensor.channels[0].name and not lacking_section(log.rig, name)
     }
 
 

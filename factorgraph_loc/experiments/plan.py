@@ -26,6 +26,7 @@ from factorgraph_loc.experiments.log_source import LogSource, RecordedSource, Si
 from factorgraph_loc.files.data_root import named_path
 from factorgraph_loc.files.models import nearest, set_key
 from factorgraph_loc.model.scoring import RunConfig, check_prior
+from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.text import quoted
 
 
@@ -258,7 +259,7 @@ def _check(logs: Sequence[_PlannedLog], sensors: Sequence[tuple[str, ...] | None
     names = [log.name for log in logs]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"two logs are called {twice[0]}, expected different names")
-    known = list(dict.fromkeys(sensor for log in logs for sensor in log.sensors))
+    known = list(dict.fromkeys(name for log in logs for sensor in log.sensors for name in (sensor, kind_of(sensor))))
     for sensor in (candidate for several in sensors for candidate in several or ()):
         if sensor not in known:
             raise InputError(f"no log has a sensor {quoted(sensor)}{nearest(sensor, known)}")

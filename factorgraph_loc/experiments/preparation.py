@@ -10,6 +10,7 @@ from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import EXACT_SIGMA, HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.scoring import PRIORS, parse_position
+from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.sensors.interfaces import Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
 from factorgraph_loc.text import Notice, listed, notice, quoted
@@ -87,6 +88,7 @@ def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """The sensors to use: those of the rig that the log has, or ``asked``, which must be available."""
     available = (*log.streams, *_filled_columns(log))
+    asked = None if asked is None else log.rig.expanded(asked)
     for sensor in asked or ():
         parent = parent_of(sensor)
         if parent and parent not in (asked or ()):
@@ -114,7 +116,8 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
     available = (*log.streams, *_filled_columns(log))
     sentence = "{log}: the rig lists the sensor {sensor}, the log has none"
     doubts = [notice("no_stream", sentence, log.name, s) for s in log.rig.sensors if s not in available]
-    lacking = {s: section for s in log.streams if s in log.rig.sensors and (section := lacking_section(log.rig, s))}
+    kinds = {kind_of(sensor) for sensor in log.rig.sensors}
+    lacking = {s: section for s in log.streams if kind_of(s) in kinds and (section := lacking_section(log.rig, s))}
     for section in dict.fromkeys(lacking.values()):
         names = ", ".join(name for name, of in lacking.items() if of == section)
         sentence = "{log}: {sensors} left out, as the rig {rig} has no [{section}]"

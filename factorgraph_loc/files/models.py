@@ -188,7 +188,9 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
         if isinstance(part, int):  # index in a list of models
             continue
         field = kind.model_fields.get(str(part))
-        nested = field.annotation if field is not None else None
+        if field is None:  # name of one of several
+            continue
+        nested = field.annotation
         if get_origin(nested) is dict:
             next(parts, None)  # key in a dict
         options = [nested, *get_args(nested)]
@@ -201,11 +203,15 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
 
 def nearest(word: str, known: list[str]) -> str:
     """A hint for a misspelt word: the most similar known one, else all of them."""
-    short = [name for name in known if len(name) <= NAME][:MOST_NAMES]
-    matches = difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
-    if matches:
+    if matches := similar(word, known):
         return f": did you mean {plain(matches[0])}?"
     return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
+
+
+def similar(word: str, known: list[str]) -> list[str]:
+    """The most similar known word, if there is one."""
+    short = [name for name in known if len(name) <= NAME][:MOST_NAMES]
+    return difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
 
 
 def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> None:

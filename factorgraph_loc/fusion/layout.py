@@ -62,7 +62,7 @@ def on_pose(observation: Observation, view: View) -> Observation:
 def learnt_from(
     constants: Mapping[str, Estimated], blocks: Iterable[tuple[str, Array, Array]], points: PointMap | None = None
 ) -> Learnt:
-    """The ``constants`` by sensor and the landmarks ``SENSOR/NAME`` among ``blocks``, each a name, mean and covariance.
+    """The ``constants`` by sensor and the landmarks ``KIND/NAME`` among ``blocks``, each a name, mean and covariance.
 
     Blocks of points in space are left out; ``points``: those that are not in the map."""
     values: dict[str, tuple[float, float]] = {}

@@ -12,9 +12,10 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.checks import ROUNDING
 from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column, farthest
 from factorgraph_loc.model.log import Log
+from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
-from factorgraph_loc.sensors.registry import channels
+from factorgraph_loc.sensors.registry import channel, channels
 from factorgraph_loc.sensors.tables import columns_of
 from factorgraph_loc.text import Notice, listed, notice
 from factors.se2 import Array
@@ -27,7 +28,7 @@ TOLERANCE = 1e-9  # relative tolerance for converted values
 def require_bounds(log: Log) -> None:
     """InputError at the first value of a log that is outside of its column's bounds, with its time."""
     for name, stream in log.streams.items():
-        for column in columns_of(channels()[name], stream) if name in channels() else ():
+        for column in columns_of(channel(name), stream) if kind_of(name) in channels() else ():
             _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
     if log.reference is not None:
         known = ("x", "y", "heading") if log.reference.has_heading else ("x", "y")
@@ -116,11 +117,11 @@ def look_over(log: Log) -> list[Notice]:
     for name, stream in log.streams.items():
         if name != "odometry" and (early := int(np.count_nonzero(stream.t < odometry.t[0]))):
             warnings.append(notice("early_rows", "{stream}: {rows} rows come before the first odometry", name, early))
-    sightings = log.streams.get("bearing_range")
-    if isinstance(sightings, BearingRangeStream):
-        unknown = [name for name in sightings.landmark if name not in log.world.landmarks]
-        if unknown:
-            names = listed(sorted(set(unknown)))
-            sentence = "bearing_range: {rows} rows name landmarks that the map lacks: {landmarks}"
-            warnings.append(notice("unknown_landmarks", sentence, len(unknown), names))
+    for name, stream in log.streams.items():
+        if isinstance(stream, BearingRangeStream):
+            unknown = [landmark for landmark in stream.landmark if landmark not in log.world.landmarks]
+            if unknown:
+                names = listed(sorted(set(unknown)))
+                sentence = "{stream}: {rows} rows name landmarks that the map lacks: {landmarks}"
+                warnings.append(notice("unknown_landmarks", sentence, name, len(unknown), names))
     return warnings

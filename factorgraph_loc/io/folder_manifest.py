@@ -16,8 +16,9 @@ from factorgraph_loc.files.column_mapping import TableFolder
 from factorgraph_loc.files.models import parse_model, read_text
 from factorgraph_loc.io.guesses import TRUTH, Guess, guess
 from factorgraph_loc.io.motions import wheel_steps
-from factorgraph_loc.io.proposals import Proposal, proposal_of, toml_of
+from factorgraph_loc.io.proposals import Proposal, distinct, proposal_of, toml_of
 from factorgraph_loc.io.readers.mapped import ReferenceFile, read_reference
+from factorgraph_loc.model.sections import kind_of, several
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import LISTED, listed, quoted
 from factors.se2 import Array
@@ -95,6 +96,9 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
         )
     beside = [] if "world" in options or any(path.parent.glob("*.world.toml")) else _map_in_parent(path, roles)
     roles.remarks += beside
+    for role in [role for role in options if kind_of(role) != role]:
+        kind, _, own = role.partition(".")
+        options.setdefault(kind, {})[own] = options.pop(role)
     return proposal_of("mapped", path, folder, options, roles.remarks, with_map=not beside and "world" not in options)
 
 
@@ -141,12 +145,17 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
     out = _Roles()
     poses = [g for g in guesses if g.has("t", "x", "y") and not g.has("epc") and not g.has("landmark")]
     truths = [g for g in poses if TRUTH.search(g.name)]
+    by_role: dict[str, list[Guess]] = {}
     for table in guesses:
-        role = _role(table)
-        if role is not None and role not in out.tables:
-            out.tables[role] = table
-        elif role is not None:
-            out.remarks.append(f"{role} could also be {table.name}")
+        if (role := _role(table)) is not None:
+            by_role.setdefault(role, []).append(table)
+    for role, tables in by_role.items():
+        if role in several() and len(tables) > 1:
+            names = distinct([Path(table.name).stem for table in tables])
+            out.tables |= {f"{role}.{name}": table for name, table in zip(names, tables, strict=True)}
+            continue
+        out.tables[role] = tables[0]
+        out.remarks += [f"{role} could also be {table.name}" for table in tables[1:]]
     rest = [g for g in poses if g not in out.tables.values() and g not in truths]
     if "odometry" not in out.tables and rest:
         out.tables["odometry"] = rest.pop(0)
@@ -187,7 +196,7 @@ def _described(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, 
         settings = table.mapping(("t", *sides))
         _add_sizes(settings, table, sides, roles, path)
         return settings
-    settings = table.mapping(("t", "v", "w") if role == "odometry" and table.has("v", "w") else FIELDS[role])
+    settings = table.mapping(("t", "v", "w") if role == "odometry" and table.has("v", "w") else FIELDS[kind_of(role)])
     if role == "reference" and not _has_headings(table):
         settings["has_heading"] = False
     return settings

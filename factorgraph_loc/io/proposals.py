@@ -1,5 +1,6 @@
 """Proposed manifests, with remarks on what they assume."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +8,8 @@ from typing import Any
 
 import tomli_w
 
+from factorgraph_loc.files.several import by_name
+from factorgraph_loc.model.sections import several
 from factorgraph_loc.text import plain
 
 COMPANIONS = {
@@ -55,6 +58,7 @@ def proposal_of(
 
 def toml_of(content: Mapping[str, Any], name: str = "") -> str:
     """Settings as TOML, or as the table ``name``: values, then tables, whose own tables are in braces."""
+    content = {each: settings for key, value in content.items() for each, settings in _sensors(key, value).items()}
     tables = {key: value for key, value in content.items() if isinstance(value, dict)}
     values = [_line(key, value) for key, value in content.items() if key not in tables]
     parts = ["\n".join([f"[{name}]", *values] if name else values)] if values else []
@@ -62,6 +66,22 @@ def toml_of(content: Mapping[str, Any], name: str = "") -> str:
         header = f"[{name}.{key}]" if name else f"[{key}]"
         parts.append("\n".join([header, *(_line(*entry) for entry in table.items())]))
     return "\n\n".join(parts) + "\n"
+
+
+def _sensors(key: str, value: Any) -> dict[str, Any]:
+    """The tables of several sensors of a kind, each by its key; any other value by its own."""
+    if key in several() and all(isinstance(settings, dict) for settings in value.values()):
+        return by_name(key, value)
+    return {key: value}
+
+
+def distinct(names: Sequence[str]) -> list[str]:
+    """Short names of several sensors: the words in the ``names`` of their topics or files that not all have."""
+    words = [re.findall(r"[^\W_]+", name) for name in names]
+    common = set.intersection(*map(set, words))
+    short = ["_".join(word for word in own if word not in common) for own in words]
+    are_clear = all(short) and len({name.casefold() for name in short}) == len(short)
+    return short if are_clear else [f"sensor_{number}" for number in range(1, len(names) + 1)]
 
 
 def _line(key: str, value: Any) -> str:

@@ -22,7 +22,7 @@ from factorgraph_loc.fusion.guarded import Guard, sound, sound_belief, sound_tra
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import HEADING_SIGMA, POSITION_SIGMA, Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Measurement, Tick, named
+from factorgraph_loc.model.measurement import Measurement, Tick, channel_of, named
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.scoring import Ticks
 from factorgraph_loc.model.setup import MapFrame
@@ -178,7 +178,9 @@ class Localizer:
         self._last: PoseEstimate | None = None  # latest estimate, None after a change
         known = channels()
         self._intakes: dict[str, Intake] = {
-            name: load(known[name].intake)(self._rig, self._world) for name in self._sensors if known[name].intake
+            name: load(known[name].intake)(self._rig, self._world)
+            for name in self._sensors
+            if name in known and known[name].intake
         }
 
     def _require_whole(self) -> None:
@@ -194,8 +196,8 @@ class Localizer:
     def _take(self, m: Measurement) -> None:
         if (estimator := self._estimator) is None or self._failure is not None:
             estimator = self._begun(named(m))
-        if (offset := self._offsets.get(m.sensor)) is None:
-            estimator.diagnostics.ignore(f"{m.sensor} is not among the sensors")
+        if (offset := self._offsets.get(channel_of(m))) is None:
+            estimator.diagnostics.ignore(f"{channel_of(m)} is not among the sensors")
             return
         if offset:
             m = replace(m, t=m.t + offset)  # type: ignore[type-var]
@@ -303,7 +305,7 @@ def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
         raise bad_field("Localizer()", "sensors", asked, "names of sensors")
     for name in asked:
         sensor_of(name if isinstance(name, str) else quoted(name))
-    return tuple(name for name in asked if not lacking_section(rig, name))
+    return tuple(name for name in rig.expanded(asked) if not lacking_section(rig, name))
 
 
 def prior_of(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:

@@ -1,5 +1,7 @@
 """A recorded or simulated run: rig, world, measurements by sensor, and the reference trajectory if there is one."""
 
+from __future__ import annotations
+
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.measurement import Measurement, Rows, Stream, joined, selected
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.sections import as_only, kind_of
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.text import Notice, well_formed
@@ -93,6 +96,13 @@ class Log:
             first = last
             yield m
         yield from _pieces(rows, late, first, len(arrived))
+
+    def alone(self, sensor: str) -> Log:
+        """The log with one of several sensors as the only one of its kind; unchanged for a name without a dot."""
+        if kind_of(sensor) == sensor:
+            return self
+        streams = {name: self.streams[old] for name, old in as_only(self.streams, sensor).items()}
+        return replace(self, rig=self.rig.alone(sensor), streams=streams)
 
     def _in_order(self, sensors: Sequence[str]) -> list[str]:
         """The streams of ``sensors``, in the order of their measurements at equal times."""

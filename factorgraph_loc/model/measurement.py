@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.model.sections import kind_of
 from factors.se2 import Array
 
 GOING_BACK = 5.0  # s that an estimator goes back in time, at most, to process a late measurement
@@ -41,6 +42,11 @@ class Measurement(Protocol):
     def count(self) -> int: ...
     @property
     def is_motion(self) -> bool: ...
+
+
+def channel_of(m: Measurement) -> str:
+    """The channel of a measurement in a log: its source if it comes from one of several sensors of a kind."""
+    return m.source if kind_of(m.source) == m.sensor else m.sensor
 
 
 def named(m: Measurement) -> str:
@@ -152,6 +158,11 @@ class ScanStream(Stream):
             parts = (column[i:j] for column in self._columns())
             values = (part if isinstance(part, np.ndarray) else tuple(part) for part in parts)
             yield self._made(float(self.t[i]) + offset, *values)
+
+
+def of_sensor(stream: Stream, name: str) -> Stream:
+    """The stream of a channel; the ``name`` of one of several sensors of a kind is its source."""
+    return stream if kind_of(name) == name else replace(stream, source=name)
 
 
 def columns_of(stream: Stream) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 Classes and functions are given as places, ``package.module:name``, and loaded when they are first used.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -16,10 +16,12 @@ from factorgraph_loc.text import plain
 @dataclass(frozen=True)
 class Section:
     """A section of a rig. ``kind``: its class, a :class:`~factorgraph_loc.files.models.FileModel`; ``always``: whether a rig
-    without the section gets the default one."""
+    without the section gets the default one. ``several``: whether a rig may have several such sensors by name,
+    ``[section.NAME]``. Their channel, its only table and the modality of its measurements have the name of the section then."""
 
     kind: Place
     always: bool = False
+    several: bool = False
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,23 @@ def sections() -> dict[str, Section]:
 def sections_of_channels() -> dict[str, str]:
     """The rig section of each channel."""
     return {channel.name: channel.section for sensor in registered().values() for channel in sensor.channels}
+
+
+@cache
+def several() -> frozenset[str]:
+    """The kinds of sensors that a rig may have several times, each with a name."""
+    return frozenset(name for name, section in sections().items() if section.several)
+
+
+def kind_of(name: str) -> str:
+    """The section or channel of a sensor by its name: ``bearing_range`` of ``bearing_range.front``."""
+    return name.partition(".")[0]
+
+
+def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
+    """``names`` without the other sensors of the kind of ``chosen``, by new names: ``chosen`` has the name of its kind."""
+    kind = kind_of(chosen)
+    return {kind if name == chosen else name: name for name in names if name == chosen or kind_of(name) != kind}
 
 
 def layers() -> dict[str, Layer]:

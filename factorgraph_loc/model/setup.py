@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_loc.model.belief import Belief, PoseEstimate, PosePrior
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.sections import as_only, kind_of
 from factorgraph_loc.model.settings import SensorSettings
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -24,6 +25,11 @@ class Setup:
     world: World
     sensors: tuple[str, ...]
     rng: np.random.Generator
+
+    def alone(self, sensor: str) -> Setup:
+        """The arguments with one of several sensors as the only one of its kind (:meth:`~factorgraph_loc.model.rig.Rig.alone`);
+        unchanged for an empty name."""
+        return replace(self, rig=self.rig.alone(sensor), sensors=tuple(as_only(self.sensors, sensor)))
 
 
 MapUse = Literal["known", "extended", "unknown"]
@@ -43,7 +49,7 @@ class MapFrame:
         """The frame of a run, by the settings of its sensors. ``modalities``: those that the estimator uses; ``landmarks``: how it
         uses the map."""
         for name in setup.sensors if landmarks != "unknown" else ():
-            settings = getattr(setup.rig, name, None) if name in modalities else None
+            settings = setup.rig.section(name) if kind_of(name) in modalities else None
             error = settings.map_error(setup.world) if isinstance(settings, SensorSettings) else None
             if error is not None:
                 return cls(error)

@@ -17,7 +17,7 @@ from factorgraph_loc.fusion.guarded import Guard, sound
 from factorgraph_loc.maps.free_space import CELL, FreeSpace, distance_to_walls, free_space
 from factorgraph_loc.model import setup as model_setup
 from factorgraph_loc.model.belief import Belief, Mode, PoseEstimate
-from factorgraph_loc.model.measurement import Measurement, Tick
+from factorgraph_loc.model.measurement import Measurement, Tick, channel_of
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.active_mcl import ActiveMcl
@@ -196,7 +196,7 @@ class _ClosedLoop:
                 self._feed(Tick(self.robot.t))
                 with self._guard.computing("the walls", self.robot.t):
                     self._estimator.see(self.robot.proximity, self.robot.read_proximity())
-            if report.sensor in self.robot.decisive and self._is_sure():
+            if channel_of(report) in self.robot.decisive and self._is_sure():
                 position, heading = self.errors()
                 if position < self._settings.position_limit and heading < self._settings.heading_limit:
                     return True

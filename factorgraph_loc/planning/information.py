@@ -78,7 +78,11 @@ class Sensors:
     ) -> Sensors:
         """The sensors of a rig with the names ``only`` that observe objects in the world, with the rates in a simulation's
         ``settings``."""
-        made = [forecast(world, rig, speed, settings) for name, forecast in functions("forecast") if name in only]
+        made = [
+            forecast(world, rig.alone(name), speed, settings)
+            for name, forecast in functions("forecast", rig)
+            if name in only
+        ]
         # those with goals first: the order affects the rounding of sums
         forecasts = sorted((f for f in made if f is not None), key=lambda f: not len(f.goals))
         return Sensors(odometry_model(rig, constants_as_noise=True), tuple(forecasts), speed / turn_rate)

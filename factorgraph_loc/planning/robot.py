@@ -7,12 +7,14 @@ likelihood is therefore tempered (:data:`TEMPERING`).
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from factorgraph_loc.maps.free_space import FreeSpace
 from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.paths import DIRECTIONS, Path, arc, free_steps
@@ -85,10 +87,12 @@ class SimulatedRobot:
         self.proximity = ProximitySensor(space, settings.sight)
         of = partial(generator, rng.bit_generator.seed_seq, names=DRAWS)
         made = [
-            (name, on_robot(world, simulation.rig, simulation, of(name))) for name, on_robot in functions("on_robot")
+            (name, on_robot(world, simulation.rig.alone(name), simulation, of(name)))
+            for name, on_robot in functions("on_robot", simulation.rig)
         ]
         self.sensors: dict[str, LiveSensor] = {name: sensor for name, sensor in made if sensor is not None}
-        self._order = sorted(self.sensors.values(), key=lambda sensor: not sensor.decides)
+        named = [(name if kind_of(name) != name else sensor.channel, sensor) for name, sensor in self.sensors.items()]
+        self._order = sorted(named, key=lambda entry: not entry[1].decides)  # by channel
         self._measured = [0] * len(self._order)
         self._noise, self._lengths = of("steps"), of("lengths")
         self._scale, self._drift, self._scale_of_turns = of("constants").normal(
@@ -104,12 +108,13 @@ class SimulatedRobot:
     @property
     def channels(self) -> tuple[str, ...]:
         """Channels of its measurements."""
-        return (IncrementOdometry.sensor, *(sensor.channel for sensor in self._order))
+        return (IncrementOdometry.sensor, *(channel for channel, _ in self._order))
 
     @property
     def decisive(self) -> tuple[str, ...]:
         """The channels after whose measurements it checks whether it is localized."""
-        return tuple(sensor.channel for sensor in self._order if sensor.decides or not self._order[0].decides)
+        any_decides = self._order[0][1].decides
+        return tuple(channel for channel, sensor in self._order if sensor.decides or not any_decides)
 
     def begin(self) -> Iterator[Measurement]:
         """Measurements before the first motion: a row of odometry without motion, and one of each sensor."""
@@ -156,10 +161,11 @@ class SimulatedRobot:
 
     def _measure(self) -> Iterator[Measurement]:
         """The measurements of the sensors that are due."""
-        for i, sensor in enumerate(self._order):
+        for i, (channel, sensor) in enumerate(self._order):
             if self.t * sensor.rate >= self._measured[i] - 1e-6:
                 self._measured[i] += 1
-                yield sensor.measure(self.t, self.pose)
+                m = sensor.measure(self.t, self.pose)
+                yield m if kind_of(channel) == channel else replace(m, source=channel)  # type: ignore[type-var]
 
     def _reported_motions(self, path: Array, metres: float) -> Array:
         """Reported motions (N, 3) of one period each along a path, each in the robot's frame before it."""

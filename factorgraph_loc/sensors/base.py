@@ -19,7 +19,6 @@ from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.sensors.registry import functions
 from factors import se2
 from factors.graph import Factor
 from factors.motion import ChainState, Increment
@@ -144,8 +143,8 @@ class Link:
 class Binding:
     """The context of a sensor: a run, the robot's ``motion`` and the diagnostics.
 
-    ``name``: of the sensor, "" for its modality. ``use``: how landmarks of the map are used, ``points``: how its points are
-    used; ``calibration``: which uncertain constants the estimator learns.
+    ``name``: of one of several sensors, the only one of its kind in the setup; "" for the modality. ``use``: how landmarks of the
+    map are used, ``points``: how its points are used; ``calibration``: which uncertain constants the estimator learns.
     """
 
     setup: Setup
@@ -155,12 +154,6 @@ class Binding:
     points: MapUse = "known"
     calibration: Calibration = "all"
     name: str = ""
-
-
-def bound_sensors(binding: Binding) -> dict[str, Sensor]:
-    """The exteroceptive sensors of a run by name."""
-    sensors = [bind(binding) for _, bind in functions("bind")]
-    return {sensor.name: sensor for sensor in sensors if sensor is not None}
 
 
 class View(Protocol):

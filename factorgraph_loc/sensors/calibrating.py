@@ -70,10 +70,10 @@ class Calibrator:
     each run.
     """
 
-    section: ClassVar[str]
-    channel: ClassVar[str]
-    senses: ClassVar[bool] = True
-    first: ClassVar[FileModel | None] = None
+    section: str
+    channel: str
+    senses: bool = True
+    first: FileModel | None = None
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
@@ -89,23 +89,56 @@ class Calibrator:
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
         """The rig with the uncertainties of the ``first`` one. Learnt ones are for later runs: in the next turn they would hold
         constants near the values of the last."""
-        if not hasattr(getattr(rig, self.section), "uncertainty"):
+        if not hasattr(rig.section(self.section), "uncertainty"):
             return rig
-        uncertainty = getattr(first, self.section).uncertainty
-        settings = getattr(rig, self.section).model_copy(update={"uncertainty": uncertainty})
+        uncertainty = first.section(self.section).uncertainty
+        settings = rig.section(self.section).model_copy(update={"uncertainty": uncertainty})
         return rig.model_copy(update={self.section: settings})
 
     def settings(self, rig: Rig) -> Any:
         """The section of a rig, or the initial one."""
-        return getattr(rig, self.section) or self.first
+        return rig.section(self.section) or self.first
 
     def is_complete(self, rig: Rig) -> bool:
         """Whether a rig has everything that the sensor needs."""
-        return self.channel not in rig.sensors or getattr(rig, self.section) is not None
+        return self.channel not in rig.sensors or rig.section(self.section) is not None
 
     def pictures(self, _knowledge: SensorKnowledge) -> Sequence[Part]:
         """Further pictures of the report."""
         return ()
+
+
+class OneOfSeveral(Calibrator):
+    """The calibration of one of several sensors of a kind, ``name``, as if it was the only one."""
+
+    def __init__(self, calibrator: Calibrator, name: str) -> None:
+        self._calibrator = calibrator
+        self.section = self.channel = name
+        self.senses, self.first = calibrator.senses, calibrator.first
+
+    def learn(
+        self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
+    ) -> SensorKnowledge:
+        """See :meth:`Calibrator.learn`."""
+        kind, name = self._calibrator.section, self.section
+        alone = [
+            replace(
+                trace,
+                log=trace.log.alone(name),
+                constants=trace.constants and {key.replace(name, kind, 1): c for key, c in trace.constants.items()},
+            )
+            for trace in traced
+        ]
+        grids = grids and grids.with_name(f"{grids.name}.{name}")
+        learnt = self._calibrator.learn(alone, rig.alone(name), first.alone(name), grids, like)
+        return replace(
+            learnt,
+            sections={name if section == kind else section: values for section, values in learnt.sections.items()},
+            constants=[replace(c, sensor=name if c.sensor == kind else c.sensor) for c in learnt.constants],
+        )
+
+    def pictures(self, knowledge: SensorKnowledge) -> Sequence[Part]:
+        return self._calibrator.pictures(knowledge)
 
 
 class ConstantsCalibrator(Calibrator):
@@ -195,9 +228,9 @@ class ConstantsCalibrator(Calibrator):
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
         """The means of what the smoother estimated in each log."""
-        if not hasattr(getattr(rig, self.section), "uncertainty"):
+        if not hasattr(rig.section(self.section), "uncertainty"):
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""
-        settings, initial = getattr(rig, self.section), getattr(first, self.section)
+        settings, initial = rig.section(self.section), first.section(self.section)
         settings, constants = pooled_constants(self.section, prefix, settings, initial, traced)
         return SensorKnowledge({self.section: settings}, constants)

@@ -2,7 +2,7 @@
 simulated drives, and the expected information along a planned path."""
 
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,9 +15,11 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Measurement, Stream
 from factorgraph_loc.model.result import Reliability
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
+from factorgraph_loc.sensors.base import Binding, Sensor
 from factorgraph_loc.sensors.registry import channels, functions, sensor_of
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array
@@ -70,11 +72,15 @@ class Review:
 
 def lacking_section(rig: Rig, sensor: str) -> str:
     """The section that a sensor requires, because its settings have no defaults, if the rig lacks it, else ""."""
-    known = channels().get(sensor)
-    if known is None or not known.section or getattr(rig, known.section, None) is not None:
+    kind = kind_of(sensor)
+    known = channels().get(kind)
+    if known is None or not known.section:
         return ""
-    fields = load(sensor_of(sensor).settings[known.section].kind).model_fields.values()
-    return known.section if any(required.is_required() for required in fields) else ""
+    section = known.section + sensor.removeprefix(kind)
+    if rig.section(section) is not None:
+        return ""
+    fields = load(sensor_of(kind).settings[known.section].kind).model_fields.values()
+    return section if kind != sensor or any(required.is_required() for required in fields) else ""
 
 
 @dataclass(frozen=True)
@@ -91,13 +97,14 @@ class Summary:
     """The summary of one sensor in a log.
 
     ``found``: entries of ``fgloc info --json``; ``in_map``: number of detectable elements by map layer; ``problems``: warnings, one
-    line each; ``text``: printed paragraphs.
+    line each; ``text``: printed paragraphs. ``undetected``: problems that are none if another sensor of the kind lacks them.
     """
 
     found: Mapping[str, Any] = field(default_factory=dict)
     in_map: Mapping[str, int] = field(default_factory=dict)
     problems: Sequence[Notice] = ()
     text: Sequence[Paragraph] = ()
+    undetected: Sequence[Notice] = ()
 
 
 def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
@@ -133,9 +140,22 @@ class Marks:
     dense: bool = False
 
 
+def bound_sensors(binding: Binding) -> dict[str, Sensor]:
+    """The exteroceptive sensors of a run by name."""
+    named = [("" if kind_of(name) == name else name, bind) for name, bind in functions("bind", binding.setup.rig)]
+    sensors = [bind(replace(binding, setup=binding.setup.alone(name), name=name)) for name, bind in named]
+    return {sensor.name: sensor for sensor in sensors if sensor is not None}
+
+
 def marks(log: Log) -> list[Marks]:
-    """The marks of all sensors for a log and its map."""
-    return [draw(log) for _, draw in functions("draw")]
+    """The marks of all sensors for a log and its map, one of each layer."""
+    layers: dict[str, Marks] = {}
+    for name, draw in functions("draw", log.rig):
+        new: Marks = draw(log.alone(name))
+        if (known := layers.get(new.layer)) is not None:
+            new = replace(known, t=np.concatenate((known.t, new.t)), seen=(*known.seen, *new.seen))
+        layers[new.layer] = new
+    return list(layers.values())
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,17 +6,22 @@ listed in :mod:`factorgraph_loc.builtin`; other packages register the place of t
 group ``factorgraph_loc.sensors``.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.files.settings import Setting, first_sentence, settings_in
-from factorgraph_loc.model.sections import Layer, Section, registered
+from factorgraph_loc.model.sections import Layer, Section, kind_of, registered, several
 from factorgraph_loc.plugins import SENSORS, Place, load
 from factorgraph_loc.text import quoted
+
+if TYPE_CHECKING:
+    from factorgraph_loc.model.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -125,10 +130,11 @@ def channels() -> Mapping[str, Channel]:
 
 @cache
 def sensor_of(channel: str) -> SensorType:
-    """The sensor of a channel; ``channel`` may be the ``sensor`` of a measurement or the name of a stream. InputError if it is
-    unknown."""
+    """The sensor of a channel; ``channel`` may be the ``sensor`` of a measurement or the name of a stream, also of one of several
+    sensors. InputError if it is unknown."""
+    kind = kind_of(channel)
     for sensor in sensors().values():
-        if any(own.name == channel for own in sensor.channels):
+        if any(own.name == kind for own in sensor.channels) and (kind == channel or kind in several()):
             return sensor
     raise InputError(f"no sensor is called {quoted(channel)}{nearest(channel, list(channels()))}")
 
@@ -136,7 +142,7 @@ def sensor_of(channel: str) -> SensorType:
 def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
     """The channels among ``names`` that measure motion on the floor; with ``rank``
     :data:`~factorgraph_loc.model.measurement.TURN` also those that measure rotation alone."""
-    streams = {name: channels()[name].streams for name in names if name in channels()}
+    streams = {name: channels()[kind_of(name)].streams for name in names if kind_of(name) in channels()}
     return tuple(name for name, kinds in streams.items() if kinds and kinds[0].rank <= rank)
 
 
@@ -151,18 +157,24 @@ def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
     return [
         sensor
         for sensor in sensors().values()
-        if any(channel.name in names for channel in sensor.channels)
+        if any(channel.name == kind_of(name) for channel in sensor.channels for name in names)
         and (sensor.locates or (sensor.detects and getattr(world, sensor.detects, None)))
     ]
 
 
 def channel(name: str) -> Channel:
-    """A channel by name; InputError if it is unknown."""
-    return next(own for own in sensor_of(name).channels if own.name == name)
+    """A channel by name, also that of one of several sensors; InputError if it is unknown."""
+    return next(own for own in sensor_of(name).channels if own.name == kind_of(name))
 
 
-def functions(kind: str) -> Iterator[tuple[str, Any]]:
-    """Names and functions of one kind, a field of :class:`SensorType`, of the sensors that have it."""
+def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
+    """Names and functions of one kind, a field of :class:`SensorType`, of the sensors that have it.
+
+    Of several sensors of a kind in the ``rig``, each has its name, such as ``bearing_range.front``. Its function expects a rig or a
+    log where it is the only one of its kind (:meth:`~factorgraph_loc.model.rig.Rig.alone`).
+    """
     for name, sensor in sensors().items():
         if place := getattr(sensor, kind):
-            yield name, load(place)
+            known = () if rig is None else [each for section in sensor.settings for each in rig.names(section)]
+            for each in [each for each in known if kind_of(each) != each] or (name,):
+                yield each, load(place)

@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import SECONDS, STAMP, Column, Table
+from factorgraph_loc.files.several import is_name
 from factorgraph_loc.files.values import names, numbers, seconds_of, within
 from factorgraph_loc.model.measurement import Measurement, Stream
+from factorgraph_loc.model.sections import several
 from factorgraph_loc.plugins import load
 from factorgraph_loc.sensors.registry import Channel, SensorType, channels, sensors
 from factorgraph_loc.text import Notice, notice
@@ -64,6 +66,16 @@ def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
         for channel in channels().values()
         for table in tables_of(channel)
     }
+
+
+def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
+    """The name of the channel with a table of a log, such as ``bearing_range.front`` of one of several sensors, and the
+    descriptions of the table; None if there is none."""
+    kind, _, own = name.partition(".")
+    if kind not in native_tables() or (kind != name and not (kind in several() and is_name(own))):
+        return None
+    channel, tables = native_tables()[kind]
+    return name if kind != name else channel.name, tables
 
 
 def all_tables(*chosen: SensorType) -> Iterator[Table]:

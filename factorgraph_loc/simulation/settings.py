@@ -124,8 +124,11 @@ class SimulationSettings(FileModel):
         """The number of simulated observations of tags, landmarks and points, summed over all objects of a kind. Raises
         ValueError if the settings are inconsistent.
         """
-        per_second = {what: often for _, rates in functions("looks") for what, often in rates(self).items()}
-        return {what: self.drive.duration * often for what, often in per_second.items()}
+        counts: dict[str, float] = {}
+        for name, rates in functions("looks", self.rig):
+            for what, often in rates(self.model_copy(update={"rig": self.rig.alone(name)})).items():
+                counts[what] = counts.get(what, 0.0) + self.drive.duration * often
+        return counts
 
 
 def _add_sections() -> None:

@@ -6,7 +6,8 @@ not affect the others.
 
 import hashlib
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.maps.free_space import SPACING, dense, free_space, shortest_path
 from factorgraph_loc.model.log import Log, StartPose
+from factorgraph_loc.model.measurement import of_sensor
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
@@ -113,7 +115,7 @@ def simulate(settings: SimulationSettings, seed: int) -> Log:
     world = make_world(settings.world, generator(of_world, "world"))
     truth = drive(world, settings.drive, generator(seed, "drive"))
     ride = Ride(settings, settings.rig, world, truth, partial(generator, seed), partial(generator, of_world))
-    made: list[Simulated] = [function(ride) for _, function in functions("simulate")]
+    made = [simulated(function, ride, name) for name, function in functions("simulate", settings.rig)]
     streams = {name: stream for simulated in made for name, stream in simulated.streams.items()}
     start = truth.poses[0] + START_SIGMAS * generator(seed, "start").standard_normal(3)
     start[2] = se2.wrap_scalar(start[2])
@@ -129,6 +131,16 @@ def simulate(settings: SimulationSettings, seed: int) -> Log:
         start=StartPose(0.0, start, START_SIGMAS.copy()),
         metadata=metadata | {key: value for simulated in made for key, value in simulated.metadata.items()},
     )
+
+
+def simulated(function: Callable[[Ride], Simulated], ride: Ride, name: str) -> Simulated:
+    """The measurements of a sensor. Each of several of a kind, by ``name``, has random generators of its own."""
+    kind, _, own = name.partition(".")
+    if not own:
+        return function(ride)
+    made = function(replace(ride, rig=ride.rig.alone(name), rng=lambda label: ride.rng(f"{label}.{own}")))
+    streams = {name if channel == kind else channel: stream for channel, stream in made.streams.items()}
+    return replace(made, streams={channel: of_sensor(stream, channel) for channel, stream in streams.items()})
 
 
 def with_sensors(rig: Rig, streams: Iterable[str]) -> Rig:

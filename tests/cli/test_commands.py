@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -186,6 +187,25 @@ def test_texts_of_options():
     }
     with pytest.raises(InputError, match=r"no key smoother.lag.x, as smoother.lag is 10"):
         parse_settings(["smoother.lag=10", "smoother.lag.x=1"], ["smoother"])
+
+
+def test_one_of_several_sensors_has_its_name(fgloc, refused, short_log, tmp_path):
+    folder = tmp_path / "named"
+    shutil.copytree(short_log, folder)
+    (folder / "bearing_range.csv").rename(folder / "bearing_range.radio.csv")
+    (rig,) = folder.glob("*.rig.toml")
+    rig.write_text(
+        rig.read_text()
+        .replace("[bearing_range", "[bearing_range.radio")
+        .replace('"bearing_range"', '"bearing_range.radio"')
+    )
+    assert "bearing_range.radio" in fgloc("info", folder).stdout
+    for sensors in ("odometry,bearing_range", "odometry,bearing_range.radio"):
+        done = fgloc("run", folder, "-e", "ekf", "--sensors", sensors, "-o", tmp_path / sensors)
+        assert done.exit_code == 0, done.stderr
+        assert "bearing_range.radio: normalised innovation squared" in done.stdout
+    message = refused("run", folder, "-e", "ekf", "--sensors", "odometry,bearing_range.radar", "-o", tmp_path / "out")
+    assert "has no sensor 'bearing_range.radar': did you mean bearing_range.radio?" in message
 
 
 def test_info_draws_a_log(fgloc, refused, short_log, tmp_path):

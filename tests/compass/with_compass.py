@@ -133,6 +133,27 @@ def test_estimators_use_it_and_learn_its_bias(estimator):
     assert run.scores["nis.compass.count"] == 60
 
 
+def test_a_robot_with_two_learns_the_bias_of_each(tmp_path):
+    log = drifting_log()
+    first = log.streams["compass"]
+    second = dataclasses.replace(first, heading=se2.wrap(first.heading - 0.3), source="compass.mast")
+    streams = {
+        "odometry": log.streams["odometry"],
+        "compass.low": dataclasses.replace(first, source="compass.low"),
+        "compass.mast": second,
+    }
+    rig = fgloc.Rig(
+        name="cart", sensors=("odometry", "compass"), compass=dict.fromkeys(("low", "mast"), log.rig.compass)
+    )
+    fgloc.write_native(dataclasses.replace(log, rig=rig, streams=streams), tmp_path / "two")
+    two = fgloc.read_log(tmp_path / "two")
+    assert two.rig == rig
+    learnt = fgloc.run(two, "ekf").result.learnt.values
+    assert learnt["compass.low.bias"][0] == pytest.approx(0.1, abs=0.03)
+    assert learnt["compass.mast.bias"][0] == pytest.approx(-0.2, abs=0.03)
+    assert "compass.mast: the compass reports -0.198" in command("info", tmp_path / "two").stdout
+
+
 def test_it_is_pushed():
     localizer = fgloc.Localizer(RIG, estimator="ekf")
     localizer.initialize((0.0, 0.0, 0.0), t=0.0)

@@ -48,6 +48,18 @@ def test_poses_in_millimetres_and_degrees_with_another_clock(tmp_path):
     assert log.reference.at(np.array([30.0]))[0] == pytest.approx([X[300], Y[300], HEADING[300]], abs=1e-3)
 
 
+def test_several_tables_of_ranges_are_several_sensors(tmp_path):
+    rows = zip(START + T, X, Y, HEADING, strict=True)
+    write(tmp_path / "day" / "odometry.csv", ["t,x,y,heading", *(f"{t:.3f},{x},{y},{h}" for t, x, y, h in rows)])
+    for name, distance in (("left", 2.0), ("right", 3.0)):
+        lines = [f"{START + t:.3f},7,{distance}" for t in T]
+        write(tmp_path / "day" / f"uwb_{name}.csv", ["t,anchor,range", *lines])
+    log, proposal = log_of(tmp_path)
+    assert set(proposal.content["options"]["bearing_range"]) == {"left", "right"}
+    assert set(log.streams["bearing_range.left"].range) == {2.0}
+    assert set(log.streams["bearing_range.right"].range) == {3.0}
+
+
 def test_counters_of_wheels_that_wrap_get_their_size_from_the_reference(tmp_path):
     turned = 0.4 * np.unwrap(HEADING)
     left, right = ((SPEED * T + side * turned / 2.0) / 0.0005 for side in (-1, 1))

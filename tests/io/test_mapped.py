@@ -41,6 +41,22 @@ def test_poses_are_odometry_by_the_motion_between_them(hall, with_options, one):
     np.testing.assert_allclose(odometry.dtheta, (0.0, np.pi / 2, 0.0), atol=1e-9)
 
 
+def test_tables_of_several_sensors(hall, with_options, one, refused):
+    folder = hall.parent / "run"
+    for name, distance in (("left", 1.5), ("right", 2.5)):
+        (folder / f"{name}.csv").write_text(f"t,id,m\n1.2,A,{distance}\n")
+    options = "".join(
+        f'[options.bearing_range.{name}]\nfile = "{name}.csv"\nunits = {{ t = "s" }}\n'
+        'columns = { t = "t", landmark = "id", range = "m" }\n'
+        for name in ("left", "right")
+    )
+    log = one(with_options(WHEELS + options))
+    assert log.streams["bearing_range.left"].range.tolist() == [1.5]
+    assert log.streams["bearing_range.right"].range.tolist() == [2.5]
+    assert log.rig.sensors == ("odometry", "bearing_range.left", "bearing_range.right")
+    refused(with_options(WHEELS + options.replace("file =", "fil =")), "bearing_range.left.fil", "did you mean file?")
+
+
 def test_a_gyro_by_its_three_axes(hall, with_options, one, refused):
     (hall.parent / "run" / "gyro.csv").write_text("t,a,b,c\n1,10,20,90\n2,0,30,0\n")
     options = f"""{WHEELS}

@@ -127,6 +127,39 @@ def test_ranges_of_radios_by_the_names_of_fields(proposal, tmp_path):
     np.testing.assert_array_equal(ranges.range, (2.0, 3.0, 4.0))
 
 
+def test_topics_of_several_sensors_of_landmarks(proposal, tmp_path):
+    def fill(made):
+        kind = "fiducial_msgs/msg/FiducialTransformArray"
+        single = "int32 fiducial_id\ngeometry_msgs/Transform transform\n"
+        made.store.register(get_types_from_msg(single, "fiducial_msgs/msg/FiducialTransform"))
+        made.store.register(
+            get_types_from_msg("std_msgs/Header header\nfiducial_msgs/FiducialTransform[] transforms\n", kind)
+        )
+        radio = "uwb/msg/Range"
+        made.store.register(get_types_from_msg("std_msgs/Header header\nuint16 anchor_id\nfloat32 distance\n", radio))
+        types = made.store.types
+        for i in range(3):
+            made.odometry("/odom", T0 + i * 10**8, (0.1 * i, 0.0, 0.0))
+            for k, side in enumerate(("front", "rear")):
+                at = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=2.0 + k)
+                turned = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+                transform = types["geometry_msgs/msg/Transform"](translation=at, rotation=turned)
+                found = types["fiducial_msgs/msg/FiducialTransform"](fiducial_id=5 + k, transform=transform)
+                made.stamped(f"/{side}/fiducials", T0 + i * 10**8, kind, transforms=[found])
+            made.stamped("/uwb", T0 + i * 10**8, radio, anchor_id=7, distance=4.0)
+
+    found, manifest, text = proposal(fill)
+    assert set(manifest["options"]["bearing_range"]) == {"front_fiducials", "rear_fiducials", "uwb"}
+    assert '[options.bearing_range.front_fiducials]\ntopic = "/front/fiducials"' in text
+    assert found.uses["/rear/fiducials"] == "bearing_range.rear_fiducials"
+    assert "are sensors of their own" in text
+    (tmp_path / "drive.toml").write_text(tomli_w.dumps(manifest))
+    log = fgloc.read_log(tmp_path / "drive.toml")
+    assert set(log.streams["bearing_range.uwb"].range) == {4.0}
+    assert set(log.streams["bearing_range.rear_fiducials"].range) == {3.0}
+    assert log.rig.sensors == ("odometry", *(name for name in log.streams if name != "odometry"))
+
+
 def test_images_and_what_tells_of_their_camera(proposal):
     def fill(made):
         made.odometry("/odom", T0, (0.0, 0.0, 0.0))

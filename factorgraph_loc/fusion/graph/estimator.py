@@ -34,7 +34,8 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import MAPPERS
-from factorgraph_loc.sensors.base import Binding, bound_sensors
+from factorgraph_loc.sensors.base import Binding
+from factorgraph_loc.sensors.interfaces import bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2

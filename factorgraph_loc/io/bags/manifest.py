@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.several import by_name
 from factorgraph_loc.io.bags.camera import COMPRESSED, INFO, RAW
 from factorgraph_loc.io.bags.file import Bag, Topic, open_bag
 from factorgraph_loc.io.bags.motion import IMU, JOINTS, ODOMETRY, TWISTS
@@ -18,7 +19,7 @@ from factorgraph_loc.io.bags.poses import POINT, POSES, ROBOT, SAMPLE, STATIC, W
 from factorgraph_loc.io.bags.tables import CORNERS, DETECTIONS
 from factorgraph_loc.io.bags.topics import LIST, TF, has_header, leaves
 from factorgraph_loc.io.guesses import ANGLES, ENDS, LANDMARK, RANGE, READ, TRUTH, plain, rank
-from factorgraph_loc.io.proposals import Proposal, proposal_of
+from factorgraph_loc.io.proposals import Proposal, distinct, proposal_of
 from factorgraph_loc.sensors.positions.measurement import POSITIONS_ON_EARTH
 from factorgraph_loc.text import listed
 
@@ -68,6 +69,16 @@ class Uses:
         if topics[1:]:
             self.remarks.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
 
+    def take_all(self, sensor: str, topics: Mapping[str, Mapping[str, Any]]) -> None:
+        """Use each topic as one sensor of a kind. ``topics``: their settings by name."""
+        names = distinct(list(topics)) if len(topics) > 1 else []
+        settings = {topic: {"topic": topic, **more} for topic, more in topics.items()}
+        if names:
+            self.options[sensor] = dict(zip(names, settings.values(), strict=True))
+        elif topics:
+            (self.options[sensor],) = settings.values()
+        self.uses |= dict(zip(topics, [f"{sensor}.{name}" for name in names] or [sensor], strict=False))
+
 
 def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
     """Propose a manifest, to be saved in ``folder`` if the bag is below that folder, else in the folder of the bag.
@@ -102,15 +113,22 @@ def propose(bag: Bag) -> Uses:
     _reference(out, bag, topics, tree)
     out.take("imu", [topic for topic in topics if topic.type == IMU])
     _camera(out, topics)
-    out.take("bearing_range", [topic for topic in topics if topic.type in DETECTIONS])
+    detections: dict[str, dict[str, Any]] = {topic.name: {} for topic in topics if topic.type in DETECTIONS}
+    out.take_all("bearing_range", detections)
     out.take("sightings", [topic for topic in topics if topic.type == CORNERS])
     out.take("start", [topic for topic in topics if (topic.name, topic.type) == INITIAL_POSE])
     custom = _custom(out, bag, topics)
     _rfid(out, custom)
-    _ranges(out, custom)
+    out.take_all("bearing_range", detections | _ranges(out, custom))
+    if len(out.options.get("bearing_range", {}).values()) > 1 and "topic" not in out.options["bearing_range"]:
+        names = listed(by_name("bearing_range", out.options["bearing_range"]))
+        out.remarks.append(
+            f"{names} are sensors of their own: remove those that repeat others; the rig needs each by name"
+        )
     if STATIC in bag.topics:
         out.uses[STATIC] = "sensor mounting"
-    used = [bag.topics[option["topic"]] for option in out.options.values()]
+    options = [each for option in out.options.values() for each in ([option] if "topic" in option else option.values())]
+    used = [bag.topics[option["topic"]] for option in options]
     if not any(topic.type in TF or has_header(bag, topic) for topic in used):
         out.options["clock"] = "receive"
     if (robot := tree.robot()) not in (None, ROBOT[0]):
@@ -278,15 +296,14 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
         out.remarks.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
 
 
-def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
-    """Use the topic with a field of a distance and, next to it, one of the name of a landmark."""
-    candidates = [(t, fields) for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))]
-    if candidates and "bearing_range" not in out.options:
-        topic, fields = candidates[0]
-        out.take("bearing_range", [candidate for candidate, _ in candidates], fields=fields)
-        out.remarks.append(
-            f"{topic.name} is taken for ranges [m] to landmarks of the map that {fields['landmark']} names"
-        )
+def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[str, dict[str, Any]]:
+    """The topics with a field of a distance and, next to it, one of the name of a landmark, each with its settings."""
+    candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
+    out.remarks += [
+        f"{topic} is taken for ranges [m] to landmarks of the map that {fields['landmark']} names"
+        for topic, fields in candidates.items()
+    ]
+    return {topic: {"fields": fields} for topic, fields in candidates.items()}
 
 
 def range_fields(paths: Sequence[str]) -> dict[str, str]:

@@ -15,6 +15,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, add_fields, parse_model
+from factorgraph_loc.files.several import by_name, one_or_several
 from factorgraph_loc.io.bags.camera import CameraTopic, Images, Info
 from factorgraph_loc.io.bags.file import Bag, open_bag
 from factorgraph_loc.io.bags.motion import ImuTopic, OdometryTopic, YawRates, odometry
@@ -34,11 +35,12 @@ from factorgraph_loc.io.bags.poses import (
 from factorgraph_loc.io.bags.tables import Landmarks, LandmarkTopic, Reads, RfidTopic, TableTopic, rows_of_table
 from factorgraph_loc.io.bags.topics import TF, Clock, Listeners, report
 from factorgraph_loc.io.motions import odometry_stream
-from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import default_rig
 from factorgraph_loc.model.log import NOT_READ, RIG_NOTES, Log
-from factorgraph_loc.model.measurement import Stream
+from factorgraph_loc.model.measurement import Stream, of_sensor
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.sections import several
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
@@ -92,7 +94,7 @@ class Options(FileModel):
     odometry: OdometryTopic
     imu: ImuTopic | None = None
     rfid: RfidTopic | None = None
-    bearing_range: LandmarkTopic | None = None
+    bearing_range: one_or_several(LandmarkTopic) = None  # type: ignore[valid-type]
     camera: CameraTopic | None = None
     reference: ReferenceTopic | None = None
     start: StartTopic | None = None
@@ -105,7 +107,11 @@ class Options(FileModel):
 OTHERS = {
     name: tables for name, (_, tables) in native_tables().items() if name not in {*Options.model_fields, "inventories"}
 }
-add_fields(Options, dict.fromkeys(OTHERS, (TableTopic | None, None)), after="camera")
+add_fields(
+    Options,
+    {name: (one_or_several(TableTopic) if name in several() else TableTopic | None, None) for name in OTHERS},
+    after="camera",
+)
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -134,7 +140,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     t_ns, moves = motion(warnings)
     t0_ns = int(t_ns[0])
     streams: dict[str, Stream] = {"odometry": odometry_stream(t_ns, moves, t0_ns)}
-    streams |= {name: sensor.stream(t0_ns, warnings) for name, sensor in sensors.items()}
+    streams |= {name: of_sensor(sensor.stream(t0_ns, warnings), name) for name, sensor in sensors.items()}
     reference = None
     if poses and of_reference:
         path = poses(warnings)
@@ -173,12 +179,12 @@ def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack
         out["imu"] = listeners.listen(options.imu, YawRates(bag, options.imu, frames))
     if options.rfid:
         out["rfid"] = listeners.listen(options.rfid, Reads(bag, options.rfid))
-    if options.bearing_range:
-        out["bearing_range"] = listeners.listen(options.bearing_range, Landmarks(bag, options.bearing_range, frames))
+    for name, topic in by_name("bearing_range", options.bearing_range).items():
+        out[name] = listeners.listen(topic, Landmarks(bag, topic, frames))
     if options.camera:
         out["camera"] = _images(listeners, options.camera, stack)
-    for name, tables in OTHERS.items():
-        if (mapping := getattr(options, name)) is not None:
+    for kind, tables in OTHERS.items():
+        for name, mapping in by_name(kind, getattr(options, kind)).items():
             out[name] = listeners.listen(mapping, rows_of_table(bag, mapping, tables))
     return out
 
@@ -204,7 +210,7 @@ def _rig(
     if options.rfid and isinstance(reads, RfidStream) and reads.antenna:
         rfid = antennas_of(set(reads.antenna), options.rfid.frames, frames, notes)
     usable = [name for name in streams if name not in {"camera", "sightings"} or camera is not None]
-    return DEFAULT_RIG.model_copy(update={"sensors": tuple(usable), "camera": camera, "rfid": rfid})
+    return default_rig(streams).model_copy(update={"sensors": tuple(usable), "camera": camera, "rfid": rfid})
 
 
 def read_trajectory(path: Path, topic: str) -> PosePath:

@@ -1,7 +1,7 @@
 """The native format: a folder with ``run.toml``, a CSV or Parquet table per sensor, and ``reference.tum``."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,19 +14,19 @@ from factorgraph_loc.files.data_root import RUN_FILE
 from factorgraph_loc.files.models import FileModel, file_name, inside, parse_model, read_toml, write_toml
 from factorgraph_loc.files.tables import TableRows, read_table, write_table
 from factorgraph_loc.files.temporary import sweep, temporary_folder, writing
-from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig, write_rig
+from factorgraph_loc.io.native.rig_file import default_rig, read_rig, write_rig
 from factorgraph_loc.io.native.world_file import parse_world, read_world, write_world
 from factorgraph_loc.io.readers.manifests import StartSettings
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.maps.points import POINTS_SUFFIX
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.measurement import Stream
+from factorgraph_loc.model.measurement import Stream, of_sensor
 from factorgraph_loc.model.rig import Rig
-from factorgraph_loc.model.sections import layers
+from factorgraph_loc.model.sections import kind_of, layers
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.registry import Channel, channel
-from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_tables
+from factorgraph_loc.sensors.registry import channel
+from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_table, native_tables
 from factorgraph_loc.text import Notice, listed, notice
 
 REFERENCE = "reference.tum"
@@ -63,7 +63,7 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
         if not run_path.read_text(encoding="utf-8").strip():
             raise InputError(f"{run_path}: is empty, expected a manifest, or odometry.csv in its folder")
         raise InputError(f"{path}: has no odometry, which every estimator needs, expected rows in odometry.csv")
-    rig = rig_of(run, run_path)
+    rig = rig_of(run, run_path, tables)
     require_span([(rows.path, rows.rows, rows.t_ns) for rows in tables.values()])
     t0_ns = min(int(rows.t_ns.min()) for rows in tables.values())
     return Log(
@@ -79,9 +79,9 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     )
 
 
-def rig_of(run: RunFile, source: Path) -> Rig:
+def rig_of(run: RunFile, source: Path, tables: Iterable[str]) -> Rig:
     if run.rig is None:
-        return DEFAULT_RIG
+        return default_rig(tables)
     if isinstance(run.rig, str):
         return read_rig(inside(source.parent, run.rig, source))
     return parse_model(Rig, run.rig, f"{source} [rig]").placed(source.parent)
@@ -98,12 +98,15 @@ def world_of(run: RunFile, source: Path) -> World:
 def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
     """The non-empty tables by name. A table of an unknown sensor gives a warning."""
     tables = {}
-    for name, (_, descriptions) in native_tables().items():
+    stems = sorted(file.stem for file in folder.iterdir() if file.suffix in SUFFIXES)
+    for name in dict.fromkeys((*native_tables(), *stems)):
+        if (known := native_table(name)) is None:
+            continue
         files = [folder / f"{name}{suffix}" for suffix in SUFFIXES if (folder / f"{name}{suffix}").is_file()]
         if len(files) > 1:
             raise InputError(f"{folder}: holds both {files[0].name} and {files[1].name}, expected one of them")
         for file in files:
-            rows = read_table(inside(folder, file.name, folder), descriptions)
+            rows = read_table(inside(folder, file.name, folder), known[1])
             if rows.left_out:
                 warnings.append(checks.unread_columns(file, rows.left_out))
             if len(rows.rows):
@@ -114,7 +117,7 @@ def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
     unread = sorted(
         file.name
         for file in folder.iterdir()
-        if file.suffix in SUFFIXES and file.stem not in native_tables() and not file.name.endswith(suffixes)
+        if file.suffix in SUFFIXES and native_table(file.stem) is None and not file.name.endswith(suffixes)
     )
     if unread:
         warnings.append(notice("unread_files", "{source}: this version does not read {files}", folder, listed(unread)))
@@ -123,10 +126,11 @@ def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
 
 def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, Stream]:
     """The streams of all channels with tables."""
-    rows: dict[Channel, dict[str, TableRows]] = {}
+    rows: dict[str, dict[str, TableRows]] = {}
     for name, table in tables.items():
-        rows.setdefault(native_tables()[name][0], {})[name] = table
-    return {channel.name: assemble(channel, table, reading) for channel, table in rows.items()}
+        if (known := native_table(name)) is not None:
+            rows.setdefault(known[0], {})[kind_of(name)] = table
+    return {name: of_sensor(assemble(channel(name), table, reading), name) for name, table in rows.items()}
 
 
 def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[Notice]) -> Trajectory | None:
@@ -187,7 +191,8 @@ def write_files(log: Log, folder: Path, format: str) -> None:
     context = Writing(log.name, log.t0_ns, folder)
     for name, stream in log.streams.items():
         for table, columns in disassemble(channel(name), stream, context).items():
-            write_table(folder / f"{table}.{format}", native_tables()[table][1], columns)
+            file = f"{table}{name.removeprefix(kind_of(name))}.{format}"
+            write_table(folder / file, native_tables()[table][1], columns)
     if log.reference is not None:
         run["has_heading"] = log.reference.has_heading
         write_tum(log.reference, folder / REFERENCE, log.t0_ns)

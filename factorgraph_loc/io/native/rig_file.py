@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +12,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model, read_toml, write_toml
 from factorgraph_loc.files.settings import Setting, settings_in
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.model.sections import kind_of, several
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factors import se2
 
@@ -32,6 +33,16 @@ READS = {
 }
 # standard deviations of the constants of wheels that nobody has calibrated
 UNCALIBRATED = {"scale_distance": 0.03, "scale_rotation": 0.05, "heading_drift": 0.03}
+
+
+def default_rig(streams: Iterable[str]) -> Rig:
+    """The default rig for a log: several sensors of a kind have the same settings."""
+    named = [name for name in streams if kind_of(name) != name and DEFAULT_RIG.section(kind_of(name)) is not None]
+    if not named:
+        return DEFAULT_RIG
+    without = DEFAULT_RIG.model_copy(update={kind_of(name): None for name in named})
+    rig = without.model_copy(update={name: DEFAULT_RIG.section(kind_of(name)) for name in named})
+    return rig.model_copy(update={"sensors": rig.expanded(rig.sensors)})
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -68,7 +79,10 @@ def _lines(
         yield f"{_key(key)} = {json.dumps(value, ensure_ascii=False)}{comment}"
     for key, value in tables.items():
         known = any(name.startswith(".".join((*pattern, key))) for name in meanings)
-        yield from _lines(value, (*path, key), (*pattern, key if known else "*"), meanings)
+        below = (*pattern, key if known else "*")
+        if not known and ".".join(path) in several():  # the name of one of several sensors
+            below = pattern
+        yield from _lines(value, (*path, key), below, meanings)
 
 
 def _key(name: str) -> str:

@@ -216,7 +216,7 @@ def _read(source: _Source, rig: Rig | None, world: World | None, options: Mappin
         log = with_markers(log, manifest.markers.family)
     warnings = list(log.warnings)
     if "imu" in log.streams and "imu" not in log.rig.sensors:
-        if log.rig is DEFAULT_RIG:
+        if log.rig.name == DEFAULT_RIG.name:
             log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
         else:
             warnings.append(notice("unused_gyro", "the gyro is not used, because the rig's sensors do not include imu"))

@@ -14,17 +14,19 @@ from factorgraph_loc.files.column_mapping import ColumnMapping, TableFolder, Tim
 from factorgraph_loc.files.columns import ANGLE, STAMPS, Table, named
 from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import FileModel, add_fields
+from factorgraph_loc.files.several import by_name, one_or_several
 from factorgraph_loc.files.tables import Cells, TableRows
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.motions import TURNS, WHEELS, odometry_stream
 from factorgraph_loc.io.native import native
-from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, default_rig
 from factorgraph_loc.io.native.world_file import parse_world
 from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads
 from factorgraph_loc.io.readers.pose_file import read_kitti, read_pose_file
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z, on_floor, rotations_of
+from factorgraph_loc.model.sections import several
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.measurement import make_images
 from factorgraph_loc.sensors.odometry.measurement import IMU, INCREMENTS, VELOCITIES, WAYS
@@ -124,10 +126,16 @@ def _has_names(tables: Sequence[Table]) -> bool:
     return any(column.kind == "name" for table in tables for column in table.columns)
 
 
+def _type_of(name: str) -> Any:
+    """The type of the mapping of a table."""
+    kind = NamedFile if _has_names(native_tables()[name][1]) else TimedMapping
+    return one_or_several(kind) if name in several() else kind | None
+
+
 OTHERS = [name for name in native_tables() if name not in Options.model_fields]  # tables that need a mapping only
 add_fields(
     Options,
-    {name: ((NamedFile if _has_names(native_tables()[name][1]) else TimedMapping) | None, None) for name in OTHERS},
+    {name: (_type_of(name), None) for name in OTHERS},
     after="camera",
 )
 
@@ -144,9 +152,9 @@ def read(path: Path | None, options: Options) -> Log:
     warnings = folder.warnings
     odometry_t_ns, moves = _odometry(folder, options.odometry)
     tables = {
-        name: _table(folder, native_tables()[name][1], mapping)
-        for name in ("imu", "camera", *OTHERS)
-        if (mapping := getattr(options, name)) is not None
+        name: _table(folder, native_tables()[kind][1], mapping)
+        for kind in ("imu", "camera", *OTHERS)
+        for name, mapping in by_name(kind, getattr(options, kind)).items()
     }
     rounds = _rounds(folder, options)
     stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
@@ -171,7 +179,7 @@ def read(path: Path | None, options: Options) -> Log:
     name = path.resolve().name
     return Log(
         name=name,
-        rig=DEFAULT_RIG,
+        rig=default_rig(streams),
         world=parse_world({"name": name, **options.world}, path, path),
         streams=streams,
         reference=reference,

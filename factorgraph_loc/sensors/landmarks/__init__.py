@@ -14,7 +14,9 @@ SENSOR = SensorType(
             section="bearing_range",
         ),
     ),
-    settings={"bearing_range": Section("factorgraph_loc.sensors.landmarks.measurement:BearingRangeSettings")},
+    settings={
+        "bearing_range": Section("factorgraph_loc.sensors.landmarks.measurement:BearingRangeSettings", several=True)
+    },
     layers={
         "landmarks": Layer(
             "factorgraph_loc.sensors.landmarks.measurement:Landmark",

@@ -246,7 +246,7 @@ class NewLandmarks:
 
 class LandmarkSensor(Sensor):
     """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. A landmark that is not in the map becomes a block
-    ``SENSOR/NAME`` once two sightings agree on its position."""
+    ``bearing_range/NAME``, which all sensors of the kind share, once two sightings agree on its position."""
 
     modality = "bearing_range"
     lost = "landmarks were not where they were expected"
@@ -270,7 +270,7 @@ class LandmarkSensor(Sensor):
         known, inexact, unknown = self._landmarks.factors(m, view.offset, twist)
         terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
         for name, factor in inexact:
-            block, (position, spread) = f"{self.name}/{name}", self._landmarks.survey(name)
+            block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
             if view.value(block) is None:  # the estimator does not estimate it
@@ -281,7 +281,7 @@ class LandmarkSensor(Sensor):
         surveyed = any(term.blocks != self._shared for term in terms)
         met: list[tuple[str, Term]] = []
         for name, factor in unknown:
-            block = f"{self.name}/{name}"
+            block = f"{self.modality}/{name}"
             term = Term(factor, (*self._shared, block), 2)
             if view.value(block) is None:
                 met.append((block, term))

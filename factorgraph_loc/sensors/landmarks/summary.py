@@ -76,13 +76,13 @@ def summarize(log: Log) -> Summary:
     other_case = "landmark {landmark} is in the map with other capital letters"
     problems = [
         *_shifted(log),
-        *(notice("unseen_landmark", "landmark {landmark} of the map is never seen", name) for name in unseen),
         *(notice("unknown_landmarks", UNKNOWN_LANDMARK, name, count) for name, count in unknown.items()),
         *(notice("other_case", other_case, name) for name in in_other_case(unknown, unseen)),
         *(suspect.warning() for suspect in suspects),
     ]
     entries = {"unseen": unseen, "unknown": unknown, "suspects": suspects}
-    return Summary(entries, {"landmarks": len(log.world.landmarks)}, problems)
+    undetected = [notice("unseen_landmark", "landmark {landmark} of the map is never seen", name) for name in unseen]
+    return Summary(entries, {"landmarks": len(log.world.landmarks)}, problems, undetected=undetected)
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
@@ -233,14 +233,15 @@ def _shifted(log: Log) -> list[Notice]:
 
     shifts = (STEP * SHIFTS).tolist()
     best, (cost, height) = min(shifts, key=lambda shift: _cost(errors(shift))), fitted(0.0)
+    name = stream.source or "bearing_range"
     if abs(best) >= LARGE and fitted(best)[0] < BETTER * cost:
-        return [interfaces.line("bearing_range", best, "the reference", "bearing_range", -best)]
+        return [interfaces.line(name, best, "the reference", name, -best)]
     if height > TALL and _cost(errors(0.0, height)) < BETTER * _cost(errors(0.0)):
         sentence = (
             "ranges near landmarks are too long, as if these were {height:.1f} m above or below the sensor: give z of the "
-            "landmarks, and bearing_range.z of the rig"
+            "landmarks, and {name}.z of the rig"
         )
-        return [notice("height", sentence, height)]
+        return [notice("height", sentence, height, name)]
     return []
 
 
@@ -254,21 +255,24 @@ def check(use: Use) -> Use:
     """InputError if landmarks are to be estimated (setting ``landmarks`` of the estimator) but no sighting determines the
     position of one or shows a landmark of the map."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
-    stream = log.streams.get("bearing_range")
-    if wanted == "known" or "bearing_range" not in use.sensors:
+    streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
+    if wanted == "known" or not streams:
         return use
-    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
+    if any(np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)) for stream in streams):
         return use
-    if np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
+    if wanted == "extended" and any(name in log.world.landmarks for stream in streams for name in stream.landmark):
         return use
-    if wanted == "extended" and any(landmark in log.world.landmarks for landmark in stream.landmark):
-        return use
-    lacks = "bearing" if np.any(np.isfinite(stream.range)) else "range"
+    lacks = "bearing" if any(np.any(np.isfinite(stream.range)) for stream in streams) else "range"
     name = use.estimator
     raise InputError(
         f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, so no landmark can be located; give a map of "
         f"them (--world) with {name}.landmarks=known, or leave out bearing_range (--sensors)"
     )
+
+
+def _streams(log: Log) -> dict[str, BearingRangeStream]:
+    """The sightings of each sensor."""
+    return {name: stream for name, stream in log.streams.items() if isinstance(stream, BearingRangeStream)}
 
 
 def draw(log: Log) -> Marks:
@@ -284,13 +288,14 @@ def draw(log: Log) -> Marks:
 
 def require_mappable(log: Log) -> None:
     """InputError if the log's sightings cannot locate any landmark."""
-    stream = log.streams.get("bearing_range")
-    if not isinstance(stream, BearingRangeStream) or not len(stream.t):
+    streams = [stream for stream in _streams(log).values() if len(stream.t)]
+    if not streams:
         raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so there is nothing to map")
-    if log.rig.find(BearingRangeSettings) is None:
+    if not log.rig.names("bearing_range"):
         raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and mounting")
-    if not np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)):
-        lacking, what = ("bearing", "range") if np.isfinite(stream.range).any() else ("range", "bearing")
+    if not any(np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)) for stream in streams):
+        has_range = any(np.isfinite(stream.range).any() for stream in streams)
+        lacking, what = ("bearing", "range") if has_range else ("range", "bearing")
         raise InputError(
             f"{log.name}: no sighting has a {lacking}; from a {what} alone a landmark cannot be located, so it cannot be mapped"
         )

@@ -18,7 +18,7 @@ SENSOR = SensorType(
             section="position",
         ),
     ),
-    settings={"position": Section("factorgraph_loc.sensors.positions.measurement:PositionSettings")},
+    settings={"position": Section("factorgraph_loc.sensors.positions.measurement:PositionSettings", several=True)},
     locates=True,
     simulation={"positions": Section("factorgraph_loc.sensors.positions.simulation:PositionSimulation", always=True)},
     simulate="factorgraph_loc.sensors.positions.simulation:simulate",
