@@ -9,6 +9,7 @@ __all__ = [
     "images",
     "models",
     "settings",
+    "several",
     "shipped",
     "tables",
     "temporary",

@@ -46,8 +46,8 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Binding, Link, NewVariable, Observation
-from factorgraph_loc.sensors.interfaces import bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.registry import bound_sensors
 from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array

@@ -22,9 +22,8 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Binding
-from factorgraph_loc.sensors.interfaces import bound_sensors
 from factorgraph_loc.sensors.motion import Motion
-from factorgraph_loc.sensors.registry import sensor_of
+from factorgraph_loc.sensors.registry import bound_sensors, sensor_of
 from factors import positive, se2
 from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array

@@ -26,8 +26,8 @@ from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.planning.robot import ProximitySensor
 from factorgraph_loc.sensors.base import Binding
-from factorgraph_loc.sensors.interfaces import bound_sensors
 from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.registry import bound_sensors
 from factors.se2 import Array
 
 ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose

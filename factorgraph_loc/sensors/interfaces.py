@@ -19,7 +19,6 @@ from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
-from factorgraph_loc.sensors.base import Binding, Sensor
 from factorgraph_loc.sensors.registry import channels, functions, sensor_of
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array
@@ -138,13 +137,6 @@ class Marks:
     size: float = 6.0
     order: float = 3.0
     dense: bool = False
-
-
-def bound_sensors(binding: Binding) -> dict[str, Sensor]:
-    """The exteroceptive sensors of a run by name."""
-    named = [("" if kind_of(name) == name else name, bind) for name, bind in functions("bind", binding.setup.rig)]
-    sensors = [bind(replace(binding, setup=binding.setup.alone(name), name=name)) for name, bind in named]
-    return {sensor.name: sensor for sensor in sensors if sensor is not None}
 
 
 def marks(log: Log) -> list[Marks]:

@@ -9,7 +9,7 @@ group ``factorgraph_loc.sensors``.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from factorgraph_loc.text import quoted
 
 if TYPE_CHECKING:
     from factorgraph_loc.model.rig import Rig
+    from factorgraph_loc.sensors.base import Binding, Sensor
 
 
 @dataclass(frozen=True)
@@ -178,3 +179,10 @@ def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
             known = () if rig is None else [each for section in sensor.settings for each in rig.names(section)]
             for each in [each for each in known if kind_of(each) != each] or (name,):
                 yield each, load(place)
+
+
+def bound_sensors(binding: Binding) -> dict[str, Sensor]:
+    """The exteroceptive sensors of a run by name."""
+    named = [("" if kind_of(name) == name else name, bind) for name, bind in functions("bind", binding.setup.rig)]
+    sensors = [bind(replace(binding, setup=binding.setup.alone(name), name=name)) for name, bind in named]
+    return {sensor.name: sensor for sensor in sensors if sensor is not None}

@@ -35,9 +35,9 @@ from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import MAPPERS
 from factorgraph_loc.sensors.base import Binding
-from factorgraph_loc.sensors.interfaces import bound_sensors
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.registry import bound_sensors
 from factors import se2
 from factors.motion import ChainState, Increment, poses_between
 from factors.se2 import Array

@@ -129,3 +129,17 @@ def test_headings_of_a_system_that_has_none_are_ignored(log, tmp_path):
     read = fgloc.read_log(tmp_path / "log")
     assert not read.reference.has_heading
     assert "false_headings" in [warning.kind for warning in read.warnings]
+
+
+def test_two_points_of_a_robot_have_their_own_mounting(tmp_path):
+    tags = {"front": {"x": 0.4, "sigma": 0.1}, "rear": {"x": -0.4, "sigma": 0.1}}
+    log = fgloc.simulate("office", 1, changes={"drive": {"duration": 60.0}, "rig": {"position": tags}})
+    fgloc.write_native(log, tmp_path / "log")
+    log = fgloc.read_log(tmp_path / "log")
+    sensors = ("odometry", "position")
+    both = fgloc.run(log, "ekf", sensors=sensors).scores
+    one = fgloc.run(log, "ekf", sensors=("odometry", "position.front")).scores
+    assert both["causal.heading_rmse"] < one["causal.heading_rmse"]
+    assert both["causal.position_rmse"] < one["causal.position_rmse"]
+    assert 1.5 < both["causal.anees"] < 5.0
+    assert fgloc.run(log, "smoother", sensors=sensors, prior="unknown").scores["final.position_rmse"] < 0.1
