@@ -74,7 +74,7 @@ def _about(name: str, summary: Summary) -> Summary:
 
 
 def _problems(name: str, sensors: Mapping[str, Summary]) -> list[Notice]:
-    """The problems of a sensor. What it does not detect is one only if no other of its kind does."""
+    """The problems of a sensor. An undetected thing is none if another sensor of the kind detects it."""
     of_kind = [summary for each, summary in sensors.items() if kind_of(each) == kind_of(name)]
     undetected = [each for each in sensors[name].undetected if all(each in summary.undetected for summary in of_kind)]
     return [*sensors[name].problems, *undetected]
