@@ -25,5 +25,6 @@ READERS.own |= {
     "mapped": "factorgraph_loc.io.readers.mapped",
     "mrclam": "factorgraph_loc.io.readers.mrclam",
     "plaza": "factorgraph_loc.io.readers.plaza",
+    "pyfg": "factorgraph_loc.io.readers.pyfg",
     "rosbag": "factorgraph_loc.io.bags.rosbag",
 }

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, constants_of, learnt_from, on_pose
+from factorgraph_loc.fusion.layout import POSE, Layout, constants_of, learnt_from, on_pose
 from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -25,6 +25,7 @@ from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Binding, Link, NewVariable
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.motion import MOTION
 from factorgraph_loc.sensors.registry import bound_sensors
 from factors import positive, se2
 from factors.motion import Increment

@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.fusion.layout import MOTION
 from factorgraph_loc.fusion.timeline import Taken, Timeline
 from factorgraph_loc.fusion.tracking import Tracked
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior
@@ -22,7 +21,7 @@ from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import EarlierPose
-from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.motion import MOTION, Motion
 from factors import se2
 from factors.motion import ChainState
 from factors.se2 import Array

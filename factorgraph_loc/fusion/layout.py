@@ -12,10 +12,9 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import Learnt, LearntPoint
 from factorgraph_loc.model.settings import Estimated
 from factorgraph_loc.sensors.base import Observation, Sensor, View
-from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.motion import MOTION, Motion
 from factors.se2 import Array
 
-MOTION = "motion"  # the block of the constants of odometry
 POSE = 3  # components of the error state that are the pose's
 
 
@@ -62,7 +61,8 @@ def on_pose(observation: Observation, view: View) -> Observation:
 def learnt_from(
     constants: Mapping[str, Estimated], blocks: Iterable[tuple[str, Array, Array]], points: PointMap | None = None
 ) -> Learnt:
-    """The ``constants`` by sensor and the landmarks ``KIND/NAME`` among ``blocks``, each a name, mean and covariance.
+    """The ``constants`` by sensor, those of landmarks, and the landmarks ``KIND/NAME``, all from ``blocks``: names, means and
+    covariances.
 
     Blocks of points in space are left out; ``points``: those that are not in the map."""
     values: dict[str, tuple[float, float]] = {}
@@ -72,6 +72,8 @@ def learnt_from(
             prefix = "" if name == MOTION else f"{name}."
             rows = zip(constants[name].names, mean, np.sqrt(np.diag(covariance)), strict=True)
             values |= {prefix + label: (float(value), float(sigma)) for label, value, sigma in rows}
+        elif len(mean) == 1:
+            values[name.replace("/", ".")] = float(mean[0]), float(np.sqrt(covariance[0, 0]))
         elif len(mean) == 2:
             landmarks[name.partition("/")[2]] = LearntPoint(mean, covariance)
     return Learnt(values, landmarks, points)

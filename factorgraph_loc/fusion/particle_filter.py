@@ -36,7 +36,7 @@ from factorgraph_loc.fusion.cloud import (
     vector_moments,
 )
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, twin
-from factorgraph_loc.fusion.layout import MOTION, POSE, Layout, constants_of, learnt_from, on_pose
+from factorgraph_loc.fusion.layout import POSE, Layout, constants_of, learnt_from, on_pose
 from factorgraph_loc.fusion.particle_smoothing import BackwardSimulation, Record
 from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.fusion.tracking import LOST, Change, Tracking, is_known
@@ -47,6 +47,7 @@ from factorgraph_loc.model.setup import Calibration, Setup
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.base import Binding, Link, NewVariable, Observation
 from factorgraph_loc.sensors.known_position import KnownPosition
+from factorgraph_loc.sensors.motion import MOTION
 from factorgraph_loc.sensors.registry import bound_sensors
 from factors import positive, se2
 from factors.motion import Increment

@@ -24,6 +24,7 @@ from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import Landmark
+from factorgraph_loc.sensors.landmarks.summary import not_located
 from factorgraph_loc.text import Notice, notice
 from factors import positive, se2
 from factors.se2 import Array
@@ -137,14 +138,15 @@ def make_map(
     """
     if not learnt and not extend:
         raise RunFailedError(
-            f"{log.name}: no landmark was sighted twice consistently with odometry, so none was mapped"
+            f"{log.name}: the sightings along the odometry determine no position of a landmark, so none was mapped"
         )
     given = log.world.landmarks
     common = [name for name in given if name in learnt]
     if extend:
-        return _assemble(log, learnt, np.zeros(3), dict.fromkeys(given, "given"), keep=tuple(given))
+        notes = not_located(log, {*learnt, *given})
+        return _assemble(log, learnt, np.zeros(3), dict.fromkeys(given, "given"), keep=tuple(given), notes=notes)
     if not given:
-        return _assemble(log, learnt, np.zeros(3), {})
+        return _assemble(log, learnt, np.zeros(3), {}, notes=not_located(log, learnt))
     if len(common) < MIN_COMMON and not in_frame:
         few = "only {mapped} of the given map's landmarks were mapped, expected {least} or more to compare"
         return _unjudged(log, learnt, notice("few_mapped", few + UNJUDGED, len(common), MIN_COMMON))
@@ -160,7 +162,8 @@ def make_map(
     verdicts = {name: _verdict(name, moved, given, wrong) for name in common}
     unseen = tuple(name for name in given if name not in learnt)
     verdicts |= dict.fromkeys(unseen, UNSEEN)
-    return _assemble(log, moved, alignment.pose, verdicts, keep=unseen, flagged=wrong, judged=True)
+    notes = not_located(log, learnt)
+    return _assemble(log, moved, alignment.pose, verdicts, keep=unseen, flagged=wrong, judged=True, notes=notes)
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
@@ -257,7 +260,8 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
 
 def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: Notice) -> LandmarkMap:
     """The map in the frame of the start, without the given one, which cannot be aligned with it."""
-    return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=[note])
+    notes = [note, *not_located(log, learnt)]
+    return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
 
 
 def _assemble(

@@ -52,7 +52,10 @@ class Diagnostics:
         return "\n".join([*lines, *(f"{kind}: {', '.join(names)}" for kind, names in self.doubted.items())])
 
     def ignore(self, reason: str, count: int = 1) -> None:
+        """Count ignored detections; a negative ``count`` is of those that are used after all."""
         self.ignored[reason] = self.ignored.get(reason, 0) + count
+        if not self.ignored[reason]:
+            del self.ignored[reason]
         if self.added is not None:
             self.added.append((self.ignored, reason, count))
 

@@ -144,7 +144,8 @@ class Binding:
     """The context of a sensor: a run, the robot's ``motion`` and the diagnostics.
 
     ``name``: of one of several sensors, the only one of its kind in the setup; "" for the modality. ``use``: how landmarks of the
-    map are used, ``points``: how its points are used; ``calibration``: which uncertain constants the estimator learns.
+    map are used, ``points``: how points are used that one measurement does not locate; ``calibration``: which uncertain constants
+    the estimator learns.
     """
 
     setup: Setup

@@ -31,6 +31,7 @@ from factors.odometry.model import (
 )
 from factors.se2 import Array
 
+MOTION = "motion"  # the block of the constants of odometry
 # m, rad, s: over which the error of a constant accumulates before other sensors correct it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
 HORIZON = 5.0  # s of odometry that are kept

@@ -31,6 +31,7 @@ from factors.update import CONVERGED, GATE, Correction
 
 NOTHING = np.zeros(0)  # values of constants if the factor estimates none
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # if there is no offset, or no covariance of it
+SMALL_BIAS = 1e-4  # m; step of the numerical derivative by a bias: residuals are nearly linear
 LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
 
 
@@ -45,7 +46,8 @@ class BearingRangeFactor:
     robot's velocity at that time.
 
     The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
-    if any; and, if ``free``, the position (2,) of the one landmark, instead of ``points``.
+    if any; if ``biased``, the bias (1,) [m] of the ranges; and, if ``free``, the position (2,) of the one landmark, instead of
+    ``points``.
     """
 
     model: BearingRangeModel
@@ -57,16 +59,21 @@ class BearingRangeFactor:
     point_covariances: Array | None = None
     estimated: tuple[int, ...] = ()
     free: bool = False
+    biased: bool = False
     twist: Array | None = None
     in_look: int | None = None
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
-        if not self.free:
+        if not (self.free or self.biased):
             constants = values[1] if self.estimated else NOTHING
             linear = kernels.weighted(self.model.packed, self.packed, values[0], constants, self.places)
             residual, by_pose, by_sensor = linear
             return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
+        if not self.biased:
+            error, jacobian = self._whitened(values)
+            kernels.weigh(error, jacobian, self.model.robust)
+            return error.ravel(), [block.reshape(len(error) * 2, -1) for block in self._blocks(jacobian)]
         error, blocks = self.whitened(values)
         weight = np.sqrt(geman_mcclure_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
         weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
@@ -74,8 +81,8 @@ class BearingRangeFactor:
 
     @property
     def kind(self) -> Hashable:
-        """Equal for factors that are linearised together; None for a factor of a free landmark."""
-        return None if self.free else (self.estimated, self.model)
+        """Equal for factors that are linearised together; None for a factor of a free landmark, or with a bias."""
+        return None if self.free or self.biased else (self.estimated, self.model)
 
     def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
         """Factors of this kind as one: see :class:`~factors.graph.Stackable`."""
@@ -126,30 +133,45 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        error, jacobian = self._whitened(values)
+        blocks = self._blocks(jacobian)
+        if self.biased:
+            shorter, longer = (self._whitened(values, bias)[0] for bias in (SMALL_BIAS, -SMALL_BIAS))
+            blocks.insert(1 + bool(self.estimated), ((shorter - longer) / (2.0 * SMALL_BIAS))[..., None])
+        return error, blocks
+
+    def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
+        """The whitened residual (K, 2) with a further ``bias`` [m], and its Jacobian (K, 2, WIDTH)."""
         packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
         if self.free:
             packed = (self._placed(values[-1]), *packed[1:])
+        if self.biased:
+            packed = (packed[0], packed[1] - values[1 + bool(self.estimated)][0] - bias, *packed[2:])
         error, jacobian = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
         kernels.linearize(self.model.packed, values[0], changes, packed, error, jacobian)
+        return error, jacobian
+
+    def _blocks(self, jacobian: Array) -> list[Array]:
+        """The parts (K, 2, d) of a Jacobian (K, 2, WIDTH) by each value, without a bias."""
         blocks = [jacobian[..., :POINT]]
         if self.estimated:
             blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])
         if self.free:
             blocks.append(jacobian[..., POINT:CONSTANTS])
-        return error, blocks
+        return blocks
 
-    def fixed(self, parameters: Sequence[Array], point: Array | None) -> BearingRangeFactor:
-        """The factor on the pose only, at given constants (one array (P,), or none) and position (2,) of a free landmark."""
-        if not parameters and point is None:
+    def fixed(self, parameters: Sequence[Array], point: Array | None, bias: float = 0.0) -> BearingRangeFactor:
+        """The factor on the pose only, at given constants (one array (P,), or none), bias, and position (2,) of a free landmark."""
+        if not (parameters or self.biased) and point is None:
             return self
         model, offset = self.model, self.offset
         if parameters:
             changes = dict(zip(self.estimated, parameters[0].tolist(), strict=True))
             model = recalibrated(model, [changes.get(i, 0.0) for i in range(len(PARAMETERS))])
             offset = delayed(offset, self.twist, changes.get(TIME_OFFSET, 0.0))
-        noises, measured = (self.offset_covariance, self.point_covariances), (self.ranges, self.bearings)
+        noises, measured = (self.offset_covariance, self.point_covariances), (self.ranges - bias, self.bearings)
         points = self.points if point is None else self._placed(point)
         return BearingRangeFactor(model, points, *measured, offset, *noises, twist=self.twist, in_look=self.in_look)
 
@@ -187,7 +209,7 @@ def landmark_update(
 ) -> Correction | None:
     """:func:`~factors.update.update_state` by landmarks of a map, compiled; None for others, and where the information form is
     numerically insufficient. ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
-    if factor.free:
+    if factor.free or factor.biased:
         return None
     contiguous = np.ascontiguousarray(covariance)  # each other memory order would compile the function again
     known = factor.model.packed, factor.packed, pose, contiguous, constants, factor.places, first

@@ -113,7 +113,7 @@ def test_what_is_located_is_what_was_seen(model, seed):
 
 
 @given(models, poses, st.integers(0, 10_000), st.booleans())
-def test_jacobians_of_the_factor_by_constants_and_point_are_the_numerical_ones(model, pose, seed, displaced):
+def test_jacobians_of_the_factor_by_all_values_are_the_numerical_ones(model, pose, seed, displaced):
     rng = np.random.default_rng(seed)
     offset = np.array((0.1, 0.02, 0.1)) if displaced else None
     point = rng.uniform(-8.0, 8.0, 2)
@@ -128,9 +128,10 @@ def test_jacobians_of_the_factor_by_constants_and_point_are_the_numerical_ones(m
         offset,
         estimated=(0, 2, 3, 4, 5),
         free=True,
+        biased=True,
         twist=np.array((0.3, 0.01, 0.2)),
     )
-    values = [pose, np.zeros(5), point]
+    values = [pose, np.zeros(5), np.array([0.01]), point]
     _, blocks = factor.whitened(values)
     for block, numerical in zip(blocks, by_each(lambda v: factor.whitened(v)[0], values), strict=True):
         np.testing.assert_allclose(block, numerical, rtol=1e-3, atol=2e-3)

@@ -24,7 +24,7 @@ from factorgraph_loc.fusion.graph.graph import NOTHING_KNOWN, STATE, Graph, Keyf
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.keyframes import Backend, Builder
 from factorgraph_loc.fusion.graph.settings import BatchSettings, SmootherSettings
-from factorgraph_loc.fusion.layout import MOTION, learnt_from
+from factorgraph_loc.fusion.layout import learnt_from
 from factorgraph_loc.fusion.search import DURATION
 from factorgraph_loc.fusion.timeline import Taken, Timeline
 from factorgraph_loc.fusion.tracking import FOUND, JUMPED, Refuted, Tracked, Tracking, is_known
@@ -36,7 +36,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.plugins import MAPPERS
 from factorgraph_loc.sensors.base import Binding
 from factorgraph_loc.sensors.known_position import KnownPosition
-from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.motion import MOTION, Motion
 from factorgraph_loc.sensors.registry import bound_sensors
 from factors import se2
 from factors.motion import ChainState, Increment, poses_between

@@ -13,13 +13,13 @@ import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.fusion.graph.problem import DAMPED, blamed
-from factorgraph_loc.fusion.layout import MOTION, constants_of
+from factorgraph_loc.fusion.layout import constants_of
 from factorgraph_loc.fusion.tracking import Change
 from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.belief import PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.base import NewVariable, Sensor, Term
-from factorgraph_loc.sensors.motion import Motion
+from factorgraph_loc.sensors.motion import MOTION, Motion
 from factors import positive, se2
 from factors.graph import (
     Factor,
@@ -286,9 +286,12 @@ class Graph:
         return {key: np.zeros(len(s)) for key, s in sigmas.items()}, {key: np.diag(s**2) for key, s in sigmas.items()}
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
-        """A landmark that becomes a variable, as seen from a pose with this body-frame ``covariance`` (3, 3); its key."""
-        numbers = [index_of(key) for key in self.keys.values() if is_landmark(key)]
-        key = self.keys[new.name] = landmark_key(1 + max(numbers, default=-1))
+        """A landmark or a bias that becomes a variable, as seen from a pose with body-frame ``covariance`` (3, 3); its key."""
+        is_position = len(new.mean) > 1
+        numbers = [index_of(key) for key in self.keys.values() if is_landmark(key) is is_position]
+        first = 0 if is_position else len(self.constants)
+        number = max((1 + number for number in numbers), default=0)
+        key = self.keys[new.name] = (landmark_key if is_position else constants_key)(max(first, number))
         self.values[key], (_, self.covariances[key]) = new.mean, new.joint(covariance, {})
         return key
 
@@ -347,11 +350,11 @@ class Graph:
             del self.values[key]  # the tilt of a keyframe that was taken back
 
     def forget_landmarks(self, known: Collection[int]) -> None:
-        """Remove landmarks that no remaining keyframe observes and no summary contains. ``known``: variables of the summary of
-        marginalised keyframes."""
+        """Remove landmarks and biases that no remaining keyframe observes and no summary contains. ``known``: variables of the
+        summary of marginalised keyframes."""
         observed = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
         for name, key in list(self.keys.items()):
-            if is_landmark(key) and key not in observed and key not in known:
+            if name not in self.constants and key not in observed and key not in known:
                 del self.keys[name], self.values[key], self.covariances[key]
 
     def report_damping(self, damping: float) -> None:

@@ -18,7 +18,7 @@ from factorgraph_loc.fusion.graph.problem import IndeterminateError, covariances
 from factorgraph_loc.fusion.graph.settings import SmootherSettings
 from factorgraph_loc.fusion.graph.solver import MARGIN, WITH_POINTS, FullHistory, Window
 from factorgraph_loc.fusion.graph.summary import MarginalSummary, is_missing
-from factorgraph_loc.fusion.layout import MOTION
+from factorgraph_loc.sensors.motion import MOTION
 from factors import positive, se2
 from factors.graph import GTSAM_ERRORS, Values, index_of, is_constant, is_landmark, is_of_keyframe, tilt_key
 from factors.se2 import Array

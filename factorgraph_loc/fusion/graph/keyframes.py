@@ -22,10 +22,11 @@ from factorgraph_loc.fusion.graph.batch import AtTheEnd
 from factorgraph_loc.fusion.graph.graph import Addition, Graph, Guess, Keyframe, Node, TickAt
 from factorgraph_loc.fusion.graph.isam import Incremental
 from factorgraph_loc.fusion.graph.settings import GraphSettings
-from factorgraph_loc.fusion.layout import MOTION, on_pose
+from factorgraph_loc.fusion.layout import on_pose
 from factorgraph_loc.fusion.tracking import Tracking, laplace_evidence
 from factorgraph_loc.model.measurement import Measurement
 from factorgraph_loc.sensors.base import EarlierPose, Link, NewVariable, Observation, Sensor
+from factorgraph_loc.sensors.motion import MOTION
 from factors import se2
 from factors.graph import VectorPriorFactor
 from factors.motion import ChainState, Increment
@@ -243,13 +244,17 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add a landmark to the graph, with the sightings that determine it or with its prior."""
-        key = self._graph.new_block(new, view.covariance)
+        """Add a landmark to the graph, with the sightings that determine it or with its prior. If the poses of most sightings have
+        left the graph, its current estimate is the prior."""
+        graph = self._graph
+        key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean
-        if not new.sightings:
-            native = gtsam.PriorFactorVector(key, new.mean, gtsam.noiseModel.Gaussian.Covariance(new.noise))
-            addition.hang(view.keyframe, Node((key,), VectorPriorFactor(new.mean, new.noise), len(new.mean), native))
-        for t, observation in new.sightings:
-            keyframe = self._graph.keyframe_before(t)
-            if keyframe.t <= t and self._graph.is_open(keyframe.index):
-                addition.hang(keyframe, *(self._graph.node(keyframe, term, sensor.name) for term in observation.terms))
+        poses = [(graph.keyframe_before(t), t, observation) for t, observation in new.sightings]
+        sighted = [(k, observation) for k, t, observation in poses if k.t <= t and graph.is_open(k.index)]
+        if 2 * len(sighted) < len(poses) or not poses:
+            noise = new.noise if not poses else graph.covariances[key]
+            native = gtsam.PriorFactorVector(key, new.mean, gtsam.noiseModel.Gaussian.Covariance(noise))
+            addition.hang(view.keyframe, Node((key,), VectorPriorFactor(new.mean, noise), len(new.mean), native))
+            return
+        for keyframe, observation in sighted:
+            addition.hang(keyframe, *(graph.node(keyframe, term, sensor.name) for term in observation.terms))

@@ -19,6 +19,7 @@ __all__ = [
     "mrclam",
     "plaza",
     "pose_file",
+    "pyfg",
     "read_log",
     "read_manifest",
     "reader",

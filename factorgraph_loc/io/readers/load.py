@@ -18,6 +18,7 @@ from factorgraph_loc.io.checks import look_over, require_bounds, without_false_h
 from factorgraph_loc.io.motions import with_wheels_in, with_wheels_of
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig
 from factorgraph_loc.io.native.world_file import read_world
+from factorgraph_loc.io.readers import pyfg
 from factorgraph_loc.io.readers.manifests import Manifest, read_manifest
 from factorgraph_loc.io.readers.pose_file import is_pose_file
 from factorgraph_loc.model.log import RIG_NOTES, Log
@@ -167,6 +168,8 @@ def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
         return _Source("native", path.parent)
     if path.suffix == ".toml":
         return _from_manifest(path, data_root)
+    if path.suffix.lower() == pyfg.SUFFIX:
+        return _Source("pyfg", path)
     if is_pose_file(path):
         raise InputError(
             f"{log}: is a file of poses, expected a log: name it as odometry or reference in a manifest with the reader mapped, "

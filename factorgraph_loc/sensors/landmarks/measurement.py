@@ -93,6 +93,8 @@ class BearingRangeUncertainty(FileModel):
     """standard deviation of the constant"""
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """standard deviation of the constant, relative"""
+    range_bias: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
+    """standard deviation of reported minus true ranges, a constant of each landmark, not with particles"""
     depth_axis: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
     """standard deviation of the constant"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0

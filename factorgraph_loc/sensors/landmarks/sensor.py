@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,114 +13,21 @@ import numpy as np
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import GOING_BACK
 from factorgraph_loc.model.settings import Estimated
-from factorgraph_loc.model.setup import MapUse
-from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.base import Binding, Blocks, Columns, NewVariable, ResidualObservation, Sensor, Term, View
+from factorgraph_loc.sensors.landmarks.candidates import Candidate, PartialSighting
 from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder
-from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings, points_of
-from factors import positive
+from factorgraph_loc.sensors.landmarks.known import KnownLandmarks
+from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings
+from factorgraph_loc.sensors.motion import MOTION
+from factors import positive, se2
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.kernels import innovations
 from factors.landmarks.model import PARAMETERS, TIME_OFFSET
-from factors.motion import Increment
 from factors.se2 import Array
 from factors.update import GATE, Correction
 
-NamedFactor = tuple[str, BearingRangeFactor]
-NOWHERE = np.zeros(2)  # of a landmark that is not in the map
-EXACT = 0.2  # landmarks whose survey has a sigma below this share of `range_sigma` are exact
-
-
-class KnownLandmarks:
-    """Turns measurements into factors. Landmarks that map or rig lack are counted as ignored.
-
-    ``use`` of the map: ``known`` uses its landmarks and ignores others, ``extended`` also estimates the others, ``unknown``
-    estimates all landmarks without the map. ``estimated``: indices of the sensor's constants that are estimated. ``carries``:
-    whether the estimator estimates landmarks with an inexact survey; otherwise the survey's covariance is added to the noise.
-    """
-
-    def __init__(
-        self,
-        settings: BearingRangeSettings,
-        world: World,
-        diagnostics: Diagnostics,
-        use: MapUse = "known",
-        estimated: tuple[int, ...] = (),
-        *,
-        carries: bool = False,
-    ) -> None:
-        self._model = settings.model()
-        landmarks = {} if use == "unknown" else world.landmarks
-        self._positions = dict(zip(landmarks, points_of(landmarks.values(), settings.z), strict=True))
-        limit = 2.0 * (EXACT * settings.range_sigma) ** 2
-        surveys = {name: m.spread() for name, m in landmarks.items()}
-        self._surveys = {name: survey for name, survey in surveys.items() if np.trace(survey) > limit}
-        self._carries = carries
-        self._maps_others = use != "known"
-        self._estimated = estimated
-        self._diagnostics = diagnostics
-
-    def factor(self, m: BearingRange) -> BearingRangeFactor | None:
-        """The factor of the landmarks that are not estimated, on the pose at the measurement's time; None without any."""
-        return self.factors(m)[0]
-
-    def factors(
-        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
-    ) -> tuple[BearingRangeFactor | None, list[NamedFactor], list[NamedFactor]]:
-        """:meth:`factor`, on the pose at the measurement's time or on one that lies ``offset`` before it. Further factors depend
-        on the pose and, as the last value, on the position of a landmark. They have names, and are of landmarks with an inexact
-        survey, then of those without one.
-
-        ``twist`` (3,): the robot's velocity at that time, needed if the sensor's time offset is estimated.
-        """
-        fixed, surveyed, unknown = list[int](), list[int](), list[int]()
-        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
-        for i, (name, no_range, no_bearing) in enumerate(lacks):
-            if name not in self._positions:
-                if not self._maps_others:
-                    self._diagnostics.ignore("landmark not in the map")
-                elif no_range or no_bearing:
-                    self._diagnostics.ignore("unknown landmark without range and bearing")
-                else:
-                    unknown.append(i)
-            elif no_range and no_bearing:
-                self._diagnostics.ignore("neither range nor bearing")
-            else:
-                (surveyed if self._carries and name in self._surveys else fixed).append(i)
-
-        def of_rows(rows: list[int], points: Array) -> BearingRangeFactor:
-            return BearingRangeFactor(
-                self._model,
-                points,
-                m.range[rows],
-                m.bearing[rows],
-                None if offset is None else offset.delta,
-                None if offset is None else offset.covariance,
-                estimated=self._estimated,
-                twist=twist,
-                in_look=None if offset is None else len(fixed) + len(surveyed) + len(unknown),
-            )
-
-        of_surveyed, of_unknown = (
-            [
-                (m.landmarks[i], replace(of_rows([i], self._positions.get(m.landmarks[i], NOWHERE)[None]), free=True))
-                for i in rows
-            ]
-            for rows in (surveyed, unknown)
-        )
-        if not fixed:
-            return None, of_surveyed, of_unknown
-        names = [m.landmarks[i] for i in fixed]
-        factor = of_rows(fixed, np.array([self._positions[name] for name in names]))
-        if any(name in self._surveys for name in names):
-            surveys = np.array([self._surveys.get(name, np.zeros((2, 2))) for name in names])
-            factor = replace(factor, point_covariances=surveys)
-        return factor, of_surveyed, of_unknown
-
-    def survey(self, name: str) -> tuple[Array, Array]:
-        """Position (2,) and covariance (2, 2) of a landmark in the map."""
-        return self._positions[name][:2], self._surveys[name]
+NOT_LOCATED = "landmark not located yet"
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
@@ -210,11 +118,16 @@ class LandmarkObservation(ResidualObservation):
             return self
         fixed = []
         for term in self.terms:
-            factor = cast(BearingRangeFactor, term.factor)
-            shared = [values[name] for name in term.blocks[: len(term.blocks) - factor.free]]
-            own = term.blocks[-1] if factor.free else None
-            here = factor.fixed(shared, None if own is None else values[own])
-            fixed.append(here if own is None else replace(here, point_covariances=spreads[own][None]))
+            factor, names = cast(BearingRangeFactor, term.factor), list(term.blocks)
+            own = names.pop() if factor.free else None
+            bias = names.pop() if factor.biased else None
+            point, shorter = None if own is None else values[own], 0.0 if bias is None else float(values[bias][0])
+            here = factor.fixed([values[name] for name in names], point, shorter)
+            uncertain = np.zeros((2, 2)) if here.point_covariances is None else here.point_covariances[0]
+            uncertain = uncertain if own is None else spreads[own]
+            if bias is not None:  # an error of the range is one of the position in that direction
+                uncertain = uncertain + spreads[bias] * np.eye(2)
+            fixed.append(here if len(names) == len(term.blocks) else replace(here, point_covariances=uncertain[None]))
         factor = together(fixed)
         return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 
@@ -226,10 +139,17 @@ Sighted = tuple[float, LandmarkObservation]  # with the time [s] of the pose tha
 class NewLandmarks:
     """Sightings of landmarks that are not initialized yet: two must agree on the position, because one may be an outlier.
 
-    Immutable, because filters go back to an earlier state when a measurement is late.
+    Immutable, because filters go back to an earlier state when a measurement is late. ``partial``: those with a range or a bearing
+    alone.
     """
 
     pending: Mapping[str, tuple[tuple[Array, Array, Sighted], ...]] = field(default_factory=dict)
+    partial: Mapping[str, Candidate] = field(default_factory=dict)
+
+    def without(self, name: str) -> NewLandmarks:
+        """The sightings of all landmarks but one."""
+        pending = {key: rows for key, rows in self.pending.items() if key != name}
+        return NewLandmarks(pending, {key: rows for key, rows in self.partial.items() if key != name})
 
     def propose(
         self, name: str, point: Array, covariance: Array, sighting: Sighted
@@ -240,13 +160,15 @@ class NewLandmarks:
         for earlier, noise, candidate in reversed(waiting):
             apart = point - earlier
             if positive.squared(apart, noise + covariance) < GATE:
-                return NewLandmarks({key: rows for key, rows in self.pending.items() if key != name}), candidate
-        return NewLandmarks({**self.pending, name: (*waiting, (point, covariance, sighting))[-MAX_PENDING:]}), None
+                return self.without(name), candidate
+        rows = (*waiting, (point, covariance, sighting))[-MAX_PENDING:]
+        return replace(self, pending={**self.pending, name: rows}), None
 
 
 class LandmarkSensor(Sensor):
-    """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. A landmark that is not in the map becomes a block
-    ``bearing_range/NAME``, which all sensors of the kind share, once two sightings agree on its position."""
+    """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. Another landmark becomes a block
+    ``bearing_range/NAME``, which all sensors of the kind share, once two sightings agree on its position, or several with a range
+    or a bearing alone determine it."""
 
     modality = "bearing_range"
     lost = "landmarks were not where they were expected"
@@ -255,7 +177,11 @@ class LandmarkSensor(Sensor):
         super().__init__(binding.name)
         world, motion, use = binding.setup.world, binding.motion, binding.use
         self.constants, self._motion, self._diagnostics = constants, motion, binding.diagnostics
-        self._landmarks = KnownLandmarks(settings, world, self._diagnostics, use, constants.indices, carries=True)
+        self._bias = settings.uncertainty.range_bias if binding.calibration == "all" else 0.0
+        locates, biased = binding.points != "known", self._bias > 0.0
+        self._landmarks = KnownLandmarks(
+            settings, world, self._diagnostics, use, constants.indices, carries=True, locates=locates, biased=biased
+        )
         # sightings before the start are counted when they are used there
         self._sought = KnownLandmarks(settings, world, Diagnostics())
         self._shared = (self.name,) if constants.names else ()
@@ -267,45 +193,94 @@ class LandmarkSensor(Sensor):
 
     def observe(self, m: BearingRange, view: View) -> Iterator[LandmarkObservation | NewVariable]:
         twist = self._motion.twist(m.t) if TIME_OFFSET in self.constants.indices else None
-        known, inexact, unknown = self._landmarks.factors(m, view.offset, twist)
+        known, single, inexact, unknown = self._landmarks.factors(m, view.offset, twist)
         terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
+        for name, factor in single:
+            yield from self._new_bias(name, view)
+            terms.append(self._term(name, factor, view))
         for name, factor in inexact:
+            yield from self._new_bias(name, view) if factor.biased else ()
             block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
             if view.value(block) is None:  # the estimator does not estimate it
                 prior = replace(factor, point_covariances=spread[None], free=False)
-                terms.append(Term(prior, self._shared, 2))
+                terms.append(self._term(name, prior, view))
             else:
-                terms.append(Term(factor, (*self._shared, block), 2))
+                terms.append(self._term(name, factor, view))
         surveyed = any(term.blocks != self._shared for term in terms)
         met: list[tuple[str, Term]] = []
         for name, factor in unknown:
             block = f"{self.modality}/{name}"
-            term = Term(factor, (*self._shared, block), 2)
             if view.value(block) is None:
-                met.append((block, term))
+                biases = (f"{block}/bias",) if factor.biased else ()
+                met.append((block, Term(factor, (*self._shared, *biases, block), 2)))
             else:
-                terms.append(term)
+                yield from self._new_bias(name, view) if factor.biased else ()
+                terms.append(self._term(name, factor, view))
         if terms:
             yield LandmarkObservation(m.t, tuple(terms), surveyed)
         for block, term in met if view.newest else ():
-            new = self._proposed(m.t, block, term, view)
+            self._before.append((m.t, self._new))
+            while self._before[0][0] < m.t - GOING_BACK:
+                self._before.popleft()
+            is_partial = cast(BearingRangeFactor, term.factor).dof() < 2
+            new = (self._located if is_partial else self._proposed)(m.t, block, term, view)
             if new is not None:
+                yield from self._new_bias(block.partition("/")[2], view) if self._bias else ()
                 yield new
+
+    def _new_bias(self, name: str, view: View) -> Iterator[NewVariable]:
+        """The bias of a landmark's ranges, if it is new."""
+        block = f"{self.modality}/{name}/bias"
+        if view.value(block) is None:
+            yield NewVariable(block, np.zeros(1), np.zeros((1, 3)), {}, np.array([[self._bias**2]]), ())
+
+    def _term(self, name: str, factor: BearingRangeFactor, view: View) -> Term:
+        """A factor of one landmark; without its bias if the estimator does not estimate that."""
+        block = f"{self.modality}/{name}"
+        if factor.biased and view.value(f"{block}/bias") is None:
+            factor = replace(factor, biased=False)
+        biases = (f"{block}/bias",) if factor.biased else ()
+        return Term(factor, (*self._shared, *biases, *((block,) if factor.free else ())), 2)
 
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
         """A new landmark if an earlier sighting agrees with this one, with its position from this sighting."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
-        point, (by_pose, *by_shared), noise = cast(BearingRangeFactor, term.factor).locate([view.pose, *shared])
+        factor = replace(cast(BearingRangeFactor, term.factor), biased=False)
+        point, (by_pose, *by_shared), noise = factor.locate([view.pose, *shared])
         current = (view.t, LandmarkObservation(t, (term,)))
         new = NewVariable(block, point, by_pose, dict(zip(self._shared, by_shared, strict=True)), noise, (current,))
         _, widened = new.joint(*view.joint())
-        self._before.append((t, self._new))
-        while self._before[0][0] < t - GOING_BACK:
-            self._before.popleft()
         self._new, earlier = self._new.propose(block, point, widened, current)
         return None if earlier is None else replace(new, sightings=(earlier, current))
+
+    def _located(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
+        """A new landmark if its sightings, each with a range or a bearing alone, determine its position."""
+        factor = cast(BearingRangeFactor, term.factor)
+        sighting = PartialSighting(self._motion.state(t), float(factor.ranges[0]), float(factor.bearings[0]))
+        source = (view.t, LandmarkObservation(t, (term,)))
+        waiting = self._new.partial.get(block, Candidate())
+        candidate = waiting.plus(sighting, source)
+        position = None
+        if candidate.is_due:
+            constants = view.value(MOTION)
+            known = (np.zeros(0), np.zeros((0, 0))) if constants is None else (constants, view.block_covariance(MOTION))
+            noisier = replace(factor.model, range_sigma=math.hypot(factor.model.range_sigma, self._bias))
+            position = candidate.position(noisier, self._motion, *known)
+            candidate = candidate.tried()
+        self._diagnostics.ignore(NOT_LOCATED, len(candidate.sources) - len(waiting.sources))
+        if position is None:
+            self._new = replace(self._new, partial={**self._new.partial, block: candidate})
+            return None
+        self._diagnostics.ignore(NOT_LOCATED, -len(candidate.sources))
+        self._new = self._new.without(block)
+        at = view.pose if view.offset is None else se2.compose(view.pose, view.offset.delta)
+        mean = se2.transform_from(at, position.point)
+        noise = _rotation(at[2]) @ position.covariance @ _rotation(at[2]).T
+        x, y = mean - view.pose[:2]
+        by_pose = np.column_stack((_rotation(view.pose[2]), (-y, x)))
+        return NewVariable(block, mean, by_pose, {}, noise, cast("tuple[Sighted, ...]", candidate.sources))
 
     def judge(self, observation: LandmarkObservation, correction: Correction, view: View) -> bool:
         factor = observation.measured
@@ -337,6 +312,11 @@ class LandmarkSensor(Sensor):
     def restart(self, t: float) -> None:
         self._new = NewLandmarks()
         self._before.clear()
+
+
+def _rotation(heading: float) -> Array:
+    c, s = math.cos(heading), math.sin(heading)
+    return np.array(((c, -s), (s, c)))
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:

@@ -8,7 +8,7 @@ are also compared with the predictions from the reference at various time shifts
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,7 +33,7 @@ from factorgraph_loc.sensors.interfaces import (
     in_other_case,
 )
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, BearingRangeStream, points_of
-from factorgraph_loc.text import Notice, notice
+from factorgraph_loc.text import Notice, listed, notice
 from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
@@ -252,11 +252,11 @@ def _cost(errors: Array) -> float:
 
 
 def check(use: Use) -> Use:
-    """InputError if landmarks are to be estimated (setting ``landmarks`` of the estimator) but no sighting determines the
-    position of one or shows a landmark of the map."""
+    """InputError if landmarks are to be estimated by an estimator that needs ranges with bearings, but no sighting has both or
+    shows a landmark of the map."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
-    if wanted == "known" or not streams:
+    if wanted == "known" or use.estimates_points or not streams:
         return use
     if any(np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)) for stream in streams):
         return use
@@ -265,8 +265,8 @@ def check(use: Use) -> Use:
     lacks = "bearing" if any(np.any(np.isfinite(stream.range)) for stream in streams) else "range"
     name = use.estimator
     raise InputError(
-        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, so no landmark can be located; give a map of "
-        f"them (--world) with {name}.landmarks=known, or leave out bearing_range (--sensors)"
+        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, and {name} needs both to locate a landmark: "
+        f"take the smoother, or give a map (--world) with {name}.landmarks=known"
     )
 
 
@@ -293,9 +293,10 @@ def require_mappable(log: Log) -> None:
         raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so there is nothing to map")
     if not log.rig.names("bearing_range"):
         raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and mounting")
-    if not any(np.any(np.isfinite(stream.range) & np.isfinite(stream.bearing)) for stream in streams):
-        has_range = any(np.isfinite(stream.range).any() for stream in streams)
-        lacking, what = ("bearing", "range") if has_range else ("range", "bearing")
-        raise InputError(
-            f"{log.name}: no sighting has a {lacking}; from a {what} alone a landmark cannot be located, so it cannot be mapped"
-        )
+
+
+def not_located(log: Log, located: Container[str]) -> list[Notice]:
+    """A note on landmarks that were sighted without being located."""
+    counts = Counter(name for stream in _streams(log).values() for name in stream.landmark)
+    missing = [f"{name} ({count} sightings)" for name, count in sorted(counts.items()) if name not in located]
+    return [notice("not_located", "not located: {landmarks}", listed(missing))] if missing else []

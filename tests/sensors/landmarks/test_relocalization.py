@@ -12,7 +12,8 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.sensors.base import Binding
 from factorgraph_loc.sensors.landmarks.finder import LandmarkFinder, TrackMonitor
-from factorgraph_loc.sensors.landmarks.sensor import KnownLandmarks, bind
+from factorgraph_loc.sensors.landmarks.known import KnownLandmarks
+from factorgraph_loc.sensors.landmarks.sensor import bind
 from factorgraph_loc.sensors.motion import Motion
 from factors import se2
 

@@ -1,0 +1,5 @@
+"""Ranges to beacons at unknown positions: the section of docs/ranges.md."""
+
+from ranges_benchmark import pyfg
+
+SECTIONS = {"7. Unknown beacons": pyfg.section}
