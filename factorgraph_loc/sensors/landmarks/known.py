@@ -15,7 +15,6 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 NamedFactor = tuple[str, BearingRangeFactor]
-NOWHERE = np.zeros(2)  # of a landmark that is not in the map
 EXACT = 0.2  # landmarks whose survey has a sigma below this share of `range_sigma` are exact
 
 
@@ -44,6 +43,8 @@ class KnownLandmarks:
         self._model = settings.model()
         landmarks = {} if use == "unknown" else world.landmarks
         self._positions = dict(zip(landmarks, points_of(landmarks.values(), settings.z), strict=True))
+        # of a landmark that is not in the map; with a height if landmarks of the map have one
+        self._nowhere = np.zeros_like(next(iter(self._positions.values()), np.zeros(2)))
         limit = 2.0 * (EXACT * settings.range_sigma) ** 2
         surveys = {name: m.spread() for name, m in landmarks.items()}
         self._surveys = {name: survey for name, survey in surveys.items() if np.trace(survey) > limit}
@@ -83,7 +84,7 @@ class KnownLandmarks:
 
         def of_row(i: int, *, free: bool) -> NamedFactor:
             name, biased = m.landmarks[i], self._biased and not bool(np.isnan(m.range[i]))
-            factor = replace(of_rows([i], self._positions.get(name, NOWHERE)[None]), free=free, biased=biased)
+            factor = replace(of_rows([i], self._positions.get(name, self._nowhere)[None]), free=free, biased=biased)
             if not free and name in self._surveys:
                 factor = replace(factor, point_covariances=self._surveys[name][None])
             return name, factor
