@@ -119,9 +119,8 @@ def test_many_looks_at_many_tags_add_up(name: str) -> None:
     copied = TagArray(np.tile(tags.points, (100, 1)), np.tile(tags.facing, 100))
     mixed = replace(looks, odds=np.linspace(-3.0, 3.0, 15), elsewhere=np.linspace(-5.0, 0.0, 15))
     expected = likelihood.log_likelihood(poses, mixed)
-    mixed = replace(
-        mixed, hits=np.tile(mixed.hits, 100), odds=np.tile(mixed.odds, 100), elsewhere=np.tile(mixed.elsewhere, 100)
-    )
+    tiled = {name: np.tile(getattr(mixed, name), 100) for name in ("hits", "odds", "elsewhere")}
+    mixed = replace(mixed, tags=np.arange(1500), **tiled)
     found = RfidLikelihood(likelihood.model, copied).log_likelihood(poses, mixed)
     assert found == pytest.approx(100.0 * expected, rel=1e-8)
 
