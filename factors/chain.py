@@ -19,8 +19,9 @@ from factors.se2 import Array, Integers
 POSE = 3
 LEAST = 1e-11  # smallest share of a diagonal element that elimination may leave; less is a rounding error
 
-# Blocks of the poses: on the diagonal (N, 3, 3), by the next pose (N, 3, 3), by the parameters and the gradient
-# (N, 3, P + 1). The block of the parameters and their gradient (P + 1, P + 1); its last row is not used.
+# The normal equations in four arrays: each pose with itself (N, 3, 3); each pose with the next one (N, 3, 3); each pose with the
+# parameters, and in the last column the gradient by the pose (N, 3, P + 1); the parameters with each other, and in the last column
+# the gradient by them (P + 1, P + 1), whose last row is not used.
 System = tuple[Array, Array, Array, Array]
 
 

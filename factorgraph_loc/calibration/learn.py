@@ -109,10 +109,11 @@ def learn_by_turns(
     grids: Path | None = None,
     progress: Callable[[float, float], None] | None = None,
 ) -> Knowledge:
-    """Learn a rig from ``logs``, whose references are not used, beginning with the rig ``start``.
+    """Learn a rig from ``logs`` without their references: smooth all logs and learn from the result, in turns.
 
-    ``grids``: path prefix of files that may be written; ``progress``: called with the number of runs done and of all that there
-    may be. InputError if a log contains too little information.
+    ``start``: the rig of the first turn. ``grids``: path and name prefix of the detection grids that may be written; ``progress``:
+    called with the number of smoothed logs so far, and the largest number possible. InputError if a log contains too little
+    information.
     """
     rig, turns, fitted = start, list[float](), dict[tuple[str, str], float]()
     while True:

@@ -94,18 +94,19 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
 def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, Any]:
     """All figures of a run, by dotted key; metres, radians, None where undefined.
 
-    ``scoring.max_gap`` [s]: only runs with equal values are comparable. ``causal.*`` and ``final.*`` (see
-    :func:`accuracy`) are scored from the first localized causal estimate and, except for ``scored``, are None without a reference
-    or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never localized, ``causal.*`` is None, and ``final.*``
-    is scored from its beginning. ``time_to_localized`` [s] counts from the first tick. ``landmarks.*`` (see
-    :func:`landmark_figures`) are None unless the map was estimated. ``learnt.NAME.value``
-    and ``learnt.NAME.sigma`` exist for each learnt constant. ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*`` and
-    ``timing.*`` always exist, as do ``warnings``, a list.
+    - ``scoring.max_gap`` [s]: only runs with equal values are comparable.
+    - ``causal.*`` and ``final.*``: see :func:`accuracy`. Both are scored from the first localized causal estimate. All but
+      ``scored`` are None without a reference, or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never
+      localized, ``causal.*`` is None, and ``final.*`` is scored from the beginning of the run.
+    - ``time_to_localized`` [s]: from the first tick.
+    - ``landmarks.*``: see :func:`landmark_figures`; None unless the run estimated the map.
+    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: of each learnt constant.
+    - ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*``, ``timing.*``, and the list ``warnings`` always exist.
 
-    With ``align`` also ``scoring.align``, and ``causal.*`` and ``final.*`` of :data:`ALIGNED` [m, rad] after that alignment, at the
-    same stamps (see :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). They are None without a reference. They
-    are None, with a warning, if the poses do not determine the alignment. A run that estimated its map is aligned by ``se2`` unless
-    ``align`` is another alignment.
+    If ``align`` is not ``none``, or if the run estimated its map, which is then aligned by ``se2``, there are also
+    ``scoring.align`` and the errors :data:`ALIGNED` [m, rad] of ``causal`` and ``final`` after the alignment, at the same stamps
+    (:func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). These are None without a reference. They are None, with a
+    warning, if the poses do not determine the alignment.
     """
     causal = result.causal()
     final = result.final

@@ -73,10 +73,10 @@ class LogSource(ABC):
 
 @dataclass(frozen=True)
 class RecordedSource(LogSource):
-    """Log ``number`` of those that ``log`` stands for, in the sense of :func:`~factorgraph_loc.io.readers.load`.
+    """One recorded log: the one with this ``number``, from 0, that :func:`~factorgraph_loc.io.readers.load` returns for ``log``.
 
-    ``options``: of the reader, as JSON. ``rig``, ``world``: files replacing the log's own. ``data_root``: folder of the data of
-    manifests, by default from the environment's FGLOC_DATA.
+    ``options``: of the reader, as JSON. ``rig``, ``world``: files replacing the log's own. ``data_root``: a folder in which a
+    manifest may find its data, besides its own folder; by default the environment's FGLOC_DATA.
     """
 
     log: str

@@ -230,7 +230,9 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
         if reference.has_heading:
             track = _track(table.times(), tick * np.append(0.0, np.nancumsum(right - left)), reference)
     else:
-        roles.remarks.append(f"{table.name}: replace {tick:g} by the metres per unit of {quoted(table.fields['left'])}")
+        roles.remarks.append(
+            f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])} is an example: replace it"
+        )
     if track is None:
         roles.remarks.append(f"{table.name}: measure the distance between the wheels: track [m]")
     else:

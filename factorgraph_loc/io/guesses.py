@@ -31,7 +31,7 @@ READ: dict[str, tuple[str, ...]] = {
     "frequency": ("frequency", "freq", "carrier", "channelfrequency", "channelmhz", "channelkhz"),
     "stamp": ("firstseen", "firstseentimestamp", "firstseentimestamputc", "readtime", "timestamp"),
 }
-# of a range to a radio or another landmark, the likeliest first
+# names of columns in a table of ranges to radios or landmarks, the likeliest first
 LANDMARK = ("anchorid", "anchor", "anchorname", "responderid", "beaconid", "beacon", "landmarkid", "nodeid", "id")
 RANGE = ("range", "distance", "dist", "dis", "rangem", "distancem")
 UNIT = re.compile(r"(deg(rees)?|rad(ians)?|[mk]?hz|[mun]s|dbm)$")

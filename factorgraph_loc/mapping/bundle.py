@@ -114,7 +114,7 @@ def marginals(
     of_cameras = np.array(information)
     np.add.at(of_cameras, tracks.frame, np.einsum("nij,nik->njk", by_camera, by_camera))
     inverse = np.linalg.inv(of_points)
-    # the gain of each observation: how its point moves with its camera
+    # minus the change (3, 6) of a point's best position by its camera's perturbation, for each observation
     gains = np.einsum("nij,nkj,nkl->nil", inverse[tracks.track], by_point, by_camera)
     gain = _sparse(gains, tracks.track, tracks.frame, (3 * total, 6 * count))
     cross = _sparse(np.einsum("nki,nkj->nij", by_camera, by_point), tracks.frame, tracks.track, (6 * count, 3 * total))

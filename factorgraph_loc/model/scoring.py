@@ -121,7 +121,7 @@ class Ticks:
         return self._start + self._next / RATE
 
     def advance(self, t: float) -> Iterable[float]:
-        """The ticks before ``t``, the time of the next measurement."""
+        """Advance to the next measurement, at ``t``: yields the ticks before it that were not yielded yet."""
         if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:
             self._newest = t
             return ()  # the usual case for odometry

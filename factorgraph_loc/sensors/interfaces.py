@@ -36,9 +36,11 @@ Places = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Use:
-    """A run of a log. ``sensors``: names of usable channels; ``estimator``: its name, with ``settings``; ``given``: those of the
-    user; ``modalities``: of measurements that it uses; ``estimates_points``: whether it may estimate points that are not in the
-    map; ``warnings``: about the settings."""
+    """A run of a log by an estimator.
+
+    ``sensors``: names of the channels that can be used; ``estimator``: its name, with its ``settings``; ``given``: names of the
+    settings that the user has set; ``modalities``: those of the measurements that the estimator uses; ``estimates_points``: whether
+    the estimator can estimate points that are not in the map; ``warnings``: about the settings."""
 
     log: Log
     sensors: tuple[str, ...]

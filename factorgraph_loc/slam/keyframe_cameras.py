@@ -82,8 +82,9 @@ def bundled(
 def _adjusted(
     model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
 ) -> tuple[Sequence[Array], Array, Truths]:
-    """Adjusted poses (3,) and tilts (N, 2) of N keyframes, and which of the M sightings fit: none if the points cannot be
-    determined.
+    """Adjusted poses (3,) and tilts (N, 2) of N keyframes, and which of the M sightings fit (M,).
+
+    If no step can be determined, poses and tilts keep their initial values.
     """
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]

@@ -271,7 +271,8 @@ def lens_of(model: CameraModel) -> Lens:
     return (*lens[:8], 1.0 / falls[0] if falls else lens[8], *lens[9:])
 
 
-# how level a floor is: in most images the tilt of a robot is that of the floor; in some, as on a sill, it may have any scale
+# how level a floor is: the standard deviation of the robot's tilt is one of these. It is the same in most images; in a few, such as
+# those on a sill, it may be any of them
 SCALES = 0.0005 * 2.0 ** (0.5 * np.arange(15))  # rad: of half a millimetre in a metre, up to 0.064
 VAGUE = math.log(3.0)  # standard deviation of the logarithm of the first guess
 MEMORY = 60.0  # images that the scale is learnt from

@@ -124,7 +124,7 @@ class RfidFactor:
         return self.likelihood.log_likelihood(poses, self.reads, self._parameters(values))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Residual (4 + P,) and its Jacobians (4 + P, 3) by the pose and, of P > 0, (4 + P, P)."""
+        """Residual (4 + P,) and its Jacobians: (4 + P, 3) by the pose and, if P > 0, (4 + P, P) by the P estimated parameters."""
         score = self.score(values)
         residual, jacobian = compressed(float(score.nll[0]), score.gradient[0], score.information[0])
         return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]

@@ -280,7 +280,7 @@ class LinearFactors:
             self._slots.add(linear.slot)
 
     def forget(self, key: int) -> None:
-        """A variable has left the solver, with all factors on it."""
+        """Delete what is stored of a variable that has left the solver, and of all factors on it."""
         del self.at[key]
         self._held.pop(key, None)
         for linear in self._on.pop(key, {}).values():

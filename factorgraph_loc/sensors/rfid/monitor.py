@@ -101,9 +101,12 @@ class ScanMonitor:
 
 
 class BurstMonitor:
-    """The number of rounds that inform as much as one independent round. Correlated reads and misses, behind a person or a shelf,
-    scatter more in blocks of time. The number is the ratio of the variances (McCullagh and Nelder, "Generalized linear models",
-    1989, section 4.5). Counted for each of A antennas and T tags."""
+    """The number of correlated rounds that inform as much as one independent round.
+
+    Reads and misses behind a person or a shelf are correlated. The number of reads in a block of time then scatters more about its
+    expectation than independent reads would. The result is the ratio of the two variances (McCullagh and Nelder, "Generalized
+    linear models", 1989, section 4.5), over A antennas and T tags.
+    """
 
     def __init__(self, antennas: int, tags: int) -> None:
         # reads minus expected reads and their variance in this block; and the tags with any
