@@ -1,3 +1,3 @@
-"""Simultaneous localization and mapping: unknown landmarks and points, and loop closure."""
+"""Simultaneous localization and mapping with images: monoSLAM, unknown points, and loop closure."""
 
 __all__ = ["monoslam", "point_mapper"]
