@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from factorgraph_loc.text import Notice
+from factorgraph_loc.text import Notice, plain
 from factorgraph_loc.version import __version__
 
 if TYPE_CHECKING:
@@ -59,6 +60,10 @@ def sectioned(title: str, lead: str, doubts: Sequence[Notice], sections: Mapping
     return render("sectioned.html", title=title, lead=lead, doubts=doubts, sections=names, parts=parts)
 
 
+# control characters but line breaks and tabs, and those that turn the direction of text
+CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
 @cache
 def _environment() -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined  # noqa: PLC0415
@@ -67,12 +72,20 @@ def _environment() -> Environment:
         loader=PackageLoader("factorgraph_loc.drawing"),
         autoescape=True,
         undefined=StrictUndefined,
+        finalize=_without_controls,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     made.filters["sha256"] = _digest
     return made
+
+
+def _without_controls(value: Any) -> Any:
+    """A text whose control characters, which a terminal would obey, are escaped; any other value itself."""
+    if not isinstance(value, str) or not CONTROL.search(value):
+        return value
+    return type(value)(CONTROL.sub(lambda found: plain(found[0]), value))
 
 
 def _digest(content: str) -> str:

@@ -17,6 +17,7 @@ from factorgraph_loc.files.tables import Cells, csv_rows, rows_of_length
 from factorgraph_loc.text import Notice, listed, notice, quoted, well_formed
 from factors.se2 import Integers
 
+TEXT_FIELDS = ("epc_base64",)  # a number is no value of these
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
 
@@ -274,10 +275,12 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
             first = listed(sorted(chosen[0][1]))
             raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {first}")
     columns: dict[str, list[str]] = {}
+    texts = {column for field, column in mapping.columns.items() if field in TEXT_FIELDS}
     for name in known.intersection(mapping.columns.values()):
         for row, o in whole:
-            if isinstance(o.get(name), list):
-                raise bad_field(path, name, o[name], "a number or a text", row=row)
+            value = o.get(name)
+            if isinstance(value, list | bool) or (name in texts and not isinstance(value, str | None)):
+                raise bad_field(path, name, value, "a text" if name in texts else "a number or a text", row=row)
         columns[name] = [_text(o.get(name)) for _, o in whole]
     names = dict.fromkeys(name for _, o in whole for name in o)
     rows = np.array([row for row, _ in whole], dtype=np.int64)

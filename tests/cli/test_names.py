@@ -39,13 +39,16 @@ def test_any_name_gives_a_run_with_tables_and_plots(name: str, landmark: str, tm
     """How names are drawn is tested in ``tests/drawing``."""
     log, out = tmp_path / "log", tmp_path / "out"
     write_native(named(name, landmark), log)
-    for command in (["info", log], ["info", log, "--json"], ["run", log, "-e", "ekf", "-o", out]):
+    compared = ["compare", log, "-e", "dead_reckoning,ekf", "-o", tmp_path / "compared"]
+    for command in (["info", log], ["info", log, "--json"], ["run", log, "-e", "ekf", "-o", out], compared):
         done = CliRunner().invoke(app, [str(word) for word in command])
         assert done.exit_code == 0, done.output
         assert shown(done.stdout + done.stderr)
     assert read_toml(out / "config.toml")
     assert json.loads((out / "metrics.json").read_text())
     assert list((out / "plots").glob("*.png"))
+    for file in ("report.html", "table.md", "results.csv"):
+        assert not {"\x1b", "\u202e", "\x9b"} & set((tmp_path / "compared" / file).read_text())
 
 
 @pytest.mark.parametrize("name", ["\x1b[31m\x00\u202e\x9b", "a\nb", "caf\udce9", "[/red]:smile:{x}"])

@@ -68,6 +68,17 @@ def test_events_of_an_r700_with_epcs_in_base64(hall, with_options, one, refused)
     refused(manifest({"epc": None}), "no object has 'tagInventoryEvent.epcHex', the first has eventType, hostname")
 
 
+@pytest.mark.parametrize("value", [True, 12])
+def test_only_a_text_is_an_epc_in_base64(hall, with_options, refused, value):
+    event = {"timestamp": "1970-01-01T00:00:01.5Z", "tagInventoryEvent": {"epc": value, "antennaPort": 2}}
+    (hall.parent / "run" / "events.json").write_text(json.dumps(event))
+    refused(
+        with_options(f'{WHEELS}\n[options.rfid]\nfile = "events.json"\npreset = "impinj_iot"\n'),
+        "events.json:1:",
+        "a text",
+    )
+
+
 def test_epcs_that_are_digits_of_a_text(hall, with_options, one):
     """Digits that are no text are EPCs as they are; a line has lists of one, as old versions of sllurp write them."""
     lines = [{"EPC-96": epc, "AntennaID": [1], "LastSeenTimestampUTC": [1_500_000]} for epc in ("453230303031", "E2FF")]
