@@ -73,11 +73,14 @@ def known_sensors() -> list[SensorDescription]:
 def describe_sensor(name: str) -> SensorDescription:
     """The description of a sensor, by its name or that of a channel; InputError for an unknown one."""
     described = sensor(name)
+    tables: dict[str, dict[str, Column]] = {}
+    for table in all_tables(described):  # several of one name are alternatives
+        tables.setdefault(table.name, {}).update({column.name: column for column in table.columns})
     return SensorDescription(
         described.name,
         about(described.name),
         tuple(channel.name for channel in described.channels),
-        {table.name: table.columns for table in all_tables(described)},
+        {name: tuple(columns.values()) for name, columns in tables.items()},
         {section: tuple(settings) for section, settings in sections_of(described).items()},
     )
 

@@ -1,6 +1,7 @@
 """A proposed manifest for a folder of tables: which file is which sensor, with columns, units and clock offsets."""
 
 import os
+import re
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
@@ -33,8 +34,10 @@ FIELDS = {
     "inventories": ("t", "antenna", "duration"),
     "bearing_range": ("t", "landmark", "range", "bearing"),
     "tags": ("epc", "x", "y", "z", "facing"),
-    "landmarks": ("landmark", "x", "y"),
+    "landmarks": ("landmark", "x", "y", "z"),
+    "position": ("t", "x", "y"),
 }
+POSITIONS = re.compile("uwb|gps|gnss|fix|position|ble", re.IGNORECASE)  # in names of tables of positions
 MAPS = ("tags", "landmarks")
 WINDOW = 1.0  # s over which turns are compared
 TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m: examples of what no file says
@@ -157,6 +160,11 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
         out.tables[role] = tables[0]
         out.remarks += [f"{role} could also be {table.name}" for table in tables[1:]]
     rest = [g for g in poses if g not in out.tables.values() and g not in truths]
+    measured = [g for g in rest if not _has_headings(g) and POSITIONS.search(g.name)]
+    if measured:
+        out.tables["position"] = measured[0]
+        out.remarks.append(f"{measured[0].name} has positions: give the rig the section [position]")
+        rest = [g for g in rest if g not in measured]
     if "odometry" not in out.tables and rest:
         out.tables["odometry"] = rest.pop(0)
     reference = truths[0] if truths else rest[0] if rest else None

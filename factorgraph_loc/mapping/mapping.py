@@ -23,7 +23,7 @@ from factorgraph_loc.evaluation.pairing import align_points
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
-from factorgraph_loc.sensors.landmarks.measurement import Landmark
+from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings, Landmark
 from factorgraph_loc.sensors.landmarks.summary import not_located
 from factorgraph_loc.text import Notice, notice
 from factors import positive, se2
@@ -277,6 +277,8 @@ def _assemble(
 ) -> LandmarkMap:
     """The map with the landmarks of the given one in their order, then the new ones; those in ``keep`` are the given ones."""
     entries, landmarks = [], {}
+    sensors = [log.rig.of(BearingRangeSettings, name) for name in log.rig.names("bearing_range")]
+    level = sensors[0].z if sensors else 0.0  # a landmark of unknown height is level with the sensor
     for name in (*log.world.landmarks, *sorted(set(learnt) - set(log.world.landmarks), key=_natural)):
         point = learnt.get(name)
         entries.append(Entry(name, log.world.position(name), point, verdicts.get(name, "new"), name in flagged))
@@ -285,7 +287,8 @@ def _assemble(
         elif point is not None:
             (xx, xy), (_, yy) = point.covariance.tolist()
             x, y = point.position.tolist()
-            landmarks[name] = Landmark.bounded(x=x, y=y, covariance=(xx, xy, yy))
+            z = log.world.landmarks[name].z if name in log.world.landmarks else level
+            landmarks[name] = Landmark.bounded(x=x, y=y, z=z, covariance=(xx, xy, yy))
     return LandmarkMap(World(name=f"{log.name}-map", landmarks=landmarks), tuple(entries), frame, judged, tuple(notes))
 
 

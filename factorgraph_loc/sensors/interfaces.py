@@ -109,7 +109,12 @@ class Summary:
 
 
 def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
-    """The warning that ``name`` is stamped ``shift`` [s] later than ``than``, with the ``time_offset`` [s] that corrects it."""
+    """The warning that ``name`` is stamped ``shift`` [s] later than ``than``, with the ``time_offset`` [s] that corrects it.
+
+    A shift at the end of the search may be larger."""
+    if abs(shift) > FARTHEST - STEP:
+        sentence = "{name} is stamped {shift:.1f} s or more apart from {other}: correct clock_offset in the manifest"
+        return notice("clocks_apart", sentence, name, FARTHEST, than)
     late = "later" if shift > 0.0 else "earlier"
     sentence = "{stream} is stamped about {shift:.2f} s {late} than {other}: set {section}.time_offset = {offset:+.2f} in the rig"
     return notice("time_offset", sentence, name, abs(shift), late, than, setting, offset)

@@ -21,6 +21,7 @@ from factors.landmarks.model import (
     BearingRangeModel,
     located,
     log_likelihood,
+    on_floor,
     recalibrated,
     widened,
 )
@@ -191,7 +192,9 @@ class BearingRangeFactor:
         """
         on_pose = self.fixed(values[1:], None)
         at = values[0] if on_pose.offset is None else se2.compose(values[0], on_pose.offset)
-        point = se2.transform_from(at, located(on_pose.model, self.ranges, self.bearings))[0]
+        point = se2.transform_from(
+            at, located(on_pose.model, on_floor(on_pose.model, self.points, self.ranges), self.bearings)
+        )[0]
         _, blocks = replace(self, free=True).whitened([*values, point])
         # the whitened residual stays zero: by_value dv + by_point dp = noise
         to_point = _raised_inverse(blocks[-1][0])

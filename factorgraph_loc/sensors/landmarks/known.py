@@ -11,6 +11,7 @@ from factorgraph_loc.model.setup import MapUse
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings, points_of
 from factors.landmarks.factor import BearingRangeFactor
+from factors.landmarks.model import HEIGHT
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -42,9 +43,12 @@ class KnownLandmarks:
     ) -> None:
         self._model = settings.model()
         landmarks = {} if use == "unknown" else world.landmarks
-        self._positions = dict(zip(landmarks, points_of(landmarks.values(), settings.z), strict=True))
-        # of a landmark that is not in the map; with a height if landmarks of the map have one
-        self._nowhere = np.zeros_like(next(iter(self._positions.values()), np.zeros(2)))
+        places = dict(zip(world.landmarks, points_of(world.landmarks.values(), settings.z), strict=True))
+        self._positions = {name: places[name] for name in landmarks}
+        # heights are known where positions are to be estimated
+        self._heights = {name: np.concatenate((np.zeros(HEIGHT), place[HEIGHT:])) for name, place in places.items()}
+        # of a landmark that is not in the map; with a height of zero if landmarks of the map have one
+        self._nowhere = np.zeros_like(next(iter(places.values()), np.zeros(HEIGHT)))
         limit = 2.0 * (EXACT * settings.range_sigma) ** 2
         surveys = {name: m.spread() for name, m in landmarks.items()}
         self._surveys = {name: survey for name, survey in surveys.items() if np.trace(survey) > limit}
@@ -84,7 +88,8 @@ class KnownLandmarks:
 
         def of_row(i: int, *, free: bool) -> NamedFactor:
             name, biased = m.landmarks[i], self._biased and not bool(np.isnan(m.range[i]))
-            factor = replace(of_rows([i], self._positions.get(name, self._nowhere)[None]), free=free, biased=biased)
+            place = self._positions.get(name, self._heights.get(name, self._nowhere))
+            factor = replace(of_rows([i], place[None]), free=free, biased=biased)
             if not free and name in self._surveys:
                 factor = replace(factor, point_covariances=self._surveys[name][None])
             return name, factor

@@ -23,7 +23,7 @@ from factors import positive, se2
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.kernels import innovations
-from factors.landmarks.model import PARAMETERS, TIME_OFFSET
+from factors.landmarks.model import PARAMETERS, TIME_OFFSET, on_floor
 from factors.se2 import Array
 from factors.update import GATE, Correction
 
@@ -258,7 +258,8 @@ class LandmarkSensor(Sensor):
     def _located(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
         """A new landmark if its sightings, each with a range or a bearing alone, determine its position."""
         factor = cast(BearingRangeFactor, term.factor)
-        sighting = PartialSighting(self._motion.state(t), float(factor.ranges[0]), float(factor.bearings[0]))
+        (along_floor,) = on_floor(factor.model, factor.points, factor.ranges).tolist()
+        sighting = PartialSighting(self._motion.state(t), along_floor, float(factor.bearings[0]))
         source = (view.t, LandmarkObservation(t, (term,)))
         waiting = self._new.partial.get(block, Candidate())
         candidate = waiting.plus(sighting, source)

@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from factorgraph_loc.files.tables import TableRows
 
 AREA, DEGREES = {"m^2": 1.0}, {"deg": 1.0}
+LARGEST = 1e308  # m^2; some systems state such a variance
 VARIANCES = ("var_x", "cov_xy", "var_y")
 _POINT = {axis: f"pose.position.{axis}" for axis in "xy"}
 _COVARIANCE = dict(zip(VARIANCES, ("covariance[0]", "covariance[1]", "covariance[7]"), strict=True))
 _SPREAD = tuple(
-    number(name, AREA, -np.inf, np.inf, "of its covariance; not used if implausible", may_lack=True)
+    number(name, AREA, -LARGEST, LARGEST, "of its covariance; not used if implausible", may_lack=True)
     for name in VARIANCES
 )
 POSITIONS = Table(

@@ -52,6 +52,28 @@ def test_an_unknown_start_among_landmarks_at_the_ceiling(flat, tall):
     assert at_height["final.position_rmse"] < 1.6 * in_plane["final.position_rmse"]
 
 
+def made_map(log, tmp_path):
+    """The landmarks of the map that is made from a log."""
+    fgloc.build_map(log, tmp_path / "made.world.toml")
+    return fgloc.read_world(tmp_path / "made.world.toml").landmarks
+
+
+def test_a_map_is_made_with_given_heights(tall, tmp_path):
+    """Where the given map has the heights, learnt positions agree with it, and the heights stay."""
+    bearings = fgloc.simulate("office", 4, changes=CHANGES).streams["bearing_range"].bearing
+    sightings = replace(tall.streams["bearing_range"], bearing=bearings)
+    given = tall.world.landmarks
+    made = made_map(replace(tall, streams=tall.streams | {"bearing_range": sightings}), tmp_path)
+    assert len(made) >= 3
+    assert {mark.z for mark in made.values()} == {HEIGHT}
+    assert np.median([np.hypot(mark.x - given[name].x, mark.y - given[name].y) for name, mark in made.items()]) < 0.2
+
+
+def test_a_new_landmark_is_level_with_the_sensor(flat, tall, tmp_path):
+    alone = replace(flat, rig=tall.rig, world=flat.world.model_copy(update={"landmarks": {}}))
+    assert {mark.z for mark in made_map(alone, tmp_path).values()} == {Z}
+
+
 def test_a_map_without_heights_is_doubted(tall):
     marks = {name: mark.model_copy(update={"z": Z}) for name, mark in tall.world.landmarks.items()}
     without = replace(tall, world=tall.world.model_copy(update={"landmarks": marks}))
