@@ -93,10 +93,12 @@ def without_false_headings(log: Log) -> Log:
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not reference.has_heading or len(reference.t) < 2 or np.ptp(reference.poses[:, 2]) > 1e-9:
         return log
+    if stream is None or len(stream.t) < 2:
+        return log
     if isinstance(stream, IncrementStream):
-        turned = float(np.abs(stream.dtheta).sum())
+        turned = float(np.ptp(np.cumsum(stream.dtheta)))
     elif isinstance(stream, VelocityStream):
-        turned = float(np.abs(stream.w[:-1]) @ np.diff(stream.t))
+        turned = float(np.ptp(np.cumsum(stream.w[:-1] * np.diff(stream.t))))
     else:
         return log
     if turned <= TURNED:

@@ -37,7 +37,7 @@ FIELDS = {
     "landmarks": ("landmark", "x", "y", "z"),
     "position": ("t", "x", "y"),
 }
-POSITIONS = re.compile("uwb|gps|gnss|fix|position|ble", re.IGNORECASE)  # in names of tables of positions
+POSITIONS = re.compile("uwb|gps|gnss|position|(^|[-_.])(fix|ble)", re.IGNORECASE)  # in names of tables of positions
 MAPS = ("tags", "landmarks")
 WINDOW = 1.0  # s over which turns are compared
 TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m: examples of what no file says

@@ -165,3 +165,21 @@ def test_a_file_name_of_two_lines_adds_no_key(tmp_path):
     write(tmp_path / "day" / "odometry.csv", ["t,v,w", *(f"{START + t:.3f},0.5,0.0" for t in T)])
     write(tmp_path / "day" / "notes\ntitle = 'x'", ["drove twice round the hall"])
     assert tomllib.loads(manifest(tmp_path / "day").text)["title"] == "The folder day"
+
+
+def test_a_table_of_positions_is_a_sensor_beside_a_reference(tmp_path):
+    write(tmp_path / "day" / "odom.csv", ["t,v,w", *(f"{START + t:.3f},0.5,0.0" for t in T)])
+    rows = zip(START + T, 1000.0 * X, 1000.0 * Y, strict=True)
+    write(tmp_path / "day" / "uwb.csv", ["time_s,x_mm,y_mm", *(f"{t:.3f},{x:.0f},{y:.0f}" for t, x, y in rows)])
+    write_truth(tmp_path / "day")
+    log, proposal = log_of(tmp_path)
+    assert proposal.content["options"]["position"]["file"] == "uwb.csv"
+    assert log.streams["position"].x[300] == pytest.approx(X[300], abs=1e-3)
+
+
+def test_a_map_of_anchors_has_their_heights(tmp_path):
+    write(tmp_path / "day" / "odom.csv", ["t,v,w", *(f"{START + t:.3f},0.5,0.0" for t in T)])
+    write(tmp_path / "day" / "uwb.csv", ["t,anchor,dist_mm", *(f"{START + t:.3f},a,2000" for t in T)])
+    write(tmp_path / "day" / "anchors.csv", ["name,x_m,y_m,z_m", "a,1.0,2.0,2.5"])
+    log, _ = log_of(tmp_path)
+    assert log.world.landmarks["a"].z == 2.5
