@@ -125,6 +125,22 @@ def transform_from(pose: Array, points: Array) -> Array:
     return np.stack((x, y), axis=-1)
 
 
+def align_points(points: Array, targets: Array) -> Array:
+    """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) in least squares; pairs with a NaN are ignored.
+
+    NaN without a pair. For coincident points the rotation is 0. Umeyama, "Least-squares estimation of transformation parameters
+    between two point patterns", PAMI 13(4), 1991, equations 40 to 42 with scale 1: in the plane the rotation is one angle.
+    """
+    known = np.isfinite(points).all(axis=1) & np.isfinite(targets).all(axis=1)
+    if not known.any():
+        return np.full(3, np.nan)
+    centre, target_centre = points[known].mean(axis=0), targets[known].mean(axis=0)
+    a, b = points[known] - centre, targets[known] - target_centre
+    angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    rotation = np.array((0.0, 0.0, angle))
+    return np.array((*(target_centre - transform_from(rotation, centre)), angle))
+
+
 def body_to_world(pose: Array, covariance: Array) -> Array:
     """Convert a covariance ``(..., 3, 3)`` of the body-frame perturbation to one of ``(x, y, heading)`` in the world."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])

@@ -228,7 +228,7 @@ def independent_count(values: Array) -> float:
 
 
 def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float, float]:
-    """The 95 % band of the mean over logs of the mean NEES, for a consistent estimator.
+    """The 95 % band of a consistent estimator's mean NEES, averaged over logs.
 
     ``counts``: effective number of independent values of each log; ``dofs``: its degrees of freedom. The band is that of a
     chi-square distribution with the same mean and variance."""

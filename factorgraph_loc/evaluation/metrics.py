@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.pairing import CONFIDENCE, TOLERANCE, Pairs, align_points, pairs, rms, summarize
+from factorgraph_loc.evaluation.pairing import CONFIDENCE, TOLERANCE, Pairs, pairs, rms, summarize
 from factorgraph_loc.evaluation.scores import ACCURACY, ALIGNED, OF_FREE_MAP
 from factorgraph_loc.evaluation.trajectories.association import in_plane
 from factorgraph_loc.evaluation.trajectories.score import pose_errors, score_paths
@@ -201,10 +201,10 @@ def landmark_figures(
     positions = np.array([landmarks[name].position for name in names]).reshape(-1, 2)
     truth = np.array([log.world.position(name) for name in names]).reshape(-1, 2)
     if log.reference is None:
-        pose = align_points(positions, truth)
+        pose = se2.align_points(positions, truth)
     else:
         pair = pairs(trajectory, log.reference, max_gap)
-        pose = align_points(pair.poses[:, :2], pair.truth[:, :2])
+        pose = se2.align_points(pair.poses[:, :2], pair.truth[:, :2])
     if names and np.isfinite(pose).all():
         # in the estimate's own frame, as the covariances
         error = positions - se2.transform_to(pose, truth)

@@ -9,9 +9,6 @@ measurement that had not arrived at the stamp.
 Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights. Let ``a`` and ``b`` be
 the errors of the neighbours. The covariance of ``(1 - f) a + f b`` is at most ``(1 - f) E[a a'] + f E[b b']``, for any
 correlation. Both are equal for identical errors.
-
-Alignment: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991, equations 40 to 42
-with scale 1. In the plane the rotation is one angle, and reflections cannot occur.
 """
 
 import bisect
@@ -23,7 +20,6 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory, neighbours
-from factors import se2
 from factors.se2 import Array, Integers
 
 RATE = 10.0  # Hz, of poses that are scored
@@ -92,21 +88,6 @@ def _within(t: Array, stamps: Array) -> Array:
         return np.full(len(t), np.nan)
     clipped = np.clip(t, stamps[0], stamps[-1])
     return np.asarray(np.where(np.abs(clipped - t) <= TOLERANCE, clipped, np.nan))
-
-
-def align_points(points: Array, targets: Array) -> Array:
-    """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) in least squares; pairs with a NaN are ignored.
-
-    NaN without a pair. For coincident points the rotation is 0.
-    """
-    known = np.isfinite(points).all(axis=1) & np.isfinite(targets).all(axis=1)
-    if not known.any():
-        return np.full(3, np.nan)
-    centre, target_centre = points[known].mean(axis=0), targets[known].mean(axis=0)
-    a, b = points[known] - centre, targets[known] - target_centre
-    angle = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-    rotation = np.array((0.0, 0.0, angle))
-    return np.array((*(target_centre - se2.transform_from(rotation, centre)), angle))
 
 
 def rms(values: Array) -> float | None:

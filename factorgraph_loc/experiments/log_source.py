@@ -75,8 +75,8 @@ class LogSource(ABC):
 class RecordedSource(LogSource):
     """One recorded log: the one with this ``number``, from 0, that :func:`~factorgraph_loc.io.readers.load` returns for ``log``.
 
-    ``options``: of the reader, as JSON. ``rig``, ``world``: files replacing the log's own. ``data_root``: a folder in which a
-    manifest may find its data, besides its own folder; by default the environment's FGLOC_DATA.
+    ``options``: of the reader, as JSON. ``rig``, ``world``: files replacing the log's own. ``data_root``: a manifest may also find
+    its data in this folder; by default the environment's FGLOC_DATA.
     """
 
     log: str

@@ -19,7 +19,6 @@ from itertools import combinations
 import numpy as np
 
 from factorgraph_loc.errors import RunFailedError
-from factorgraph_loc.evaluation.pairing import align_points
 from factorgraph_loc.model.belief import LearntPoint
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.world import World
@@ -182,7 +181,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
         error = se2.transform_from(pose, positions) - targets
         return error, information, np.einsum("ki,kij,kj->k", error, information, error)
 
-    candidates = [align_points(positions[pair], targets[pair]) for pair in _pairs(count)]
+    candidates = [se2.align_points(positions[pair], targets[pair]) for pair in _pairs(count)]
     half = max(MIN_COMMON, count // 2 + 1)
     median = min(np.partition(errors(pose)[2], half - 1)[half - 1] for pose in candidates)
     factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))

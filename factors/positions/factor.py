@@ -27,14 +27,19 @@ class PositionFactor:
     robust: float
     offset: Increment | None = None
 
+    @property
+    def point(self) -> Array:
+        """The measured point (2,) in the frame of the pose."""
+        return self.arm if self.offset is None else np.asarray(se2.transform_from(self.offset.delta, self.arm))
+
     def errors(self, poses: Array) -> Array:
         """Predicted minus measured positions (N, 2) [m] from poses (N, 3)."""
-        return np.asarray(se2.transform_from(poses, self._arm_at_pose()) - self.position)
+        return np.asarray(se2.transform_from(poses, self.point) - self.position)
 
     def linearized(self, poses: Array) -> tuple[Array, Array]:
         """Whitened residuals (N, 2) of poses (N, 3), and their Jacobians (N, 2, 3) by the body-frame perturbation."""
-        arm, axes = self._arm_at_pose(), _axes(poses[:, 2])
-        jacobian = axes @ np.array(((1.0, 0.0, -arm[1]), (0.0, 1.0, arm[0])))
+        point, axes = self.point, _axes(poses[:, 2])
+        jacobian = axes @ np.array(((1.0, 0.0, -point[1]), (0.0, 1.0, point[0])))
         whitener = positive.whitener(self._covariances(poses))
         return np.einsum("nij,nj->ni", whitener, self.errors(poses)), whitener @ jacobian
 
@@ -74,9 +79,6 @@ class PositionFactor:
     def widened(self, width: float) -> PositionFactor:
         """The factor with a loss ``width`` times as wide."""
         return replace(self, robust=width * self.robust)
-
-    def _arm_at_pose(self) -> Array:
-        return self.arm if self.offset is None else np.asarray(se2.transform_from(self.offset.delta, self.arm))
 
     def _covariances(self, poses: Array) -> Array:
         """Covariances (N, 2, 2) of the errors: of the measurement, and of the motion since the pose."""

@@ -13,7 +13,7 @@ from scipy.stats import binom, chi2
 
 from factorgraph_loc import Landmark, Log, Rig, Trajectory, World
 from factorgraph_loc.evaluation.metrics import accuracy, errors, landmark_figures, score
-from factorgraph_loc.evaluation.pairing import Pairs, align_points, pairs
+from factorgraph_loc.evaluation.pairing import Pairs, pairs
 from factorgraph_loc.evaluation.scores import OF_FREE_MAP
 from factorgraph_loc.evaluation.trajectories.association import in_plane
 from factorgraph_loc.evaluation.trajectories.score import pose_errors
@@ -244,7 +244,7 @@ def arc():
 
 def align(estimate, truth):
     pair = pairs(estimate, truth)
-    return align_points(pair.poses[:, :2], pair.truth[:, :2])
+    return se2.align_points(pair.poses[:, :2], pair.truth[:, :2])
 
 
 def free_map(n, rng):
@@ -259,7 +259,7 @@ def free_map(n, rng):
 def test_least_squares_are_those_of_evo():
     rng = np.random.default_rng(4)
     points, targets = rng.normal(size=(2, 40, 2))
-    pose = align_points(points, targets)
+    pose = se2.align_points(points, targets)
     rotation, translation, _ = umeyama_alignment(points.T, targets.T, with_scale=False)
     np.testing.assert_allclose(pose, (*translation, math.atan2(rotation[1, 0], rotation[0, 0])), atol=1e-12)
 
@@ -271,7 +271,7 @@ def test_pairs_without_a_reference_are_left_out():
     poses[30:] += 100.0
     np.testing.assert_allclose(align(Trajectory(truth.t, poses), seen), se2.inverse(FRAME), atol=1e-12)
     assert np.isnan(align(Trajectory(truth.t + 100.0, poses), seen)).all()
-    np.testing.assert_array_equal(align_points(np.ones((3, 2)), np.zeros((3, 2))), (-1.0, -1.0, 0.0))
+    np.testing.assert_array_equal(se2.align_points(np.ones((3, 2)), np.zeros((3, 2))), (-1.0, -1.0, 0.0))
 
 
 @pytest.mark.parametrize("with_reference", [True, False])

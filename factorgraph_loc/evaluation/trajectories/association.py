@@ -2,7 +2,7 @@
 
 Least squares in space: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
 Transactions on Pattern Analysis and Machine Intelligence, 1991, equations 38 to 43. In the plane:
-:func:`~factorgraph_loc.evaluation.pairing.align_points`.
+:func:`~factors.se2.align_points`.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.evaluation.pairing import Pairs, align_points, pairs, pairs_in_space, pauses
+from factorgraph_loc.evaluation.pairing import Pairs, pairs, pairs_in_space, pauses
 from factorgraph_loc.files import checks
 from factorgraph_loc.model.pose_path import PosePath, upright
 from factorgraph_loc.model.scoring import Alignment, Association
 from factorgraph_loc.model.trajectory import Trajectory
+from factors import se2
 from factors.se2 import Array, Integers
 
 FEWEST = 3  # pairs that define an alignment by least squares
@@ -171,7 +172,7 @@ def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similari
             raise InputError(
                 f"{path.name}: all positions are one, which --align {how} cannot turn, expected a robot that moves"
             )
-    x, y, angle = align_points(points, targets)
+    x, y, angle = se2.align_points(points, targets)
     rise = float(np.mean(reference.positions[:, 2] - estimate.positions[:, 2])) if how == "yaw" else 0.0
     return Similarity(upright(np.array([angle]))[0], np.array((x, y, rise)))
 

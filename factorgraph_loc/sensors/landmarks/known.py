@@ -23,8 +23,9 @@ class KnownLandmarks:
     """Turns measurements into factors. Landmarks that map or rig lack are counted as ignored.
 
     ``use`` of the map: ``known`` uses its landmarks and ignores others, ``extended`` also estimates the others, ``unknown``
-    estimates all landmarks without the map. ``estimated``: indices of the sensor's constants that are estimated. ``carries``:
-    whether the estimator estimates landmarks with an inexact survey; otherwise the survey's covariance is added to the noise.
+    estimates all landmarks; only their heights are those of the map. ``estimated``: indices of the sensor's constants that
+    are estimated. ``carries``: whether the estimator estimates landmarks with an inexact survey; otherwise the survey's
+    covariance is added to the noise.
     ``locates``: whether it estimates others that are sighted by range or bearing alone; ``biased``: whether ranges have a bias
     for each landmark.
     """

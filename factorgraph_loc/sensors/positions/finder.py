@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from factorgraph_loc.sensors.base import View
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import Motion
 from factors import positive, se2
-from factors.motion import ChainState
+from factors.motion import ChainState, Increment
 from factors.positions.factor import PositionFactor
 from factors.robust import geman_mcclure_weight
 from factors.se2 import Array
@@ -34,12 +35,10 @@ SEARCH_INTERVAL = 1.0  # s between alignments while the track is doubted
 
 
 class Row(NamedTuple):
-    """A position (2,) with ``covariance`` (2, 2) of the point ``arm`` (2,) of the robot at ``odometry``."""
+    """The ``factor`` of a position on the pose at ``odometry``."""
 
     odometry: ChainState
-    position: Array
-    covariance: Array
-    arm: Array
+    factor: PositionFactor
 
 
 class PositionFinder:
@@ -95,7 +94,7 @@ class PositionFinder:
         return since if positive.squared(error, world) > BEYOND * GATE else None
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last position; with any heading as long as that is unknown."""
+        """Poses (N, 3) at the last position; their headings are uniform until the heading is known."""
         if not self.hypotheses:
             return np.empty((0, 3))
         (mode,) = self.hypotheses
@@ -114,7 +113,7 @@ class PositionFinder:
             return
         if len(self._rows) > 1 and self._rows[-1].odometry.t < self._rows[-2].odometry.t + INTERVAL:
             self._rows.pop()
-        self._rows.append(Row(odometry, factor.position, factor.covariance, factor.arm))
+        self._rows.append(Row(odometry, replace(factor, offset=None)))
         while self._rows[0].odometry.t < odometry.t - DURATION:
             self._rows.popleft()
 
@@ -123,16 +122,14 @@ class PositionFinder:
         rows = list(self._rows)
         if self.start is not None:
             known = self.start.prior
-            rows.insert(0, Row(self.start.odometry, known.pose[:2], known.covariance[:2, :2], np.zeros(2)))
-        moved = [self._motion.relative(row.odometry, now) for row in rows]
-        # the measured points in the present robot frame
-        points = np.array(
-            [se2.transform_from(se2.inverse(step.delta), row.arm) for step, row in zip(moved, rows, strict=True)]
-        )
-        drift = np.array([step.covariance for step in moved])
-        pose = _rigid(points, np.array([row.position for row in rows]))
+            at_start = PositionFactor(known.pose[:2], known.covariance[:2, :2], np.zeros(2), self._robust)
+            rows.insert(0, Row(self.start.odometry, at_start))
+        factors = [self._on(now, row) for row in rows]
+        pose = se2.align_points(np.array([f.point for f in factors]), np.array([f.position for f in factors]))
         for widening in WIDENINGS:
-            residual, jacobian = _linearized(pose, points, drift, rows)
+            parts = [factor.whitened([pose]) for factor in factors]
+            residual = np.concatenate([error for error, _ in parts])
+            jacobian = np.concatenate([by_pose for _, (by_pose,) in parts])
             squared = np.einsum("ni,ni->n", residual, residual)
             weight = geman_mcclure_weight(squared, widening * self._robust)
             information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian) + 1e-9 * np.eye(3)
@@ -141,30 +138,15 @@ class PositionFinder:
         covariance = se2.body_to_world(pose, np.linalg.inv(information))
         is_known = len(rows) > 1 and covariance[2, 2] < 1.0
         if not is_known:
-            covariance = np.diag((*np.diag(rows[-1].covariance), math.pi**2 / 3.0))
-            pose = np.array((*rows[-1].position, 0.0))
+            covariance = np.diag((*np.diag(rows[-1].factor.covariance), math.pi**2 / 3.0))
+            pose = np.array((*rows[-1].factor.position, 0.0))
         self.hypotheses = (Mode(1.0, pose, covariance),)
         agree = is_known and len(rows) >= FEWEST and float(np.mean(squared < GATE)) >= SHARE
         self.best = PosePrior(now.t, pose, covariance) if agree and covariance[2, 2] < HEADING**2 else None
 
-
-def _rigid(points: Array, positions: Array) -> Array:
-    """The pose (3,) that maps ``points`` (N, 2) to ``positions`` (N, 2) best (Umeyama, PAMI 13(4), 1991, in the plane)."""
-    p, q = points - points.mean(axis=0), positions - positions.mean(axis=0)
-    heading = math.atan2(float(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])), float(np.sum(p * q)))
-    origin = positions.mean(axis=0) - se2.transform_from(np.array((0.0, 0.0, heading)), points.mean(axis=0))
-    return np.append(origin, heading)
-
-
-def _linearized(pose: Array, points: Array, drift: Array, rows: Sequence[Row]) -> tuple[Array, Array]:
-    """Whitened errors (N, 2) of the positions and their Jacobians (N, 2, 3) by the pose. ``drift`` (N, 3, 3): covariances of the
-    motion from each row."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    lever = np.zeros((len(points), 2, 3))
-    lever[:, 0, 0] = lever[:, 1, 1] = 1.0
-    lever[:, 0, 2], lever[:, 1, 2] = -points[:, 1], points[:, 0]
-    jacobian = np.array(((c, -s), (s, c))) @ lever
-    noise = np.array([row.covariance for row in rows]) + jacobian @ drift @ jacobian.transpose(0, 2, 1)
-    whitener = positive.whitener(noise)
-    errors = se2.transform_from(pose, points) - np.array([row.position for row in rows])
-    return np.einsum("nij,nj->ni", whitener, errors), whitener @ jacobian
+    def _on(self, now: ChainState, row: Row) -> PositionFactor:
+        """The factor of a position on the pose ``now``: the motion since then is reversed, with its error at the earlier end."""
+        step = self._motion.relative(row.odometry, now)
+        carried = se2.adjoint(step.delta)
+        back = Increment(se2.inverse(step.delta), carried @ step.covariance @ carried.T, step.duration, step.still)
+        return replace(row.factor, offset=back)

@@ -101,6 +101,13 @@ class PositionStream(Stream):
     var_y: Array
 
 
+def are_plausible(var_x: Any, cov_xy: Any, var_y: Any) -> Any:
+    """Whether covariances, numbers or arrays (N,) of their elements [m^2], are not placeholders. False where they are unknown."""
+    low, high = PLAUSIBLE
+    ranges = (low <= var_x) & (var_x <= high) & (low <= var_y) & (var_y <= high)
+    return ranges & (np.abs(cov_xy) < np.sqrt(np.abs(var_x)) * np.sqrt(np.abs(var_y)))
+
+
 class PositionSettings(SensorSettings):
     """A system that measures the position of a point of the robot."""
 
@@ -115,9 +122,7 @@ class PositionSettings(SensorSettings):
 
     def covariance(self, m: Position) -> Array:
         """The covariance (2, 2) [m^2] of a position: its own, if that is plausible."""
-        low, high = PLAUSIBLE
-        determinant = m.var_x * m.var_y - m.cov_xy**2
-        if low <= m.var_x <= high and low <= m.var_y <= high and determinant > 0.0:
+        if are_plausible(m.var_x, m.cov_xy, m.var_y):
             return np.array(((m.var_x, m.cov_xy), (m.cov_xy, m.var_y)))
         return self.sigma**2 * np.eye(2)
 

@@ -20,7 +20,7 @@ from factors.update import Correction
 
 @dataclass(frozen=True)
 class PositionObservation(ResidualObservation):
-    """One position; weighs all particles at once."""
+    """One position; weighs all particles in one call."""
 
     @property
     def factor(self) -> PositionFactor:

@@ -6,7 +6,7 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Paragraph, Summary
 from factorgraph_loc.sensors.motion import integrated, odometry_model
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
-from factorgraph_loc.sensors.positions.measurement import PLAUSIBLE, PositionSettings, PositionStream
+from factorgraph_loc.sensors.positions.measurement import PositionSettings, PositionStream, are_plausible
 from factorgraph_loc.text import notice
 from factors import se2
 from factors.se2 import Array
@@ -32,10 +32,9 @@ def summarize(log: Log) -> Summary:
             entries["median_error"] = float(np.nanmedian(away))
             line += f", {entries['median_error']:.2f} m from the reference (median)"
     problems = []
-    stated = np.isfinite(stream.var_x)
-    implausible = stated & ~((stream.var_x >= PLAUSIBLE[0]) & (stream.var_x <= PLAUSIBLE[1]))
+    implausible = np.isfinite(stream.var_x) & ~are_plausible(stream.var_x, stream.cov_xy, stream.var_y)
     if implausible.any():
-        sentence = "{wrong} of {count} positions have an implausible variance: position.sigma is used for them"
+        sentence = "{wrong} of {count} positions have an implausible covariance: position.sigma is used for them"
         problems.append(notice("implausible_variance", sentence, np.count_nonzero(implausible), len(t)))
     repeated = int(np.count_nonzero((np.diff(places, axis=0) == 0.0).all(axis=1)))
     if repeated > len(t) / 2:

@@ -11,7 +11,6 @@ import numpy as np
 from benchmarking.report import NOTHING, Options, Report
 
 from factorgraph_loc.evaluation.metrics import score
-from factorgraph_loc.evaluation.pairing import align_points
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.files.data_root import find_data_root
 from factorgraph_loc.io.readers import read_log
@@ -71,5 +70,5 @@ def timed(call: Callable[[], T]) -> tuple[T, float]:
 
 def aligned(positions: Array, poses: Array) -> float:
     """The root mean square error [m] of positions (N, 2) after alignment with true poses (N, 3)."""
-    moved = se2.transform_from(align_points(positions, poses[:, :2]), positions)
+    moved = se2.transform_from(se2.align_points(positions, poses[:, :2]), positions)
     return float(np.sqrt(np.mean(np.sum((moved - poses[:, :2]) ** 2, axis=1))))
