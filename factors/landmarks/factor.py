@@ -1,4 +1,5 @@
-"""The bearing-range factor: landmarks on a pose, and optionally on sensor constants and a landmark."""
+"""The factor of measured ranges and bearings of landmarks. It depends on a robot pose, and optionally on calibration constants of
+the sensor, on a range bias, and on the position of an unknown landmark."""
 
 from __future__ import annotations
 
@@ -30,25 +31,31 @@ from factors.se2 import Array, Integers
 from factors.sighting import delayed
 from factors.update import CONVERGED, GATE, Correction
 
-NOTHING = np.zeros(0)  # values of constants if the factor estimates none
-_NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # if there is no offset, or no covariance of it
-SMALL_BIAS = 1e-4  # m; step of the numerical derivative by a bias: residuals are nearly linear
+NOTHING = np.zeros(0)  # the values of the sensor constants if the factor estimates no constants
+_NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # placeholders for an offset or covariance that is None
+SMALL_BIAS = 1e-4  # m; step of the numerical derivative by a range bias: residuals are nearly linear
 LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
 
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
-    """K landmarks seen at one time, as a factor on the robot's pose at that time or shortly before.
+    """A factor on the robot's pose from K landmarks measured at one time. The pose may be that of a slightly earlier time.
 
-    ``points`` (K, 2): positions of the landmarks, or (K, 3) with their heights above the sensor; ``point_covariances`` (K, 2, 2) of
-    an inexact map are added to the noise. ``offset`` (3,): the pose at the measurement's time in the frame of the variable's pose,
-    from odometry; its body-frame covariance ``offset_covariance`` (3, 3) is added to the noise. This error is common to all
-    landmarks of the measurement; ``in_look``: their number including those in other factors, by default K. ``twist`` (3,): the
-    robot's velocity at that time.
+    ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their heights above the sensor.
+    ``ranges``, ``bearings``: measurements (K,) [m, rad], NaN where a value is missing.
+    ``offset`` (3,): the robot's pose at the measurement's time, in the frame of the pose variable. Odometry measures it. None if
+    both poses are the same.
+    ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
+    ``point_covariances`` (K, 2, 2): covariances of the landmarks of an inexact map. They are added to the noise.
+    ``estimated``: indices in :data:`PARAMETERS` of the P sensor constants that are estimated.
+    ``free``: True if the position of the landmark is a variable. Then K is 1, and the position replaces ``points``.
+    ``biased``: True if a bias of the ranges is a variable.
+    ``twist`` (3,): the robot's body-frame velocity at the measurement's time. The Jacobian by the time offset needs it.
+    ``in_look``: the number of landmarks measured at this time, including those in separate factors. None means K. The landmarks
+    have the error of ``offset`` in common, so its covariance is multiplied by this number and does not average out.
 
-    The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
-    if any; if ``biased``, the bias (1,) [m] of the ranges; and, if ``free``, the position (2,) of the one landmark, instead of
-    ``points``.
+    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P > 0, the
+    range bias (1,) [m] if ``biased``, and the landmark's position (2,) if ``free``.
     """
 
     model: BearingRangeModel
@@ -65,7 +72,7 @@ class BearingRangeFactor:
     in_look: int | None = None
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (2K,) and its Jacobian (2K, d) by each value."""
+        """The whitened residual (2K,) with robust weights, and its Jacobian (2K, d) by each value."""
         if not (self.free or self.biased):
             constants = values[1] if self.estimated else NOTHING
             linear = kernels.weighted(self.model.packed, self.packed, values[0], constants, self.places)
@@ -82,22 +89,23 @@ class BearingRangeFactor:
 
     @property
     def kind(self) -> Hashable:
-        """Equal for factors that are linearised together; None for a factor of a free landmark, or with a bias."""
+        """A key that is equal for factors that can be linearised together. None if the factor has a free landmark or a bias, since
+        such factors are linearised one by one."""
         return None if self.free or self.biased else (self.estimated, self.model)
 
     def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
-        """Factors of this kind as one: see :class:`~factors.graph.Stackable`."""
+        """Combine factors of the same ``kind`` into one object, for speed. See :class:`~factors.graph.Stackable`."""
         return BearingRangeStack(factors, numbers, column)
 
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
-        """How many of the landmarks of a factor on the pose only have a normalised innovation squared above ``limit`` at the
-        predicted ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
+        """The number of landmarks whose normalised innovation squared exceeds ``limit``, at the predicted ``pose`` (3,) with
+        body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
         contiguous = np.ascontiguousarray(covariance)
         return int(kernels.beyond(self.model.packed, pose, self.packed, contiguous, limit))
 
     @property
     def packed(self) -> kernels.Sighting:
-        """The measurement as arguments of compiled code."""
+        """The fields of the measurement as a tuple, the argument ``packed`` of compiled functions."""
         offset, drift, twist, surveys = self.offset, self.offset_covariance, self.twist, self.point_covariances
         return (
             *(self.points, self.ranges, self.bearings),
@@ -110,22 +118,22 @@ class BearingRangeFactor:
 
     @property
     def places(self) -> Integers:
-        """Those of the estimated constants (P,)."""
+        """The indices (P,) of the estimated constants in :data:`PARAMETERS`, as an array."""
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss."""
+        """The robust loss, summed over the landmarks."""
         error, _ = self.whitened(values)
         return float(np.sum(geman_mcclure_loss(np.sum(error**2, axis=-1), self.model.robust)))
 
     def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
-        """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement, each with its own
-        ``parameters`` (N, 6) of the sensor; see :func:`~factors.landmarks.model.log_likelihood`."""
+        """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement. ``parameters`` (N, 6):
+        corrections of the sensor constants for each pose. See :func:`~factors.landmarks.model.log_likelihood`."""
         measured = self.points, self.ranges, self.bearings
         return log_likelihood(self.model, poses, *measured, parameters, self.point_covariances)
 
     def weight(self, squared: Array) -> Array:
-        """The robust weight of squared whitened residuals."""
+        """The robust weights of ``squared`` norms of whitened residuals."""
         return geman_mcclure_weight(squared, self.model.robust)
 
     def widened(self, width: float) -> BearingRangeFactor:
@@ -142,7 +150,8 @@ class BearingRangeFactor:
         return error, blocks
 
     def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
-        """The whitened residual (K, 2) with a further ``bias`` [m], and its Jacobian (K, 2, WIDTH)."""
+        """The whitened residual (K, 2) with ``bias`` [m] added to the range bias, and its Jacobian (K, 2, WIDTH) by the pose, the
+        landmark and all sensor constants."""
         packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
@@ -155,7 +164,7 @@ class BearingRangeFactor:
         return error, jacobian
 
     def _blocks(self, jacobian: Array) -> list[Array]:
-        """The parts (K, 2, d) of a Jacobian (K, 2, WIDTH) by each value, without a bias."""
+        """The columns (K, 2, d) of a Jacobian (K, 2, WIDTH) for each value of the factor except the range bias."""
         blocks = [jacobian[..., :POINT]]
         if self.estimated:
             blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])
@@ -164,7 +173,12 @@ class BearingRangeFactor:
         return blocks
 
     def fixed(self, parameters: Sequence[Array], point: Array | None, bias: float = 0.0) -> BearingRangeFactor:
-        """The factor on the pose only, at given constants (one array (P,), or none), bias, and position (2,) of a free landmark."""
+        """A factor on the pose only, with all other values fixed.
+
+        ``parameters``: a sequence of one array (P,), the corrections of the estimated constants, or an empty sequence.
+        ``point`` (2,): the position of a free landmark, otherwise None.
+        ``bias``: the range bias [m].
+        """
         if not (parameters or self.biased) and point is None:
             return self
         model, offset = self.model, self.offset
@@ -177,7 +191,7 @@ class BearingRangeFactor:
         return BearingRangeFactor(model, points, *measured, offset, *noises, twist=self.twist, in_look=self.in_look)
 
     def _placed(self, point: Array) -> Array:
-        """The one landmark at ``point`` (2,), with its height if it has one."""
+        """The landmark's ``point`` (2,) as an array (1, 2), or (1, 3) with its height if ``points`` has heights."""
         return np.concatenate((np.reshape(point, (1, 2)), self.points[:1, HEIGHT:]), axis=1)
 
     def dof(self) -> int:
@@ -185,10 +199,10 @@ class BearingRangeFactor:
         return int(np.count_nonzero(~np.isnan(self.ranges)) + np.count_nonzero(~np.isnan(self.bearings)))
 
     def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
-        """Position of the one landmark from its range and bearing, given pose and constants.
+        """Compute the position of a single landmark from its range and bearing, to initialise a free landmark.
 
-        Returns its position (2,), the Jacobian (2, d) by each of ``values`` (which exclude the landmark), and its covariance (2, 2)
-        from the measurement noise.
+        ``values``: the values of the factor without the landmark's position. Returns the position (2,) in the world, its Jacobian
+        (2, d) by each of ``values``, and its covariance (2, 2) caused by the measurement noise.
         """
         on_pose = self.fixed(values[1:], None)
         at = values[0] if on_pose.offset is None else se2.compose(values[0], on_pose.offset)
@@ -196,7 +210,8 @@ class BearingRangeFactor:
             at, located(on_pose.model, on_floor(on_pose.model, self.points, self.ranges), self.bearings)
         )[0]
         _, blocks = replace(self, free=True).whitened([*values, point])
-        # the whitened residual stays zero: by_value dv + by_point dp = noise
+        # The residual is zero at this position. Changes dv of the values and dp of the position satisfy
+        # by_value dv + by_point dp = unit noise.
         to_point = _raised_inverse(blocks[-1][0])
         return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T
 
@@ -210,11 +225,16 @@ def landmark_update(
     iterations: int,
     converged: float = CONVERGED,
 ) -> Correction | None:
-    """:func:`~factors.update.update_state` by landmarks of a map, compiled; None for others, and where the information form is
-    numerically insufficient. ``constants`` (P,): those that are estimated, whose columns begin at ``first``."""
+    """Correct a Gaussian by landmarks of the map, in compiled code. Equivalent to :func:`~factors.update.update_state`.
+
+    ``pose`` (3,): the predicted pose. ``covariance`` (S, S): of the error state, whose first three components are the pose.
+    ``constants`` (P,): the estimated sensor constants, which are the components of the error state from index ``first`` on.
+    ``iterations``: maximum number. ``converged``: the step size that ends the iterations. Returns None if the factor has a free
+    landmark or a bias, or if the information form is numerically singular. The caller then uses ``update_state``.
+    """
     if factor.free or factor.biased:
         return None
-    contiguous = np.ascontiguousarray(covariance)  # each other memory order would compile the function again
+    contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order
     known = factor.model.packed, factor.packed, pose, contiguous, constants, factor.places, first
     try:
         return Correction(*kernels.updated(*known, iterations, converged, GATE))
@@ -223,8 +243,12 @@ def landmark_update(
 
 
 class BearingRangeStack:
-    """Factors of one sensor with one model and the same estimated constants. ``factors`` (L) are on the poses ``pose_of`` (L,) by
-    number; the constants are the parameters from ``column`` on. None of the landmarks is free."""
+    """Several factors with the same model and the same estimated constants, linearised together. No landmark is free.
+
+    ``factors``: L factors.
+    ``pose_of`` (L,): the number of the pose that each factor depends on.
+    ``column``: the index of the first estimated constant among the parameters of the graph.
+    """
 
     def __init__(self, factors: Sequence[BearingRangeFactor], pose_of: Sequence[int], column: int) -> None:
         first = factors[0]
@@ -249,11 +273,12 @@ class BearingRangeStack:
 
     @property
     def first(self) -> Integers:
-        """The number of the pose that each residual depends on."""
+        """The number (2 K,) of the pose that each residual depends on, for K landmarks in all factors."""
         return np.repeat(np.repeat(self._pose_of, np.diff(self._ends, prepend=0)), 2)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Fill ``residual`` (2 K,) and ``jacobian`` (2 K, 6 + P), see :mod:`factors.chain`, weighted."""
+        """Write the whitened residuals with robust weights into ``residual`` (2 K,), and their Jacobian into ``jacobian``
+        (2 K, 6 + P). The columns are those of :mod:`factors.chain`."""
         error, by_all = self._whitened(poses, parameters)
         kernels.weigh(error, by_all, self._robust)
         by_all = by_all.reshape(len(residual), WIDTH)
@@ -262,11 +287,12 @@ class BearingRangeStack:
         jacobian[:, 6 + self._column : 6 + end] = by_all[:, CONSTANTS:][:, self._estimated]
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """The robust loss of all."""
+        """The robust loss, summed over all factors."""
         error, _ = self._whitened(poses, parameters)
         return float(np.sum(geman_mcclure_loss(np.einsum("ki,ki->k", error, error), self._robust)))
 
     def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array]:
+        """The whitened residuals (K, 2) and their Jacobian (K, 2, WIDTH), without robust weights."""
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2
         changes[self._estimated] = parameters[self._column : self._column + len(self._estimated)]
         out = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
@@ -281,8 +307,8 @@ def _places(estimated: tuple[int, ...]) -> Integers:
 
 
 def _raised_inverse(by_point: Array) -> Array:
-    """The inverse of a whitened Jacobian (2, 2) by a landmark; singular values below the minimum are raised, as for a landmark at
-    the sensor."""
+    """The inverse of a whitened Jacobian (2, 2) by a landmark's position. Small singular values are raised to a minimum first,
+    because the Jacobian is singular for a landmark at the sensor."""
     rows, values, columns = np.linalg.svd(by_point)
     if values[1] > LEAST_TOLD * values[0]:
         return np.asarray(np.linalg.inv(by_point))

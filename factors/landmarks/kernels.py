@@ -1,5 +1,6 @@
-"""Compiled linearisation of landmark measurements for graphs, and their Kalman update in information form: that of
-:func:`factors.update.update_state`. A filter computes a dozen small matrices per measurement, and NumPy is slow for these."""
+"""Compiled functions for landmark measurements: linearisation for graphs, and a Kalman update in information form for filters. The
+update is equivalent to :func:`factors.update.update_state`. A filter computes a dozen small matrices per measurement, and NumPy is
+slow for these."""
 
 import math
 
@@ -25,17 +26,24 @@ from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers, compose_scalars, exp_scalars, moved
 from factors.update import corrected, normalised
 
-# points (K, 2), ranges (K,), bearings (K,); of the motion since the pose, each with whether there is one: the offset (3,), its
-# covariance (3, 3) with the number of landmarks that have it in common, the velocity (3,); and spreads of the points (K, 2, 2), or
-# (0, 2, 2)
+# One measurement of K landmarks. The elements are, in this order:
+# - points (K, 2) or (K, 3), ranges (K,), bearings (K,);
+# - whether there is an offset (the motion from the pose variable to the measurement), and the offset (3,);
+# - whether the offset has a covariance, the covariance (3, 3), and the number of landmarks that have its error in common;
+# - whether the velocity is known, and the velocity (3,);
+# - covariances of the points (K, 2, 2), or (0, 2, 2) if the points are exact.
 Sighting = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Array, Array]
 
 
 @compiled
 def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error: Array, jacobian: Array) -> None:
-    """Linearise one measurement as :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` does, with ``changes`` (6,) of the
-    constants. Writes the whitened ``error`` (K, 2) and its ``jacobian`` (K, 2, WIDTH), which must be zero before. ``model``:
-    ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`."""
+    """Linearise one measurement as :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` does.
+
+    ``model`` (11,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
+    ``changes`` (6,): corrections of the sensor constants.
+    ``error`` (K, 2): output, the whitened residual. Must contain zeros before the call.
+    ``jacobian`` (K, 2, WIDTH): output, its Jacobian. Must contain zeros before the call.
+    """
     points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, surveys = packed
     x, y, turned = offset[0], offset[1], offset[2]
     if moves and changes[TIME_OFFSET] != 0.0:
@@ -75,7 +83,7 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
                 uu, uv, vv = uu + count * a, uv + count * b, vv + count * d
             _widen(error[k], jacobian[k], uu, uv, vv)
         if displaced:
-            for i in range(2):  # by the pose before the motion
+            for i in range(2):  # convert the derivative by the pose after the offset to that by the pose variable
                 u, v = jacobian[k, i, 0], jacobian[k, i, 1]
                 jacobian[k, i, 0], jacobian[k, i, 1] = u * c - v * s, u * s + v * c
                 jacobian[k, i, 2] += u * lever_x + v * lever_y
@@ -83,7 +91,8 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
 
 @compiled
 def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
-    """Whitened residuals (N, 2) of N sightings, each from a pose (N, 3), and their Jacobian (N, 2, WIDTH)."""
+    """The whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH). Each measurement has its own
+    point (N, 2) or (N, 3) and its own pose (N, 3). ``model``: as of :func:`linearize`."""
     error, jacobian = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, WIDTH))
     mounted, depth = (model[0], model[1], model[TURN]), model[DEPTH] > 0.0
     noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]
@@ -96,8 +105,8 @@ def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bea
 
 @compiled
 def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> None:
-    """Whiten the ``error`` (2,) of a landmark and its ``jacobian`` (2, WIDTH) by a covariance [[uu, uv], [uv, vv]]."""
-    # the inverse of its lower root [[p, 0], [r, q]]
+    """Whiten the ``error`` (2,) of a landmark and its ``jacobian`` (2, WIDTH) by a covariance [[uu, uv], [uv, vv]], in place."""
+    # [[p, 0], [r, q]] is the inverse of the lower Cholesky root of the covariance
     p = 1.0 / math.sqrt(uu)
     low = uv * p
     q = 1.0 / math.sqrt(max(vv - low * low, 1e-12 * vv))
@@ -111,7 +120,8 @@ def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> No
 
 @compiled
 def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
-    """The elements (0, 0), (1, 0) and (1, 1) of what the first columns of a Jacobian make of a covariance (D, D)."""
+    """Propagate a covariance (D, D) by the first D columns J of a Jacobian. Returns the elements (0, 0), (1, 0) and (1, 1) of the
+    product ``J covariance J^T``."""
     a = b = d = 0.0
     for i in range(len(covariance)):
         for j in range(len(covariance)):
@@ -123,7 +133,8 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
 
 @compiled
 def weigh(error: Array, jacobian: Array, robust: float) -> None:
-    """Multiply residuals (K, 2) and their Jacobian (K, 2, D) by the roots of the robust weights."""
+    """Multiply residuals (K, 2) and their Jacobian (K, 2, D), in place, by the square roots of the robust weights. ``robust``:
+    scale of the loss in standard deviations."""
     for k in range(len(error)):
         root = math.sqrt(geman_mcclure_weight(error[k, 0] ** 2 + error[k, 1] ** 2, robust))
         for i in range(2):
@@ -134,14 +145,15 @@ def weigh(error: Array, jacobian: Array, robust: float) -> None:
 
 @compiled(error_model="numpy")
 def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
-    """The number of landmarks whose normalised innovation squared exceeds ``limit``, with pose ``covariance`` (3, 3)."""
+    """The number of landmarks whose normalised innovation squared exceeds ``limit``, at a ``pose`` (3,) with body-frame
+    ``covariance`` (3, 3)."""
     count = len(packed[0])
     error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
     linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
     for k in range(count):
         a, b, c = _carried(by_pose[k], covariance)
         a, c, x, y = 1.0 + a, 1.0 + c, error[k, 0], error[k, 1]
-        # rounding may take all of the difference, which is never less than that
+        # the exact determinant is at least half the trace, but rounding may cancel the difference completely
         determinant = max(a * c - b * b, 0.5 * (a + c))
         outliers += (c * x * x - 2.0 * b * x * y + a * y * y) / determinant > limit
     return outliers
@@ -164,9 +176,16 @@ def linearize_all(
     error: Array,
     jacobian: Array,
 ) -> None:
-    """:func:`linearize` of L measurements. Each is at the pose number ``pose_of`` (L,) and has the rows up to ``ends`` (L,).
+    """Linearise L measurements with :func:`linearize`. All their landmarks together are K rows.
 
-    ``flags`` (L, 4): whether a measurement has an offset, its covariance, a velocity, and covariances of its points.
+    ``poses`` (N, 3), ``pose_of`` (L,): poses, and the index of the pose of each measurement.
+    ``ends`` (L,): the index behind the last row of each measurement.
+    ``measured``: points, ranges and bearings, with K rows each.
+    ``flags`` (L, 4): True where a measurement has an offset, an offset covariance, a velocity, and point covariances.
+    ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): those of each measurement; ignored where a flag is False.
+    ``counts`` (L,): the number of landmarks that have the error of an offset in common.
+    ``surveys`` (K, 2, 2): point covariances.
+    ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): outputs, which must contain zeros before the call.
     """
     points, ranges, bearings = measured
     first = 0
@@ -192,12 +211,17 @@ def updated(
     converged: float,
     gate: float,
 ) -> tuple[Array, Array, Array, float, int]:
-    """The correction (S,) and the covariance (S, S) after it; the whitened residuals (K, 2) before it, their normalised square, and
-    how many numbers were measured. LinAlgError if rounding makes a covariance singular.
+    """The robust, iterated Kalman update by one measurement of landmarks. See :func:`factors.update.update_state`.
 
-    ``model``: ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``values`` (P,): of the sensor's constants that
-    are estimated; ``indices`` (P,): their places in :data:`~factors.landmarks.model.PARAMETERS`; ``first``: of their columns in
-    the error state. ``gate``: beyond which a landmark's noise is widened.
+    ``model`` (11,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
+    ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components of the error state are the pose.
+    ``values`` (P,): corrections of the estimated sensor constants at the prediction.
+    ``indices`` (P,): the indices of these constants in :data:`~factors.landmarks.model.PARAMETERS`.
+    ``first``: the index of the first of these constants in the error state.
+    ``gate``: the noise of a landmark is increased if its normalised innovation squared exceeds this limit.
+
+    Returns the correction (S,), the covariance (S, S) after it, the whitened residuals (K, 2) of the prediction, their normalised
+    square, and the number of measured ranges and bearings. Raises LinAlgError if rounding makes a covariance singular.
     """
     count, size = len(packed[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)
@@ -242,8 +266,8 @@ def updated(
 def weighted(
     model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
 ) -> tuple[Array, Array, Array]:
-    """Whitened, robustly weighted residual (2K,) and its Jacobians by the pose (2K, 3) and by the constants (2K, P); arguments as
-    of :func:`updated`."""
+    """The whitened residual (2K,) with robust weights, and its Jacobians by the pose (2K, 3) and by the estimated constants
+    (2K, P). The arguments are those of :func:`updated`."""
     count, wide = len(packed[0]), len(indices)
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
     _linearized(model, packed, pose, values, indices, residual, jacobian)
@@ -254,7 +278,10 @@ def weighted(
 
 @compiled(error_model="numpy")
 def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
-    """Measured less predicted ranges [m] and bearings [rad], of those that were measured, from whitened ``residual`` (K, 2)."""
+    """Convert whitened residuals to innovations. ``residual`` (K, 2): whitened, predicted minus measured.
+
+    Returns measured minus predicted ranges [m] and measured minus predicted bearings [rad]. Missing measurements are left out.
+    """
     by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
     r = b = 0
     for k in range(len(ranges)):
@@ -271,7 +298,8 @@ def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -
 def _linearized(
     model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers, residual: Array, jacobian: Array
 ) -> None:
-    """Whitened residuals (K, 2) at constants that differ by ``values``, and their Jacobian (K, 2, 3+P)."""
+    """Write the whitened residuals (K, 2) and their Jacobian (K, 2, 3 + P) by the pose and the estimated constants. The arguments
+    are those of :func:`updated`."""
     count = len(residual)
     changes = np.zeros(len(PARAMETERS))
     for j in range(len(values)):

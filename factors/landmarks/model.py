@@ -1,10 +1,10 @@
 """The measurement model of identified landmarks: bearing and range, or range only (ranging beacons).
 
-Ranges are slant ranges where landmarks have a height above the sensor.
-The sensor is mounted on the robot at ``mounting`` (rTs). It reports ``range = range_scale * distance + noise`` and ``bearing =
-direction in the sensor frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 6.40). A camera
-that measures range by apparent size reports depth instead of distance: the distance times the cosine of the direction. The noise is
-Gaussian with the robust loss of Geman and McClure, jointly for range and bearing of a landmark.
+The sensor's pose in the robot frame is ``mounting``. The sensor reports ``range = range_scale * distance + noise`` and ``bearing =
+direction in the sensor frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 6.40). The distance
+is the slant distance if a landmark has a height above the sensor. A camera that measures range by apparent size reports the depth
+instead: the distance times the cosine of the direction. The noise is Gaussian. The range and bearing of a landmark together have
+one robust loss, that of Geman and McClure.
 """
 
 import math
@@ -19,13 +19,14 @@ from factors.compiled import compiled
 from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
 
-# the constants of a sensor that can be estimated: those of its model, and the time offset [s] of its timestamps
+# The constants of a sensor that can be estimated. The first five belong to the model; the last is the offset of the timestamps [s].
 PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
 TIME_OFFSET = PARAMETERS.index("time_offset")
-# columns of a Jacobian by the pose, by a point and by all PARAMETERS: where the point begins, and those, and their number
+# The columns of a full Jacobian are the pose (3), a point (2) and all PARAMETERS (6). POINT and CONSTANTS are the first columns of
+# the point and of PARAMETERS, and WIDTH is the number of columns.
 POINT, CONSTANTS, WIDTH = 3, 5, 11
 EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
-# indices in ``packed``, after the constants that PARAMETERS change
+# indices in ``BearingRangeModel.packed``, which begins with the first five PARAMETERS
 TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST = range(TIME_OFFSET, TIME_OFFSET + 6)
 HEIGHT = 2  # column of the height above the sensor in points that have one
 MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
@@ -35,10 +36,14 @@ MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
 class BearingRangeModel:
     """A landmark sensor and its noise.
 
-    ``mounting``: (x, y, heading) of the sensor in the robot frame. ``range_scale``: reported divided by true. ``depth``: ranges are
-    distances along one axis, at the angle ``depth_axis`` in the sensor frame. The standard deviation of a range r is
-    ``hypot(range_sigma, range_sigma_relative * r)`` [m], that of a bearing ``bearing_sigma`` [rad]. ``robust``: scale of the
-    Geman-McClure loss in standard deviations. ``packed``: the model as an array (11,) for compiled code.
+    ``mounting``: (x, y, heading) of the sensor in the robot frame [m, m, rad].
+    ``range_scale``: the reported range divided by the true range.
+    ``depth``: True if ranges are measured along one axis. ``depth_axis``: the direction of this axis in the sensor frame [rad].
+    ``range_sigma`` [m], ``range_sigma_relative``: the standard deviation of a range r is ``hypot(range_sigma,
+    range_sigma_relative * r)``.
+    ``bearing_bias``, ``bearing_sigma``: offset and standard deviation of bearings [rad].
+    ``robust``: the scale of the Geman-McClure loss in standard deviations.
+    ``packed``: the model as an array (11,) for compiled code.
     """
 
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -60,8 +65,10 @@ class BearingRangeModel:
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:
-    """Predicted range [m] and bearing [rad] of ``points`` (..., 2) in the world from ``poses`` (..., 3); or of points (..., 3)
-    whose last coordinate is their height above the sensor."""
+    """Predict the ranges [m] and bearings [rad] of ``points`` from robot ``poses`` (..., 3).
+
+    ``points``: world positions (..., 2), or (..., 3) with the height above the sensor as third coordinate.
+    """
     sensors = se2.compose(poses, np.array(model.mounting))
     local = se2.transform_to(sensors, points[..., :2])
     distance = np.hypot(local[..., 0], local[..., 1])
@@ -74,7 +81,8 @@ def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Arra
 
 
 def on_floor(model: BearingRangeModel, points: Array, ranges: Array) -> Array:
-    """Ranges (K,) to points (K, 3) with heights as ranges along the floor, or those to points (K, 2) unchanged."""
+    """Convert slant ranges (K,) to ranges along the floor. ``points``: (K, 3) with the height above the sensor as third coordinate.
+    If the points (K, 2) have no heights, the ranges are returned unchanged."""
     if points.shape[1] <= HEIGHT:
         return ranges
     squared = np.square(ranges / model.range_scale) - np.square(points[:, HEIGHT])
@@ -82,7 +90,7 @@ def on_floor(model: BearingRangeModel, points: Array, ranges: Array) -> Array:
 
 
 def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
-    """Positions (K, 2) in the robot frame of points with ranges (K,) and bearings (K,)."""
+    """The positions (K, 2) in the robot frame of landmarks with measured ranges (K,) and bearings (K,)."""
     direction = bearings - model.bearing_bias
     distance = ranges / model.range_scale
     if model.depth:
@@ -92,7 +100,7 @@ def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
 
 
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
-    """Standard deviations (K, 2) of range and bearing at measured ``ranges`` (K,); a missing range is replaced by 0."""
+    """The standard deviations (K, 2) of range and bearing at measured ``ranges`` (K,). A missing range (NaN) counts as 0 m."""
     ranges = np.where(np.isnan(ranges), 0.0, ranges)
     out = np.empty((len(ranges), 2))
     out[:, 0] = np.hypot(model.range_sigma, model.range_sigma_relative * ranges)
@@ -101,8 +109,8 @@ def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
 
 
 def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
-    """Whitened residuals (..., K, 2), predicted minus measured, of K points (K, 2) at ``poses`` (..., 1, 3) or (3,); zero for a
-    missing (NaN) range or bearing."""
+    """The whitened residuals (..., K, 2) of K points (K, 2), predicted minus measured. ``poses``: (..., 1, 3) or (3,). A residual
+    is zero where the range or bearing is missing (NaN)."""
     expected_range, expected_bearing = predict(model, poses, points)
     sigma = sigmas(model, ranges)
     error = np.empty((*np.shape(expected_range), 2))
@@ -113,7 +121,8 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
 
 
 def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> BearingRangeModel:
-    """The model with corrections (6,) of :data:`PARAMETERS`: relative for the range scale; the time offset is ignored."""
+    """The model with corrected constants. ``parameters`` (6,): additive corrections of :data:`PARAMETERS`, except that the range
+    scale is multiplied by one plus its correction. The time offset is ignored, because it is not part of the model."""
     x, y, bearing_bias, range_scale, depth_axis = _constants(model, np.array(parameters)).tolist()
     constants = {"bearing_bias": bearing_bias, "range_scale": range_scale, "depth_axis": depth_axis}
     return replace(model, mounting=(x, y, model.mounting[2]), **constants)
@@ -148,9 +157,15 @@ def whitened_into(
     error: Array,
     jacobian: Array,
 ) -> None:
-    """:func:`residuals` (K, 2) at one pose (3,), and their Jacobian (K, 2, WIDTH) by its body-frame perturbation, by the points and
-    by :data:`PARAMETERS`: that by the range scale is relative, and that by the time offset zero, as it needs the robot's velocity.
-    Written into arrays that hold zeros."""
+    """Compute the whitened residuals of :func:`residuals` at one pose, with their Jacobian.
+
+    ``pose`` (3,): the robot's pose.
+    ``model``: range scale, range sigma, relative range sigma, bearing bias, bearing sigma.
+    ``error`` (K, 2): output, the residuals. Must contain zeros before the call.
+    ``jacobian`` (K, 2, WIDTH): output, the derivatives by the body-frame perturbation of the pose, by the point, and by
+    :data:`PARAMETERS`. The derivative by the range scale is by its relative change. The derivative by the time offset stays zero,
+    because it needs the robot's velocity. Must contain zeros before the call.
+    """
     range_scale, _, _, _, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
     ahead_x, ahead_y = math.cos(mounting[2] + depth_axis), math.sin(mounting[2] + depth_axis)
@@ -175,7 +190,8 @@ def whitened_into(
             jacobian[k, 1, 2] = (-uy * py - ux * px) * weight
             jacobian[k, 1, CONSTANTS + 2] = 1.0 / bearing_sigma
         for i in range(2):
-            # moving the sensor is moving the robot; moving the point is the opposite, in the world frame
+            # A shift of the sensor has the derivative of a shift of the robot. A shift of the point has the opposite derivative,
+            # rotated to the world frame.
             a, b = jacobian[k, i, 0], jacobian[k, i, 1]
             jacobian[k, i, CONSTANTS], jacobian[k, i, CONSTANTS + 1] = a, b
             jacobian[k, i, POINT], jacobian[k, i, POINT + 1] = s * b - c * a, -s * a - c * b
@@ -194,9 +210,14 @@ def _whitened(
     measured_range: float,
     measured_bearing: float,
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Whitened errors of range and bearing, zero if missing, of a point at (sx, sy, height) from the sensor in robot axes; its
-    distance on the floor; the gradient of the range by sx and sy; the unscaled range; and the inverse standard deviation of the
-    range."""
+    """The whitened errors of range and bearing of one point, and intermediate values for derivatives.
+
+    ``sx``, ``sy``, ``height``: the vector from the sensor to the point, along the robot's axes [m]. ``turn``: heading of the sensor
+    in the robot frame. ``ahead_x``, ``ahead_y``: unit vector of the depth axis in the robot frame.
+
+    Returns the errors of range and bearing (zero if missing), the point's distance along the floor, the derivatives of the
+    unscaled range by ``sx`` and ``sy``, the unscaled range, and the inverse standard deviation of the range (zero if missing).
+    """
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0
     distance = max(math.sqrt(sx * sx + sy * sy), 1e-6)
@@ -226,10 +247,11 @@ def log_likelihood(
     parameters: Array | None = None,
     point_covariances: Array | None = None,
 ) -> Array:
-    """Log-likelihood (N,), up to a constant, of K measurements (K,) of points (K, 2) at ``poses`` (N, 3).
+    """The log-likelihood (N,), up to a constant, of K landmark measurements at ``poses`` (N, 3).
 
-    ``parameters`` (N, 6): corrections of :data:`PARAMETERS`, as in :func:`recalibrated`, for each pose. ``point_covariances``
-    (K, 2, 2) of an inexact map are added to the noise, propagated from each pose.
+    ``points``: world positions (K, 2), or (K, 3) with heights. ``ranges``, ``bearings`` (K,): NaN where missing.
+    ``parameters`` (N, 6): corrections of :data:`PARAMETERS` for each pose, as in :func:`recalibrated`.
+    ``point_covariances`` (K, 2, 2): covariances of the points of an inexact map. They are added to the measurement noise.
     """
     changes = np.zeros((1, len(PARAMETERS))) if parameters is None else parameters
     constants = np.broadcast_to(_constants(model, changes), (len(poses), TIME_OFFSET))
@@ -259,10 +281,13 @@ def _squared(
     squared: Array,
     widths: Array,
 ) -> None:
-    """Squared whitened residuals ``squared`` (N, K) of sensors with their own ``constants`` (N, 5).
+    """Compute squared norms of whitened residuals of K landmarks at N poses.
 
-    The ``covariances`` (K, 2, 2) of points are added to the noise; ``widths`` (N, K): logarithm of the ratio of the determinants'
-    roots.
+    ``constants`` (N, 5): sensor constants for each pose. ``turn``: heading of the sensor in the robot frame.
+    ``noise``: range sigma, relative range sigma, bearing sigma.
+    ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
+    ``squared`` (N, K): output. ``widths`` (N, K): output if there are covariances. It is half the logarithm of the determinant of
+    the noise covariance with the points' part relative to that without. The negative log-likelihood contains it.
     """
     range_sigma, range_sigma_relative, bearing_sigma = noise
     axis = ahead_x = ahead_y = 0.0
@@ -281,7 +306,8 @@ def _squared(
             )
             squared[i, k] = range_error**2 + bearing_error**2
             if len(covariances):
-                # by the point, in the robot's axes: the range grows along v, the bearing perpendicular to the line of sight
+                # (ax, ay), (bx, by): gradients of the whitened range and bearing by the point's world position. The range
+                # grows along (vx, vy), the bearing perpendicular to the line of sight.
                 by_range = range_scale * weight
                 by_bearing = 0.0 if math.isnan(bearings[k]) else 1.0 / (distance * bearing_sigma)
                 ax, ay = by_range * (c * vx - s * vy), by_range * (s * vx + c * vy)
@@ -290,7 +316,7 @@ def _squared(
                 rr = 1.0 + ax * (xx * ax + xy * ay) + ay * (xy * ax + yy * ay)
                 rb = ax * (xx * bx + xy * by) + ay * (xy * bx + yy * by)
                 bb = 1.0 + bx * (xx * bx + xy * by) + by * (xy * bx + yy * by)
-                # rounding may cancel the difference completely, which is never less than that
+                # the exact determinant is at least half the trace, but rounding may cancel the difference completely
                 determinant = max(rr * bb - rb * rb, 0.5 * (rr + bb))
                 mixed = bb * range_error**2 - 2.0 * rb * range_error * bearing_error + rr * bearing_error**2
                 squared[i, k] = mixed / determinant
