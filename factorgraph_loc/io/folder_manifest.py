@@ -5,7 +5,7 @@ import re
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from factorgraph_loc.io.guesses import TRUTH, Guess, guess
 from factorgraph_loc.io.motions import wheel_steps
 from factorgraph_loc.io.proposals import Proposal, distinct, proposal_of, toml_of
 from factorgraph_loc.io.readers.mapped import ReferenceFile, read_reference
+from factorgraph_loc.io.turns import Turns, match
 from factorgraph_loc.model.sections import kind_of, several
 from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import LISTED, listed, quoted
@@ -39,9 +40,8 @@ FIELDS = {
 }
 POSITIONS = re.compile("uwb|gps|gnss|position|(^|[-_.])(fix|ble)", re.IGNORECASE)  # in names of tables of positions
 MAPS = ("tags", "landmarks")
-WINDOW = 1.0  # s over which turns are compared
+WINDOW = 1.0  # s over which distances are compared
 TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m: examples of what no file says
-LEAST_TURNED = 1.0  # rad: a reference that turns less does not show the distance between the wheels
 APART = 5.0  # s that clocks may begin apart
 
 
@@ -82,7 +82,7 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
     reference = roles.tables.get("reference")
     if reference is not None and not _has_headings(reference):
         roles.remarks.append(f"{reference.name}: has no headings")
-    _add_clocks(options, roles)
+    _add_clocks(options, roles, path)
     for table in roles.tables.values():
         roles.remarks += [f"{table.name}: {reason}" for reason in table.reasons]
     read = {table.name for table in roles.tables.values()}
@@ -224,19 +224,22 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
             f"{table.name}: measure the distance between the wheels, and their radius: track, radius [m]"
         )
         return
-    steps = {name: wheel_steps(table.values(name), 1.0) for name in sides}
-    left, right = (np.mean([steps[name] for name in sides if side in name], axis=0) for side in ("left", "right"))
+    left, right = _counted(table, sides)
     reference, tick, track = _reference(roles, path), TICK, None
-    travelled = float(np.nansum(np.abs(left + right))) / 2.0
-    if reference is not None and travelled > 0.0:
-        length = float(np.sum(np.hypot(*np.diff(_each_second(reference.t, reference.poses[:, :2]), axis=0).T)))
-        tick = float(f"{length / travelled:.3g}") or TICK
+    if reference is not None and reference.has_heading:
+        turned = match(Turns(table.times(), right - left), _turns_of(reference))
+    else:
+        turned = None
+    if reference is not None:
+        offset = 0.0 if turned is None or turned.offset is None else turned.offset
+        length, travelled = _lengths(table.times(), left + right, replace(reference, t=reference.t + offset))
+        tick = float(f"{2.0 * length / max(travelled, 1e-9):.3g}") if travelled > 0.0 and length > 0.0 else TICK
         roles.remarks.append(
             f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])}, as the reference travels {length:.1f} m "
-            f"over {travelled:.0f} of them; replace it by the size of your wheels"
+            f"over {travelled / 2.0:.0f} of them; replace it by the size of your wheels"
         )
-        if reference.has_heading:
-            track = _track(table.times(), tick * np.append(0.0, np.nancumsum(right - left)), reference)
+        if turned is not None and turned.ratio > 0.0:
+            track = float(f"{tick * turned.ratio:.3g}")
     else:
         roles.remarks.append(
             f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])} is an example: replace it"
@@ -261,21 +264,53 @@ def _reference(roles: _Roles, path: Path) -> Trajectory | None:
     return None
 
 
+def _lengths(t: Array, counted: Array, reference: Trajectory) -> tuple[float, float]:
+    """The length [m] of the reference and the change of what was ``counted`` (N,) at ``t`` (N,), both over the time that they
+    have in common; over all their time if they have none in common."""
+    during = (t >= reference.t[0]) & (t <= reference.t[-1])
+    of_reference = (reference.t >= t[0]) & (reference.t <= t[-1])
+    if not during.any() or not of_reference.any():
+        during, of_reference = np.ones(len(t), dtype=bool), np.ones(len(reference.t), dtype=bool)
+    steps = np.diff(_each_second(reference.t[of_reference], reference.poses[of_reference, :2]), axis=0)
+    return float(np.sum(np.hypot(*steps.T))), float(np.sum(np.abs(np.diff(_each_second(t[during], counted[during])))))
+
+
 def _each_second(t: Array, values: Array) -> Array:
     """The first row of ``values`` (N, ...) in each :data:`WINDOW` of the times ``t`` (N,) [s]."""
     return np.asarray(values[np.unique(np.floor((t - t[0]) / WINDOW), return_index=True)[1]])
 
 
-def _track(t: Array, difference: Array, reference: Trajectory) -> float | None:
-    """The distance between the wheels [m] with which their difference (N,) [m] turns as much as the reference; None if it hardly
-    turns."""
-    turned = np.sum(np.abs(np.diff(_each_second(reference.t, np.unwrap(reference.poses[:, 2])))))
-    driven = np.sum(np.abs(np.diff(_each_second(t, difference))))
-    return float(f"{driven / turned:.3g}") if turned > LEAST_TURNED and driven > 0.0 else None
+def _counted(table: Guess, sides: Sequence[str]) -> tuple[Array, Array]:
+    """The counts (N,) of the left and of the right wheels since the first row, as if no counter wrapped."""
+    steps = {name: wheel_steps(table.values(name), 1.0) for name in sides}
+    left, right = (np.mean([steps[name] for name in sides if side in name], axis=0) for side in ("left", "right"))
+    return np.append(0.0, np.nancumsum(left)), np.append(0.0, np.nancumsum(right))
 
 
-def _add_clocks(options: dict[str, Any], roles: _Roles) -> None:
-    """Offsets of clocks that begin at another time than that of most tables: as if all logs began together."""
+def _turns_of(reference: Trajectory) -> Turns:
+    return Turns(reference.t, np.unwrap(reference.poses[:, 2]))
+
+
+def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
+    """The turns that the table of a role shows; None if it shows none."""
+    table = roles.tables[role]
+    if role == "reference":
+        reference = _reference(roles, path)
+        return None if reference is None or not reference.has_heading else _turns_of(reference)
+    if role == "odometry" and _sides(table)[:1] == ("left",):
+        left, right = _counted(table, _sides(table))
+        return Turns(table.times(), right - left)
+    if table.has("heading"):
+        period = 360.0 if table.units.get("heading") == "deg" else 2.0 * np.pi
+        return Turns(table.times(), np.unwrap(table.values("heading"), period=period))
+    if table.has("w"):
+        return Turns(table.times(), np.append(0.0, np.nancumsum(table.values("w")[:-1] * np.diff(table.times()))))
+    return None
+
+
+def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
+    """Offsets of clocks that differ from that of most tables: such that both show the same turns. If no offset
+    is clear, both begin together."""
     starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}
     if not starts:
@@ -286,10 +321,17 @@ def _add_clocks(options: dict[str, Any], roles: _Roles) -> None:
         return count, role == "reference"
 
     usual = max(starts, key=agreeing)
+    apart = {role for role in starts if starts[role] > ends[usual] + APART or ends[role] < starts[usual] - APART}
+    by_clock = (_turns(role, roles, path) for role in starts if role not in apart)
+    first = next((turns for turns in by_clock if turns is not None), None)
     for role, start in starts.items():
-        if start > ends[usual] + APART or ends[role] < starts[usual] - APART:
-            options[role]["clock_offset"] = round(starts[usual] - start, 3)
+        if role in apart:
+            second = _turns(role, roles, path)
+            same = None if first is None or second is None else match(first, second)
+            offset = None if same is None else same.offset
+            options[role]["clock_offset"] = round(starts[usual] - start if offset is None else offset, 3)
+            how = "begin together; correct it if they did not" if offset is None else "show the same turns"
             roles.remarks.append(
                 f"{roles.tables[role].name}: its clock differs from that of {roles.tables[usual].name}: clock_offset is such that "
-                "both begin together; correct it if they did not"
+                f"both {how}"
             )

@@ -23,8 +23,8 @@ def write(path, lines):
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_truth(folder):
-    rows = zip(START + T, X, Y, np.sin(HEADING / 2.0), np.cos(HEADING / 2.0), strict=True)
+def write_truth(folder, start=START):
+    rows = zip(start + T, X, Y, np.sin(HEADING / 2.0), np.cos(HEADING / 2.0), strict=True)
     write(folder / "mocap.txt", [f"{t:.6f} {x:.4f} {y:.4f} 0 0 0 {s:.6f} {c:.6f}" for t, x, y, s, c in rows])
 
 
@@ -72,6 +72,30 @@ def test_counters_of_wheels_that_wrap_get_their_size_from_the_reference(tmp_path
     assert odometry["units"]["left"] == pytest.approx(0.0005, rel=0.02)
     assert odometry["track"] == pytest.approx(0.4, rel=0.05)
     assert np.sum(log.streams["odometry"].dx) == pytest.approx(SPEED * 59.9, rel=0.02)
+
+
+def test_noise_of_encoders_and_another_clock_leave_the_sizes_right(tmp_path):
+    later = T >= 5.0  # the reference begins first, by a clock of its own
+    noise = np.random.default_rng(3).normal(0.0, 0.002, (2, len(T))).cumsum(axis=1)  # 2 mm a row
+    turned = 0.4 * np.unwrap(HEADING)
+    left, right = ((SPEED * T + side * turned / 2.0 + noise[i]) / 0.0005 for i, side in enumerate((-1, 1)))
+    lines = [f"{1e3 * t:.0f},{a:.0f},{b:.0f}" for t, a, b in zip(T[later], left[later], right[later], strict=True)]
+    write(tmp_path / "day" / "encoders.csv", ["millis,left,right", *lines])
+    write_truth(tmp_path / "day", START + 100.0)
+    _, proposal = log_of(tmp_path)
+    odometry = proposal.content["options"]["odometry"]
+    assert odometry["units"]["left"] == pytest.approx(0.0005, rel=0.03)
+    assert odometry["track"] == pytest.approx(0.4, rel=0.05)
+    offsets = [table["clock_offset"] for table in proposal.content["options"].values() if "clock_offset" in table]
+    assert np.abs(offsets) == pytest.approx([START + 100.0], abs=0.2)
+
+
+def test_a_straight_drive_shows_no_offset_of_clocks(tmp_path):
+    write(tmp_path / "day" / "odometry.csv", ["t,x,y,heading", *(f"{t:.2f},{SPEED * t},0,0" for t in T)])
+    write(tmp_path / "day" / "truth.csv", ["t,x,y,heading", *(f"{START + t:.2f},{SPEED * t},0,0" for t in T[50:])])
+    _, proposal = log_of(tmp_path)
+    offsets = [table["clock_offset"] for table in proposal.content["options"].values() if "clock_offset" in table]
+    assert np.abs(offsets) == pytest.approx([START + 5.0])
 
 
 def test_four_wheels_are_proposed_together(tmp_path):

@@ -1,0 +1,70 @@
+"""The turns that two tables of one drive show, compared: the offset between their clocks, and the ratio of their sizes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import correlate
+
+from factors.se2 import Array
+
+STEP = 0.05  # s between compared turns
+WINDOW = 1.0  # s over which turns are compared
+ALIKE = 0.9  # minimum correlation of two tables of one drive
+DISTINCT = 2.0  # minimum ratio of what the correlation leaves unexplained at other offsets to that at the best one
+NEAR = 5.0  # s between offsets that count as one
+LONGEST = 86400.0  # s that a table may last; a longer one has a clock that was set
+OVERLAP = 0.9  # minimum share of the shorter table that is compared
+
+
+@dataclass(frozen=True)
+class Turns:
+    """An angle ``angle`` (N,) that counts on over whole turns, at the times ``t`` (N,) [s]. Its unit may be unknown."""
+
+    t: Array
+    angle: Array
+
+    def each_window(self) -> Array:
+        """The change of the angle (K,) over the :data:`WINDOW` that begins at each :data:`STEP`."""
+        grid = np.arange(self.t[0], self.t[-1], STEP)
+        angle = np.interp(grid, self.t, self.angle)
+        width = round(WINDOW / STEP)
+        return np.asarray(angle[width:] - angle[:-width])
+
+
+@dataclass(frozen=True)
+class Match:
+    """Two tables that show the same turns.
+
+    ``offset`` [s]: the clock of the first table minus the clock of the second; None if the turns agree at several offsets.
+    ``ratio``: the angle of the first table divided by the angle of the second.
+    """
+
+    offset: float | None
+    ratio: float
+
+
+def match(first: Turns, second: Turns) -> Match | None:
+    """Find the offset at which the turns of two tables agree best.
+
+    Returns None if no offset makes them agree, such as on a straight drive, or if a table lasts longer than :data:`LONGEST`.
+    """
+    if not all(0.0 < turns.t[-1] - turns.t[0] < LONGEST for turns in (first, second)):
+        return None
+    a, b = first.each_window(), second.each_window()
+    if not len(a) or not len(b):
+        return None
+    products = correlate(a, b)
+    in_a, in_b = correlate(a**2, np.ones(len(b))), correlate(np.ones(len(a)), b**2)
+    lags = np.arange(1 - len(b), len(a))
+    compared = np.minimum(len(a), lags + len(b)) - np.maximum(0, lags)
+    usable = (compared >= OVERLAP * min(len(a), len(b))) & (np.minimum(in_a, in_b) > 1e-9 * max(in_a.max(), in_b.max()))
+    if not usable.any():
+        return None
+    likeness = np.where(usable, products / np.sqrt(np.where(usable, in_a * in_b, 1.0)), -1.0)
+    best = int(np.argmax(likeness))
+    elsewhere = likeness[np.abs(lags - lags[best]) > NEAR / STEP].max(initial=-1.0)
+    if likeness[best] < ALIKE:
+        return None
+    is_distinct = 1.0 - elsewhere > DISTINCT * (1.0 - likeness[best])
+    offset = first.t[0] - second.t[0] + STEP * float(lags[best]) if is_distinct else None
+    return Match(offset, float(products[best] / in_b[best]))
