@@ -1,4 +1,4 @@
-"""The chi-square distribution, of squared whitened errors. As ``scipy.stats.chi2``, which takes half a second to import."""
+"""The chi-square distribution. Equal to ``scipy.stats.chi2``, which is not used because its import takes half a second."""
 
 import numpy as np
 import scipy
@@ -8,10 +8,10 @@ from factors.se2 import Array
 
 
 def quantile(probability: ArrayLike, dof: ArrayLike) -> Array:
-    """The value that is exceeded with one minus ``probability``, for ``dof`` degrees of freedom."""
+    """The value below which a chi-square variable with ``dof`` degrees of freedom is with this ``probability``."""
     return np.asarray(scipy.special.chdtri(dof, 1.0 - np.asarray(probability)))
 
 
 def survival(value: ArrayLike, dof: ArrayLike) -> Array:
-    """The probability that ``value`` is exceeded."""
+    """The probability that a chi-square variable with ``dof`` degrees of freedom exceeds ``value``."""
     return np.asarray(scipy.special.chdtrc(dof, value))

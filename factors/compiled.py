@@ -1,5 +1,5 @@
-"""Functions compiled by numba. Their code is kept in files, and where several processes need a function that is not there yet, one
-compiles it and the others wait for it."""
+"""Compilation of functions by numba, with a cache on disk that several processes share. If several processes need a function that
+is not in the cache, one compiles the function and the rest wait."""
 
 import fcntl
 import os
@@ -14,8 +14,8 @@ from typing import Any, TypeVar, overload
 import numba
 from numba.core.caching import FunctionCache
 
-PATIENCE = 60.0  # s; then a process compiles what another seems to be stuck with
-_BEAT = 0.02  # s
+PATIENCE = 60.0  # s; a process that has waited this long compiles the function itself
+_BEAT = 0.02  # s; interval between attempts to get the lock
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -29,24 +29,31 @@ def compiled(**options: Any) -> Callable[[Function], Function]: ...
 
 
 def compiled(function: Any = None, /, **options: Any) -> Any:
-    """``numba.njit`` with these options. The code is cached next to the function's file, else in the user's cache folder. If
-    neither is writable, each process compiles the function."""
+    """Compile a function with ``numba.njit`` and these options. A decorator, with or without arguments.
+
+    The compiled code is cached next to the function's file, or in the user's cache folder if the former is not writable. If neither
+    is writable, each process compiles the function.
+    """
     if function is None:
         return lambda decorated: _compiled(decorated, options)
     return _compiled(function, options)
 
 
 def _compiled(function: Any, options: dict[str, Any]) -> Any:
-    # C code never calls it: no wrapper is needed, which numba would compile too
+    # without the wrapper for calls from C, which numba would compile too and which nobody needs
     made = numba.njit(**{"no_cfunc_wrapper": True, **options})(function)
-    with suppress(RuntimeError):  # there is no place for it
-        made._cache = _Shared(function)  # what `cache=True` does with numba's own class
+    with suppress(RuntimeError):  # no folder for the cache is writable
+        made._cache = _Shared(function)  # the option `cache=True` does the same with numba's own class
     return made
 
 
 class _Shared(FunctionCache):
-    """A cache that keeps a lock from when a function is not found until it is saved. A function locks those that it calls while it
-    is locked itself, which is no circle. Locks end with their process."""
+    """A cache of one function's compiled code with a lock between processes.
+
+    The process that does not find the code takes the lock, and releases it after saving the code. While it compiles the function,
+    it may also lock the functions that this one calls. There is no deadlock, because calls of compiled functions form no cycle. The
+    operating system releases the locks of a process that ends.
+    """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         code = super().load_overload(sig, target_context)
@@ -67,14 +74,14 @@ class _Shared(FunctionCache):
     def _lock(self) -> None:
         try:
             locks = _locks(self.cache_path)
-        except OSError:  # it belongs to somebody else
+        except OSError:  # the lock file is not writable, because another user owns it
             return
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             try:
                 fcntl.lockf(locks, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, self._place())
                 return
-            except (BlockingIOError, PermissionError):  # another process has it
+            except (BlockingIOError, PermissionError):  # another process has the lock
                 time.sleep(_BEAT)
             except OSError:  # a file system without locks
                 return
@@ -86,11 +93,11 @@ class _Shared(FunctionCache):
             return
 
     def _place(self) -> int:
-        """The byte that is locked, of a file that all functions of a folder have in common."""
+        """The offset of the byte that represents this function in the lock file. All functions of a folder have one lock file."""
         return zlib.crc32(self._impl.filename_base.encode())
 
 
 @cache
 def _locks(folder: str) -> int:
-    """An open file of a folder, for locks. It stays open, because closing it releases all locks."""
+    """The file descriptor of the lock file of a folder. The file stays open, because closing it releases all locks."""
     return os.open(Path(folder) / "compiling.lock", os.O_RDWR | os.O_CREAT, 0o666)

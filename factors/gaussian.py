@@ -1,7 +1,7 @@
-"""Small matrices and Gaussians in compiled code: products, solutions, roots and inverses; prediction and smoothing.
+"""Compiled linear algebra for small matrices, and the prediction and smoothing of Gaussians.
 
-Plain loops: calls of LAPACK take longer than the arithmetic of small matrices, and numba compiles NumPy's
-operations on slices and matrices again into each function that uses them, in a second or more each.
+The functions are plain loops for two reasons. A call of LAPACK takes longer than the arithmetic of a small matrix. Numba compiles
+NumPy's operations on slices and matrices again into each function that uses them, which takes a second or more each.
 """
 
 import math
@@ -11,7 +11,8 @@ import numpy as np
 from factors.compiled import compiled
 from factors.se2 import Array
 
-SKEW = 1e-7  # of two standard deviations: more asymmetry is not one of a few roundings
+# Largest asymmetry of a covariance that a few rounding errors explain, relative to the product of the two standard deviations.
+SKEW = 1e-7
 
 
 @compiled(error_model="numpy")
@@ -38,8 +39,11 @@ def product_by_transpose(left: Array, right: Array) -> Array:
 
 @compiled(error_model="numpy")
 def solved(matrix: Array, right: Array) -> tuple[Array, float]:
-    """The solution (D, N) of ``matrix`` (D, D) times x = ``right`` (D, N), by elimination with pivots, and the logarithm of the
-    absolute determinant. LinAlgError if the matrix is singular or not finite."""
+    """Solve ``matrix @ x = right`` by Gaussian elimination with pivots.
+
+    ``matrix`` (D, D), ``right`` (D, N). Returns the solution x (D, N) and the logarithm of the absolute determinant of the matrix.
+    Raises LinAlgError if the matrix is singular or not finite.
+    """
     size, width = matrix.shape[0], right.shape[1]
     left, out, log_determinant = matrix.copy(), right.copy(), 0.0
     for k in range(size):
@@ -66,7 +70,8 @@ def solved(matrix: Array, right: Array) -> tuple[Array, float]:
 
 @compiled(error_model="numpy")
 def _substitute(upper: Array, out: Array) -> None:
-    """Solve ``upper`` (D, D) x = ``out`` (D, N) in place; only the upper half of ``upper`` is read."""
+    """Solve ``upper @ x = out`` for an upper triangular matrix (D, D), and write x (D, N) into ``out`` (D, N). The elements below
+    the diagonal of ``upper`` are ignored."""
     size, width = out.shape
     for i in range(size - 1, -1, -1):
         for k in range(i + 1, size):
@@ -86,13 +91,14 @@ def put(matrix: Array, out: Array) -> None:
 
 @compiled
 def inverse(matrix: Array) -> Array:
-    """The inverse of a matrix (D, D). LinAlgError if it is singular."""
+    """The inverse of a matrix (D, D). Raises LinAlgError if the matrix is singular."""
     return solved(matrix, np.eye(len(matrix)))[0]
 
 
 @compiled(error_model="numpy")
 def cholesky(covariance: Array) -> tuple[Array, bool]:
-    """The lower Cholesky root of a covariance (D, D), whose lower half is read, and whether it exists."""
+    """The lower Cholesky root (D, D) of a covariance (D, D), and True if the covariance is positive definite. If the second value
+    is False, the first is undefined. The elements above the diagonal of the covariance are ignored."""
     size = len(covariance)
     out = np.zeros((size, size))
     for i in range(size):
@@ -111,12 +117,13 @@ def cholesky(covariance: Array) -> tuple[Array, bool]:
 
 @compiled(error_model="numpy")
 def invert_covariance(covariance: Array) -> Array:
-    """The inverse of a covariance (D, D), whose lower half is read. LinAlgError if it is not positive definite."""
+    """The inverse of a covariance (D, D). The elements above its diagonal are ignored. Raises LinAlgError if the covariance is not
+    positive definite."""
     size = len(covariance)
     lower, exists = cholesky(covariance)
     if not exists:
         raise np.linalg.LinAlgError("a covariance is not positive definite")
-    out, back = np.empty((size, size)), np.zeros((size, size))  # ``back``: the inverse of the root
+    out, back = np.empty((size, size)), np.zeros((size, size))  # ``back`` is the inverse of the lower root
     for j in range(size):
         back[j, j] = 1.0 / lower[j, j]
         for i in range(j + 1, size):
@@ -135,8 +142,11 @@ def invert_covariance(covariance: Array) -> Array:
 
 @compiled
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
-    """The predicted covariance (S, S). ``transition`` (R, S): its first rows, the others are those of the identity; ``noise`` (R,
-    R): added to the first components."""
+    """Predict a ``covariance`` (S, S) over one step: ``F covariance F^T + Q``.
+
+    ``transition`` (R, S): the first R rows of the transition matrix F. Its last S - R rows are those of the identity.
+    ``noise`` (R, R): the covariance Q of the process noise of the first R components. The other components have no process noise.
+    """
     rows, moved, out = len(transition), product(transition, covariance), covariance.copy()
     own = product_by_transpose(moved, transition)
     for i in range(rows):
@@ -149,17 +159,21 @@ def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
 
 @compiled
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
-    """One backward step of the smoother of Rauch, Tung and Striebel (1965): the correction (S,) of a state, and its smoothed
-    covariance (S, S). :func:`factors.positive.smoothed` also serves where rounding makes this fail.
+    """One backward step of the smoother of Rauch, Tung and Striebel (1965).
 
-    ``covariance`` (S, S): of the filtered state; ``transition`` and ``noise``: of the following step, as in :func:`predicted`. The
-    smoothed state after that step differs by ``change`` (S,) from the predicted one, and has the covariance ``later`` (S, S).
-    LinAlgError if the predicted covariance is singular, or if rounding leaves no positive definite one.
+    ``covariance`` (S, S): covariance of the filtered state.
+    ``transition`` (R, S), ``noise`` (R, R): of the step that follows the filtered state, as in :func:`predicted`.
+    ``change`` (S,): the smoothed minus the predicted state after that step.
+    ``later`` (S, S): the smoothed covariance after that step.
+
+    Returns the correction (S,) of the filtered state, and its smoothed covariance (S, S). Raises LinAlgError if the predicted
+    covariance is singular, or if the smoothed covariance is not positive definite because of rounding.
+    :func:`factors.positive.smoothed` handles these cases.
     """
     size, prediction, moved = len(covariance), predicted(covariance, transition, noise), product(transition, covariance)
-    carried = covariance.copy()  # transition times covariance
+    carried = covariance.copy()  # the full transition matrix times the covariance
     put(moved, carried)
-    gain, _ = solved(prediction, carried)  # its transpose
+    gain, _ = solved(prediction, carried)  # the transpose of the smoother gain
     for i in range(size):
         for j in range(size):
             prediction[i, j] = later[i, j] - prediction[i, j]

@@ -1,11 +1,12 @@
-"""Variables and factors as GTSAM gets them.
+"""Variables and factors of a graph, and their conversion to GTSAM.
 
-A variable is a pose (3,), or a vector: roll and pitch (2,) of the robot at a pose, constants of a sensor that are estimated, or the
-position of a landmark (2,) or point (3,).
+A variable is a pose (3,) or a vector. A vector is the roll and pitch (2,) of the robot at a pose, the estimated constants of a
+sensor, or the position of a landmark (2,) or of a point in space (3,).
 
-A factor has ``linearize(values)``, whose values are arrays: poses (3,), vectors (P,). It returns the whitened, robustly weighted
-residual and one Jacobian per variable, by body-frame perturbation. GTSAM gets it as a linear factor: callbacks would copy all
-variables, and an exception in a callback leaves iSAM2 in an inconsistent state.
+A factor has the method ``linearize(values)``, whose values are arrays: poses (3,) and vectors (P,). It returns the whitened
+residual with robust weights and one Jacobian per variable. The Jacobian of a pose is by its body-frame perturbation. GTSAM gets
+each factor linearised, not as a callback. Callbacks would copy all variables, and an exception in a callback leaves iSAM2 in an
+inconsistent state.
 """
 
 import math
@@ -23,11 +24,15 @@ from factors.compiled import compiled
 from factors.gaussian import cholesky
 from factors.se2 import Array, Integers
 
-MOST_TERMS = 3  # of a `gtsam.JacobianFactor` in Python; a conditional is such a factor and may have any number
-RELATIVE_RIDGE, RIDGE = 1e-9, 1e-10  # of the mean curvature of a cost, and of any: against division by zero
-LEAST = 1e-12  # a cost of zero has no gradient
+MOST_TERMS = (
+    3  # most variables of a `gtsam.JacobianFactor` in Python; a `gtsam.GaussianConditional` may have any number
+)
+# Added to the diagonal of an information matrix before its decomposition, so that it is invertible: a fraction of the mean diagonal
+# element, and a constant.
+RELATIVE_RIDGE, RIDGE = 1e-9, 1e-10
+LEAST = 1e-12  # minimum of twice a cost, against division by zero
 Values = dict[int, Array]
-GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)  # all that GTSAM raises
+GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)  # all exceptions that GTSAM raises
 
 _POSE, _TILT, _POINT, _LANDMARK = ord("x"), ord("t"), ord("p"), ord("l")
 _CHARACTER = 56  # bits of a key below its character
@@ -44,57 +49,57 @@ def tilt_key(index: int) -> int:
 
 
 def constants_key(index: int) -> int:
-    """The key of the constants of the sensor with number ``index``."""
+    """The key of the estimated constants of sensor number ``index``."""
     return int(gtsam.symbol("c", index))
 
 
 def landmark_key(index: int) -> int:
-    """The key of the landmark that was met as number ``index``."""
+    """The key of landmark number ``index``, in order of first detection."""
     return int(gtsam.symbol("l", index))
 
 
 def point_key(index: int) -> int:
-    """The key of the point in space that was added as number ``index``."""
+    """The key of point number ``index`` in space, in order of addition to the graph."""
     return int(gtsam.symbol("p", index))
 
 
 def leaving_key(index: int) -> int:
-    """The key of a variable that only serves to leave a window, with number ``index``."""
+    """The key of auxiliary variable number ``index``, which is added to a fixed-lag smoother only to be marginalised at once."""
     return int(gtsam.symbol("q", index))
 
 
 def is_point(key: int) -> bool:
-    """Whether the variable is a point in space."""
+    """True if the variable is a point in space."""
     return key >> _CHARACTER == _POINT
 
 
 def is_landmark(key: int) -> bool:
-    """Whether the variable is a landmark."""
+    """True if the variable is a landmark."""
     return key >> _CHARACTER == _LANDMARK
 
 
 def is_pose(key: int) -> bool:
-    """Whether the variable is a pose."""
+    """True if the variable is a pose."""
     return key >> _CHARACTER == _POSE
 
 
 def is_place(key: int) -> bool:
-    """Whether the variable begins with x and y in the frame of the world."""
+    """True if the first two components of the variable are a position (x, y) in the world frame."""
     return key >> _CHARACTER in (_POSE, _POINT, _LANDMARK)
 
 
 def is_of_keyframe(key: int) -> bool:
-    """Whether the variable is a pose or a tilt, which a window loses with its keyframe."""
+    """True if the variable is a pose or a tilt. A fixed-lag smoother removes these together with their keyframe."""
     return key >> _CHARACTER in (_POSE, _TILT)
 
 
 def is_constant(key: int) -> bool:
-    """Whether the variable is always there: constants, or a landmark."""
+    """True if the variable is a landmark or a vector of sensor constants. A smoother never removes these."""
     return not is_of_keyframe(key) and not is_point(key)
 
 
 def index_of(key: int) -> int:
-    """The number of a pose, tilt, landmark or point."""
+    """The number of the pose, tilt, landmark or point with this key."""
     return key & ((1 << _CHARACTER) - 1)
 
 
@@ -102,14 +107,15 @@ class Factor(Protocol):
     """A factor that :func:`jacobian_factors` accepts."""
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, weighted residual (m,) and a Jacobian (m, d) for each variable."""
+        """The whitened residual (m,) with robust weights, and a Jacobian (m, d) for each variable."""
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The loss, robust if the factor is."""
+        """The loss. It is robust if the factor has robust weights."""
 
 
 class Stack(Protocol):
-    """Factors of one kind on N poses in a row and on P parameters that all have in common, linearised by one call."""
+    """Many factors of one kind that are linearised by one call, for speed. Each depends on one of N poses or on two consecutive
+    ones, and on some of P parameters of the graph, such as sensor constants."""
 
     rows: int
 
@@ -118,23 +124,29 @@ class Stack(Protocol):
         """The number (M,) of the first pose that each of the ``rows`` residuals depends on."""
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Fill ``residual`` (M,) and ``jacobian`` (M, 6 + P), see :mod:`factors.chain`, at ``poses`` (N, 3) and ``parameters``."""
+        """Linearise at ``poses`` (N, 3) and ``parameters`` (P,). Writes ``residual`` (M,) and ``jacobian`` (M, 6 + P), whose
+        columns :mod:`factors.chain` defines."""
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """The loss of all."""
+        """The loss, summed over all factors."""
 
 
 @runtime_checkable
 class Stackable(Factor, Protocol):
-    """A factor on one pose or on two consecutive ones, and perhaps on one vector. Many such factors become a stack."""
+    """A factor on one pose or on two consecutive poses, and optionally on one vector of parameters. Many such factors can be
+    combined into a :class:`Stack`."""
 
     @property
     def kind(self) -> Hashable:
-        """Equal for factors of one type and vector that share a stack; None for a factor outside stacks."""
+        """A key that is equal for factors that can be in one stack, given equal type and parameters. None if the factor must be
+        linearised alone."""
 
     def stack(self, factors: Sequence[Any], numbers: Sequence[int], column: int) -> Stack:
-        """``factors`` of this type and kind as one, each on the pose with its number; ``column``: of the vector among the
-        parameters."""
+        """Combine ``factors`` of this type and kind.
+
+        ``numbers``: for each factor, the number of the (first) pose that it depends on. ``column``: the index of the first
+        component of the factors' vector among the parameters of the graph.
+        """
 
 
 def pose_array(pose: gtsam.Pose2) -> Array:
@@ -147,12 +159,16 @@ def jacobian_factors(
     values: Mapping[int, Array],
     on_failure: Callable[[str], None] | None = None,
 ) -> list[gtsam.GaussianFactor]:
-    """Factors, each with the keys of its variables, linearised at ``values``.
+    """Linearise factors at ``values``, as linear factors of GTSAM in the same order.
 
-    Factors whose ``alike`` is equal are linearised together, by ``linearize_all`` of their class, to residuals (N, m) and a
-    Jacobian (N, m, d) for each of their variables.
-    ``on_failure``: called with the reason where a residual or Jacobian is not finite or has a wrong shape, which then is zero.
-    Each factor comes with the number of its residuals then. Factors that are alike are not checked.
+    ``factors``: tuples of a factor, the keys of its variables, and its number of residuals. The number is needed only with
+    ``on_failure``.
+    ``values``: the value of each key.
+    ``on_failure``: is called with the reason if a residual or Jacobian is not finite or has a wrong shape. The linear factor is
+    then zero. If ``on_failure`` is None, nothing is checked.
+
+    Factors with equal values of an attribute ``alike`` are linearised together by ``linearize_all`` of their class, for speed. That
+    returns residuals (N, m) and a Jacobian (N, m, d) for each variable. Such factors are never checked.
     """
     out: list[Any] = []
     alike: defaultdict[Hashable, list[int]] = defaultdict(list)
@@ -188,7 +204,7 @@ def _unit(size: int) -> gtsam.noiseModel.Unit:
 
 
 class PriorFactor:
-    """A Gaussian prior of a pose: ``mean`` (3,) and the ``covariance`` (3, 3) of its body-frame perturbation."""
+    """A Gaussian prior of a pose. ``mean`` (3,): a pose. ``covariance`` (3, 3): that of the body-frame perturbation of the mean."""
 
     def __init__(self, mean: Array, covariance: Array) -> None:
         self._mean = mean
@@ -206,7 +222,7 @@ class PriorFactor:
 
 
 class VectorPriorFactor:
-    """A Gaussian prior of a vector: ``mean`` (P,), and standard deviations (P,) or a covariance (P, P)."""
+    """A Gaussian prior of a vector. ``mean`` (P,). ``uncertainty``: standard deviations (P,), or a covariance (P, P)."""
 
     def __init__(self, mean: Array, uncertainty: Array) -> None:
         self._mean = mean
@@ -224,10 +240,11 @@ class VectorPriorFactor:
 def _checked(
     factor: Factor, values: Sequence[Array], rows: int, on_failure: Callable[[str], None]
 ) -> tuple[Array, list[Array]]:
-    """A factor with ``rows`` residuals, linearised; zero where that fails."""
+    """Linearise a factor that must have ``rows`` residuals. If the result is not finite or has a wrong shape, call ``on_failure``
+    with the reason and return zeros."""
     try:
         residual, blocks = factor.linearize(values)
-        # a product with zeros is not a number if any value is not finite
+        # NaN or infinity times zero is NaN, so the product with zeros detects a value that is not finite
         total = np.vdot(residual, _zeros(residual.size))
         fits = residual.shape == (rows,) and len(blocks) == len(values)
         for block, value in zip(blocks, values, strict=False):
@@ -250,13 +267,16 @@ def _zeros(size: int) -> Array:
 
 
 def retract(key: int, value: Array, step: Array) -> Array:
-    """A variable moved by a step of its tangent space."""
+    """The value of a variable after a step in its tangent space: a body-frame twist of a pose, or a change of a vector."""
     return se2.moved(value, step) if is_pose(key) else value + step
 
 
 def frame_motions(values: Values) -> tuple[Array, list[int]]:
-    """The tangent steps (n, 3) of all variables, stacked, when the world frame moves in x, in y, and about its origin; and the end
-    row of each variable."""
+    """The gauge directions of a graph: how all variables change when the whole solution moves in the world frame.
+
+    Returns an array (n, 3) of stacked tangent steps of the variables, and the index behind the last row of each variable. The
+    columns are derivatives by a shift in x, a shift in y, and a rotation about the origin of the world.
+    """
     parts = []
     for key, value in values.items():
         part = np.zeros((len(value), 3))
@@ -271,7 +291,7 @@ def frame_motions(values: Values) -> tuple[Array, list[int]]:
 
 
 def to_gtsam(values: Values) -> gtsam.Values:
-    """The same as GTSAM holds them."""
+    """Convert values to ``gtsam.Values``. Poses become ``gtsam.Pose2``."""
     out = gtsam.Values()
     for key, value in values.items():
         out.insert(key, gtsam.Pose2(*value) if is_pose(key) else value)
@@ -279,20 +299,20 @@ def to_gtsam(values: Values) -> gtsam.Values:
 
 
 def read(solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, key: int) -> Array:
-    """The estimate of a variable."""
+    """The solver's estimate of a variable: a pose (3,) or a vector (P,)."""
     if is_pose(key):
         return pose_array(solver.calculateEstimatePose2(key))
     return np.asarray(solver.calculateEstimateVector(key), dtype=float)
 
 
 def gather(values: Values, keys: Sequence[int]) -> list[Array]:
-    """The values of several variables."""
+    """The values of the variables with these keys, as a list in the order of the keys."""
     return [values[key] for key in keys]
 
 
 @compiled(error_model="numpy")
 def _whitened(lower: Array, vector: Array, out: Array) -> float:
-    """Compute L^-1 v into ``out`` and return its squared norm."""
+    """Solve ``lower @ out = vector`` for a lower triangular matrix, write ``out``, and return its squared norm."""
     squared = 0.0
     for i in range(len(vector)):
         total = vector[i]
@@ -305,6 +325,7 @@ def _whitened(lower: Array, vector: Array, out: Array) -> float:
 
 @compiled(error_model="numpy")
 def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
+    """:func:`compressed` of contiguous arrays."""
     size, curvature, trace = len(gradient), information.copy(), 0.0
     residual, jacobian = np.empty(size + 1), np.zeros((size + 1, size))
     for i in range(size):
@@ -328,13 +349,17 @@ def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array,
 
 
 def compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
-    """Residual (d + 1,) and Jacobian (d + 1, d) of a cost ``nll`` >= 0 with ``gradient`` (d,) and symmetric positive semi-definite
-    ``information`` (d, d). All are finite for any rank of the information.
+    """Convert a cost with derivatives to a residual (d + 1,) and a Jacobian (d + 1, d) for a least-squares solver.
 
-    With the information H = L L^T the residual is ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` and its Jacobian ``[L^T; 0]``. Half its
-    square is nll exactly, its gradient is g and its curvature H, so a least-squares solver takes the scoring step and evaluates
-    the exact likelihood. The last row requires ``g^T H^-1 g <= 2 nll``: the minimum of the parabola must not be negative.
-    Otherwise the curvature is raised along g to ``H + t g g^T`` with ``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``.
+    ``nll``: the cost, a negative log-likelihood of at least 0.
+    ``gradient`` (d,): its gradient g.
+    ``information`` (d, d): its Fisher information H, symmetric and positive semi-definite, of any rank.
+
+    With H = L L^T the residual is ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` and its Jacobian is ``[L^T; 0]``. Half the squared
+    residual is exactly nll, its gradient is g, and its curvature is H. A least-squares solver therefore takes the step of Fisher
+    scoring and evaluates the exact likelihood. The last residual requires ``g^T H^-1 g <= 2 nll``: the minimum of the parabola must
+    not be negative. Otherwise the curvature is raised along g to ``H + t g g^T`` with ``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``. The
+    results are always finite.
     """
     arrays = np.ascontiguousarray(gradient, dtype=float), np.ascontiguousarray(information, dtype=float)
     residual, jacobian = _compressed(float(nll), *arrays)

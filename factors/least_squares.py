@@ -1,7 +1,8 @@
-"""The minima of costs in a few variables, by the damped steps of Levenberg (1944) and Marquardt (1963).
+"""Minimise costs by the damped steps of Levenberg (1944) and Marquardt (1963).
 
-The damping is a share of the diagonal of the curvature, because metres, radians and scales differ. Many problems of one shape are
-solved together. :func:`descended` is for a problem that solves for its own steps, such as a whole graph, without dense matrices.
+The damping is relative to the diagonal of the curvature, because metres, radians and scales have different magnitudes.
+:func:`minima` solves many small problems with equal numbers of variables together, and :func:`minimum` solves one.
+:func:`descended` is for large sparse problems, such as a graph, where the caller computes the steps.
 """
 
 import math
@@ -13,14 +14,15 @@ import numpy as np
 from factors.se2 import Array, Integers
 
 DAMPING, MAX_DAMPING = 1e-3, 1e8
-LEAST = 1e-9  # curvature of a direction that its problem does not determine
-# of `descended`: a gain relative to the cost, and a step in m, rad or the units of other variables
+LEAST = 1e-9  # minimum of a diagonal element of the curvature, for directions that the problem does not determine
+# Limits of `descended`. The gain is relative to the cost; the step is in m, rad or the units of other variables.
 MAX_ITERATIONS, CONVERGED_GAIN, CONVERGED_STEP, INITIAL_DAMPING = 100, 1e-6, 1e-6, 1e-8
 State = TypeVar("State")
 
 
 class Minima(NamedTuple):
-    """``states`` (N, S) of N problems; their ``costs`` (N,), gradients (N, D) and curvatures (N, D, D) there."""
+    """The solutions of N problems: the final ``states`` (N, S), with ``costs`` (N,), ``gradients`` (N, D) and ``curvatures``
+    (N, D, D) at these states."""
 
     states: Array
     costs: Array
@@ -37,11 +39,15 @@ def minima(
     moved: Callable[[Array, Array], Array] = np.add,
     largest: Array | float = np.inf,
 ) -> Minima:
-    """The local minima of N costs from ``start`` (N, S).
+    """Find local minima of N independent costs.
 
-    ``at(states, which)``: costs (n,), gradients (n, D) and curvatures (n, D, D) of the problems with indices ``which`` (n,). The
-    curvature is the Fisher information or that of Gauss and Newton. ``moved(states, steps)``: the states after steps (n, D). Steps
-    are shortened to the ``largest`` (D,) allowed. A problem is solved when a step is below ``converged`` (D,).
+    ``at(states, which)``: returns costs (n,), gradients (n, D) and curvatures (n, D, D) of the problems with indices ``which``
+    (n,). The curvature is the Fisher information or the Gauss-Newton approximation of the Hessian.
+    ``start`` (N, S): initial states.
+    ``iterations``: maximum number of iterations.
+    ``converged``: scalar or (D,). A problem is solved when all components of its step are at most this large.
+    ``moved(states, steps)``: returns the states (n, S) after steps (n, D).
+    ``largest``: scalar or (D,). A step with a larger component is shortened.
     """
     states, which = np.array(start, dtype=float), np.arange(len(start))
     best = Minima(states, *(np.array(part) for part in at(states, which)))
@@ -74,7 +80,11 @@ def minimum(
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
 ) -> tuple[Array, float, Array]:
-    """The state (D,), cost and curvature (D, D) at the local minimum of one cost, within bounds: see :func:`minima`."""
+    """Find a local minimum of one cost within the bounds ``low`` and ``high``, scalars or (D,).
+
+    ``at(state)``: returns the cost, gradient (D,) and curvature (D, D). The remaining arguments are those of :func:`minima`.
+    Returns the state (D,), the cost and the curvature (D, D) at the minimum.
+    """
 
     def only(states: Array, _: Integers) -> tuple[Array, Array, Array]:
         cost, gradient, curvature = at(states[0])
@@ -93,11 +103,15 @@ def descended(
     state: State,
     max_iterations: int = MAX_ITERATIONS,
 ) -> tuple[State, float, int]:
-    """The local minimum of a cost, the cost there, and the number of steps.
+    """Find a local minimum of a cost whose steps the caller computes.
 
-    ``moved``: the state after a step whose damping is a share of the curvature, and the largest component of the step; None where
-    the step is not determined. The problem is solved when a step is below :data:`CONVERGED_STEP`, or lowers the cost by less than
-    the share :data:`CONVERGED_GAIN`.
+    ``cost_of(state)``: returns the cost.
+    ``moved(state, damping)``: returns the state after one damped step, and the largest absolute component of the step. Returns None
+    if the step is not determined. ``damping`` is relative to the diagonal of the curvature.
+    ``state``: the initial state.
+
+    The problem is solved when a step is at most :data:`CONVERGED_STEP`, or when it reduces the cost by at most the fraction
+    :data:`CONVERGED_GAIN`. Returns the state at the minimum, its cost, and the number of iterations.
     """
     damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
     while iteration < max_iterations and damping < MAX_DAMPING:

@@ -1,4 +1,4 @@
-"""Motion increments, the propagation of covariances, and poses between those of a row."""
+"""Motion increments of the robot, the propagation of covariances along them, and the interpolation of poses along odometry."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,10 +14,10 @@ from factors.se2 import Array, Integers, between_scalars, compose_scalars, exp_s
 
 @dataclass(frozen=True, slots=True)
 class Increment:
-    """Relative motion between two times.
+    """The relative motion of the robot between two times.
 
-    ``delta`` (3,): pose of the end in the frame of the start. ``covariance`` (3, 3): of the body-frame perturbation at the end.
-    ``duration`` [s], and ``still`` [s], the part of it at rest.
+    ``delta`` (3,): the pose at the end in the frame of the pose at the start. ``covariance`` (3, 3): covariance of its body-frame
+    perturbation. ``duration`` [s]: the time between both. ``still`` [s]: the part of the duration in which the robot is at rest.
     """
 
     delta: Array
@@ -27,13 +27,17 @@ class Increment:
 
     @property
     def moving(self) -> float:
-        """Time [s] in motion."""
+        """The part [s] of the duration in which the robot moves."""
         return self.duration - self.still
 
 
 class ChainState(NamedTuple):
-    """State of the integrated odometry: pose in its own frame, path length [m], accumulated rotation [rad], time without odometry
-    [s], time at rest [s]."""
+    """The state of the integrated odometry at time ``t`` [s].
+
+    ``x``, ``y``, ``heading``: the pose in the odometry's own frame [m, m, rad].
+    ``path``: the length of the path so far [m]. ``turn``: the sum of absolute rotations so far [rad].
+    ``unknown``: the time so far without valid odometry [s]. ``still``: the time so far at rest [s].
+    """
 
     t: float
     x: float
@@ -46,7 +50,8 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """A body-frame covariance (3, 3) propagated along an increment."""
+    """Propagate the body-frame ``covariance`` (3, 3) of a pose along an increment. Returns the body-frame covariance (3, 3) of the
+    pose at the end."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 
@@ -63,13 +68,17 @@ def poses_between(
     poses: Array,
     covariances: Array,
 ) -> tuple[Array, Array]:
-    """T poses (T, 3) and body-frame covariances (T, 3, 3), each after the pose number ``previous`` (T,) of M ``poses``
-    (M, 3) with ``covariances`` (M, 3, 3).
+    """Interpolate M estimated poses at T times, along the odometry.
 
-    ``deltas`` (T, 3), ``noises`` (T, 3, 3) and ``durations`` (T,) [s]: of the motion from there; ``steps`` (M-1, 3) and so on: of
-    that from each pose to the next. The misclosure of the odometry at the next pose is distributed in proportion to time. The
-    covariance is interpolated linearly, plus that of a bridge pinned at both ends. ``elsewhere`` (M-1,): whether the robot was
-    carried to the next pose, which then does not inform the poses in between.
+    ``previous`` (T,): the index of the last estimated pose before each time.
+    ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time, its
+    body-frame covariance, and its duration.
+    ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: those from each estimated pose to the next.
+    ``elsewhere`` (M-1,): True where somebody carried the robot to the next pose. Poses in between then ignore the next pose.
+    ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
+
+    The misclosure of the odometry at the next pose is distributed in proportion to time. The covariance is the linear interpolation
+    of both, plus that of a Brownian bridge. Returns poses (T, 3) and body-frame covariances (T, 3, 3).
     """
     count = len(previous)
     at, out = np.empty((count, 3)), np.empty((count, 3, 3))

@@ -1,7 +1,7 @@
 """Operations on covariances that may be numerically singular.
 
-A covariance with components of very different scales is singular in floating point although it is well conditioned in units of its
-standard deviations. Eigenvalues of its correlation matrix below :data:`LEAST` are rounding errors and are raised to that.
+A covariance whose components have very different scales may be singular in floating point, although its correlation matrix is well
+conditioned. Eigenvalues of the correlation matrix below :data:`LEAST` are rounding errors, and are raised to :data:`LEAST`.
 Well-conditioned covariances are used unchanged.
 """
 
@@ -16,12 +16,13 @@ from factors.compiled import compiled
 from factors.se2 import Array
 
 LEAST = 1e-12  # minimum eigenvalue of an invertible correlation matrix
-CLEAR = 1e-9  # determinant of a clearly invertible correlation matrix
-SKEW = 1e-6  # of two standard deviations: most asymmetry of a covariance that rounding explains
+CLEAR = 1e-9  # a correlation matrix with a larger determinant is certainly invertible
+SKEW = 1e-6  # largest asymmetry of a correlation matrix that rounding explains
 
 
 def nearest(covariances: Array) -> Array:
-    """The nearest symmetric, invertible covariances (..., D, D). LinAlgError if a variance is not positive or not finite."""
+    """The nearest symmetric, invertible covariances (..., D, D). Raises LinAlgError if a variance is not positive, or if an element
+    is not finite."""
     sigmas, values, vectors = _parts(covariances)
     shares = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     shares = (shares + np.swapaxes(shares, -1, -2)) / 2.0
@@ -29,7 +30,7 @@ def nearest(covariances: Array) -> Array:
 
 
 def sound(covariance: Array) -> Array:
-    """The covariance (D, D) itself if it is invertible, else the :func:`nearest` invertible one."""
+    """Return the covariance (D, D) unchanged if it is numerically invertible, otherwise the :func:`nearest` invertible one."""
     if is_clear(covariance):
         return covariance
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -41,7 +42,8 @@ def sound(covariance: Array) -> Array:
 
 @compiled(error_model="numpy")
 def is_clear(covariance: Array) -> bool:
-    """Whether a covariance (D, D) is finite, symmetric and far from singular, so that it is its own :func:`sound` covariance."""
+    """True if a covariance (D, D) is finite, symmetric and far from singular. A cheap sufficient test: :func:`sound` then returns
+    the covariance unchanged."""
     size, shares = len(covariance), np.empty(covariance.shape)
     for i in range(size):
         if not 0.0 < covariance[i, i] < np.inf:
@@ -55,12 +57,13 @@ def is_clear(covariance: Array) -> bool:
     determinant = 1.0
     for i in range(size):
         determinant *= lower[i, i] * lower[i, i]
-    # with such a determinant the smallest eigenvalue of a correlation matrix is far above LEAST: det < e * smallest
+    # The determinant of a correlation matrix is less than e times its smallest eigenvalue, which is therefore far above LEAST.
     return exists and determinant > CLEAR
 
 
 def whitener(covariances: Array) -> Array:
-    """Inverses of the lower Cholesky roots of covariances (..., D, D), or other whitening matrices if there are no roots."""
+    """Matrices W (..., D, D) that whiten errors with these covariances (..., D, D): ``W covariance W^T`` is the identity. They are
+    the inverses of the lower Cholesky roots, or eigenvector matrices with raised eigenvalues where a root does not exist."""
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
     except np.linalg.LinAlgError:
@@ -68,7 +71,7 @@ def whitener(covariances: Array) -> Array:
 
 
 def root(covariances: Array) -> Array:
-    """The lower roots of covariances (..., D, D)."""
+    """The lower Cholesky roots of covariances (..., D, D), or of the :func:`nearest` covariances if a root does not exist."""
     try:
         return np.asarray(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:
@@ -76,7 +79,7 @@ def root(covariances: Array) -> Array:
 
 
 def solve(covariances: Array, right: Array) -> Array:
-    """The solution of ``covariances @ x = right`` for covariances (..., D, D) and ``right`` (..., D, N)."""
+    """Solve ``covariances @ x = right`` for covariances (..., D, D) and ``right`` (..., D, N). Returns x (..., D, N)."""
     try:
         return np.asarray(np.linalg.solve(covariances, right))
     except np.linalg.LinAlgError:
@@ -85,7 +88,7 @@ def solve(covariances: Array, right: Array) -> Array:
 
 
 def inverse(covariances: Array) -> Array:
-    """The inverses of covariances (..., D, D)."""
+    """The inverses of covariances (..., D, D). Small eigenvalues are raised first if a covariance is numerically singular."""
     try:
         inverses = np.asarray(np.linalg.inv(covariances), dtype=float)
         if np.all(np.diagonal(inverses, axis1=-2, axis2=-1) > 0.0):
@@ -97,14 +100,17 @@ def inverse(covariances: Array) -> Array:
 
 
 def squared(errors: Array, covariances: Array) -> Array:
-    """Squared Mahalanobis distances (...) of ``errors`` (..., D) under covariances (..., D, D)."""
+    """The squared Mahalanobis distances (...) of ``errors`` (..., D) with covariances (..., D, D)."""
     return np.asarray(np.sum(errors * solve(covariances, errors[..., None])[..., 0], axis=-1))
 
 
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
-    """One backward step of the smoother of Rauch, Tung and Striebel (1965): the correction (S,) of a state, and its smoothed
-    covariance (S, S). Arguments as of :func:`factors.gaussian.smoothed`. Where that fails, the covariance is a sum that is as
-    positive as its parts, for any gain."""
+    """One backward step of the smoother of Rauch, Tung and Striebel (1965), also for nearly singular covariances.
+
+    The arguments are those of :func:`factors.gaussian.smoothed`. If that function fails, the covariance is computed in Joseph's
+    form, a sum of positive semi-definite terms for any gain. Returns the correction (S,) of the filtered state and its smoothed
+    covariance (S, S).
+    """
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (covariance, transition, noise, change, later))
     try:
         correction, smoothed_covariance = gaussian.smoothed(*arrays)
@@ -121,29 +127,31 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
 
 
 def worst_sigma(covariances: Array) -> Array:
-    """Standard deviations (...,) in the least certain direction of covariances (..., D, D)."""
+    """The largest standard deviation (...,) of covariances (..., D, D) over all directions."""
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[..., -1], 0.0)))
 
 
 def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
-    """Draws (count, D) from a zero-mean Gaussian whose covariance (D, D) may be singular."""
+    """Draw ``count`` samples (count, D) from a zero-mean Gaussian whose covariance (D, D) may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(rng.standard_normal((count, len(values))) @ root.T)
 
 
 def _whitener(covariances: Array) -> Array:
+    """Whitening matrices (..., D, D) from the raised eigenvalues of the correlation matrices."""
     sigmas, values, vectors = _parts(covariances)
     return np.asarray(np.swapaxes(vectors / np.sqrt(values)[..., None, :], -1, -2) / sigmas[..., None, :])
 
 
 def _parts(covariances: Array) -> tuple[Array, Array, Array]:
-    """Standard deviations (..., D), and eigenvalues (..., D), raised, and eigenvectors (..., D, D) of the correlations."""
+    """Decompose covariances (..., D, D). Returns the standard deviations (..., D), and the eigenvalues (..., D), raised to at least
+    :data:`LEAST`, and eigenvectors (..., D, D) of the correlation matrices."""
     variances = np.diagonal(covariances, axis1=-2, axis2=-1)
     if not (np.all(np.isfinite(covariances)) and np.all(variances > 0.0)):
-        raise np.linalg.LinAlgError("a covariance is not finite, or not positive")
+        raise np.linalg.LinAlgError("a covariance is not finite, or has a variance that is not positive")
     sigmas = np.sqrt(variances)
-    # divided separately, because the product may overflow
+    # two divisions, because the product of the standard deviations may overflow
     shares = covariances / sigmas[..., :, None] / sigmas[..., None, :]
     values, vectors = np.linalg.eigh((shares + np.swapaxes(shares, -1, -2)) / 2.0)
     return sigmas, np.maximum(values, LEAST), vectors

@@ -1,7 +1,7 @@
 """Robust losses of squared whitened residuals, and their weights in iteratively reweighted least squares.
 
-Each is half of the squared residual where that is small; the weight is twice the derivative. ``scale``: in standard deviations.
-They take numbers and arrays, and may be called in compiled code.
+For small residuals, each loss equals half of the squared residual. The weight is twice the derivative of the loss by the squared
+residual. ``scale``: the scale of the loss in standard deviations. The functions accept numbers and arrays, also in compiled code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Squared = TypeVar("Squared", float, Array)
 
 @register_jitable(inline="always")
 def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
-    """At most ``scale^2 / 2``, so that gross outliers have no influence (Geman, McClure, 1985)."""
+    """The loss of Geman and McClure (1985). It is at most ``scale^2 / 2``, so that gross outliers have no influence."""
     return 0.5 * squared / (1.0 + squared / scale**2)
 
 
@@ -30,7 +30,7 @@ def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_loss(squared: Squared, scale: float) -> Squared:
-    """Linear in the residual beyond ``scale`` (Huber, 1964)."""
+    """The loss of Huber (1964). It is linear in the residual beyond ``scale``."""
     size = np.sqrt(squared)
     inner = np.minimum(size, scale)
     loss: Squared = inner * (size - 0.5 * inner)

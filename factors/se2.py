@@ -19,8 +19,8 @@ from factors.compiled import compiled
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-SMALL = 1e-4  # rad; smaller angles use series, against cancellation
-SHORT = 0.5  # rad; of many poses smaller angles use longer series, in less time
+SMALL = 1e-4  # rad; functions of smaller angles use a Taylor series, to avoid cancellation
+SHORT = 0.5  # rad; functions of many poses use a longer Taylor series below this angle, because it is faster
 
 
 def wrap(angle: Array) -> Array:
@@ -126,10 +126,11 @@ def transform_from(pose: Array, points: Array) -> Array:
 
 
 def align_points(points: Array, targets: Array) -> Array:
-    """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) in least squares; pairs with a NaN are ignored.
+    """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) with the least squared distances.
 
-    NaN without a pair. For coincident points the rotation is 0. Umeyama, "Least-squares estimation of transformation parameters
-    between two point patterns", PAMI 13(4), 1991, equations 40 to 42 with scale 1: in the plane the rotation is one angle.
+    Pairs that contain a NaN are ignored. If no pair is left, the result is NaN. If all points coincide, the rotation is 0. Source:
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4), 1991, equations 40 to
+    42 with scale 1. In the plane the rotation is one angle.
     """
     known = np.isfinite(points).all(axis=1) & np.isfinite(targets).all(axis=1)
     if not known.any():
@@ -155,23 +156,24 @@ def world_to_body(pose: Array, covariance: Array) -> Array:
 
 @register_jitable
 def arc_coefficients(phi: float) -> tuple[float, float]:
-    """``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle, for compiled code too."""
+    """``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle [rad]. Compiled code may call this function."""
     if abs(phi) < SMALL:
         return 1.0 - phi * phi / 6.0, phi / 2.0
     return math.sin(phi) / phi, 2.0 * math.sin(phi / 2.0) ** 2 / phi
 
 
 def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
-    """:func:`arc_coefficients` of arrays."""
+    """:func:`arc_coefficients` of an array of angles."""
     small = np.abs(phi) < SMALL
     safe = np.where(small, 1.0, phi)
     a = np.where(small, 1.0 - phi**2 / 6.0, np.sin(safe) / safe)
-    # 1 - cos(phi) by the half angle, against cancellation
+    # 1 - cos(phi) = 2 sin(phi / 2)^2, without cancellation
     b = np.where(small, phi / 2.0, 2.0 * np.sin(safe / 2.0) ** 2 / safe)
     return a, b
 
 
 def _rotation3(heading: Array) -> Array:
+    """The matrices (..., 3, 3) that rotate the first two components by ``heading`` (...) and keep the third."""
     if np.ndim(heading) == 0:
         cos, sin = math.cos(heading), math.sin(heading)
         return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
@@ -185,7 +187,7 @@ def _rotation3(heading: Array) -> Array:
 
 @compiled(inline="always")
 def _arc_of_many(angle: float) -> tuple[float, float]:
-    """:func:`arc_coefficients` to 1e-12."""
+    """:func:`arc_coefficients`, faster, with an error of at most 1e-12."""
     if abs(angle) > SHORT:
         return math.sin(angle) / angle, 2.0 * math.sin(angle / 2.0) ** 2 / angle
     z = angle * angle
@@ -196,17 +198,20 @@ def _arc_of_many(angle: float) -> tuple[float, float]:
 
 @compiled(inline="always")
 def _wrapped_of_many(angle: float) -> float:
+    """:func:`wrap_scalar`, faster."""
     return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
 
 
 @compiled
 def exp_scalars(x: float, y: float, angle: float) -> tuple[float, float, float]:
+    """:func:`exp` of one twist (x, y, angle)."""
     p, q = arc_coefficients(angle)
     return p * x - q * y, q * x + p * y, wrap_scalar(angle)
 
 
 @compiled
 def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float]:
+    """:func:`log` of one pose (x, y, heading)."""
     angle = wrap_scalar(heading)
     p, q = arc_coefficients(angle)
     scale = 1.0 / (p * p + q * q)
@@ -217,7 +222,7 @@ def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float
 def compose_scalars(
     x: float, y: float, heading: float, dx: float, dy: float, turned: float
 ) -> tuple[float, float, float]:
-    """The pose (dx, dy, turned) in the frame of another one."""
+    """:func:`compose` of two poses: (dx, dy, turned) is given in the frame of (x, y, heading)."""
     c, s = math.cos(heading), math.sin(heading)
     return x + c * dx - s * dy, y + s * dx + c * dy, wrap_scalar(heading + turned)
 
@@ -226,14 +231,14 @@ def compose_scalars(
 def between_scalars(
     x: float, y: float, heading: float, to_x: float, to_y: float, to: float
 ) -> tuple[float, float, float]:
-    """The pose (to_x, to_y, to) as seen from another one."""
+    """:func:`between` of two poses: (to_x, to_y, to) in the frame of (x, y, heading)."""
     c, s, dx, dy = math.cos(heading), math.sin(heading), to_x - x, to_y - y
     return c * dx + s * dy, c * dy - s * dx, wrap_scalar(to - heading)
 
 
 @compiled
 def moved(pose: Array, twist: Array) -> Array:
-    """The pose (3,) moved by the first three components of a twist in its own frame."""
+    """The pose (3,) moved by a twist in its own frame: ``pose * exp(twist)``. ``twist``: its first three components are used."""
     x, y, turned = exp_scalars(twist[0], twist[1], twist[2])
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrap_scalar(pose[2] + turned)))
@@ -241,7 +246,7 @@ def moved(pose: Array, twist: Array) -> Array:
 
 @compiled
 def twist_to(pose: Array, target: Array) -> Array:
-    """The twist (3,) in the frame of a pose (3,) that leads from it to another: the inverse of :func:`moved`."""
+    """The twist (3,) that moves ``pose`` (3,) to ``target`` (3,), in the frame of ``pose``. The inverse of :func:`moved`."""
     x, y, turned = between_scalars(pose[0], pose[1], pose[2], target[0], target[1], target[2])
     return np.array(log_scalars(x, y, turned))
 
@@ -279,8 +284,8 @@ def inverse_right_jacobian(xi: Array) -> Array:
 
 @compiled
 def body_to_world_one(pose: Array, covariance: Array) -> Array:
-    """:func:`body_to_world` of one pose (3,), and of the first three components of a covariance (S, S). Only the upper
-    triangle is read, so the result is exactly symmetric."""
+    """:func:`body_to_world` of one pose (3,) and of the first three components of a covariance (S, S). Elements below the diagonal
+    are ignored, so the result (3, 3) is exactly symmetric."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     out = np.empty((3, 3))
     a, b, e = covariance[0, 0], covariance[0, 1], covariance[1, 1]
@@ -294,7 +299,8 @@ def body_to_world_one(pose: Array, covariance: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
-    """Poses (N, 3) composed with ``delta`` (3,), and each then moved by a twist (N, 3) in its own frame."""
+    """Move each of N poses (N, 3) by the common motion ``delta`` (3,) and then by its own twist (N, 3):
+    ``poses * delta * exp(twists)``."""
     out, cd, sd = np.empty_like(poses), math.cos(delta[2]), math.sin(delta[2])
     for n in range(len(poses)):
         c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])
@@ -308,7 +314,7 @@ def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def twists_to(pose: Array, targets: Array) -> Array:
-    """The twists (N, 3) in the frame of a pose (3,) that lead from it to others (N, 3)."""
+    """The twists (N, 3) that move ``pose`` (3,) to each of ``targets`` (N, 3), in the frame of ``pose``."""
     out, c, s = np.empty_like(targets), math.cos(pose[2]), math.sin(pose[2])
     for n in range(len(targets)):
         dx, dy = targets[n, 0] - pose[0], targets[n, 1] - pose[1]
@@ -321,7 +327,8 @@ def twists_to(pose: Array, targets: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"reassoc", "contract"})
 def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
+    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) of (x, y, heading)
+    in the world frame. ``weights`` (N,): must have the sum 1."""
     x = y = cosine = sine = 0.0
     for n in range(len(poses)):
         x, y = x + weights[n] * poses[n, 0], y + weights[n] * poses[n, 1]

@@ -1,7 +1,8 @@
-"""The correction of a Gaussian by residuals: the robust, iterated Kalman update in information form.
+"""The correction of a Gaussian by residuals: a robust, iterated Kalman update in information form.
 
-Robust, because an outlier must neither dominate nor be rejected by a wrong prediction. Landmarks of a map have a compiled version
-(:mod:`factors.landmarks.kernels`), because an EKF updates so often that calls of NumPy would take most of its time.
+The update is robust because an outlier must not dominate it, and because a wrong prediction must not reject good measurements.
+Landmarks of a map have a compiled version in :mod:`factors.landmarks.kernels`. Without it, calls of NumPy take most of the time of
+an EKF.
 """
 
 from __future__ import annotations
@@ -17,18 +18,22 @@ from factors.compiled import compiled
 from factors.gaussian import invert_covariance
 from factors.se2 import Array, Integers
 
-CONVERGED = 1e-6  # m and rad; convergence limit of an iterated update
-GATE = 9.21  # 99 % of chi-square with two degrees of freedom
-GATES = {1: 6.63, 2: GATE, 3: 11.34}  # by degrees of freedom
+CONVERGED = 1e-6  # m and rad; an iterated update ends when a step is smaller
+GATE = 9.21  # 99 % quantile of chi-square with two degrees of freedom
+GATES = {1: 6.63, 2: GATE, 3: 11.34}  # 99 % quantiles of chi-square by degrees of freedom
 
 
 @dataclass(frozen=True)
 class Correction:
-    """The correction of a Gaussian by an observation: ``delta`` (S,) of the error state, and its ``covariance`` (S, S) afterwards.
+    """The correction of a Gaussian error state (S,) by an observation.
 
-    At the prediction: the whitened ``residual`` (K, g), predicted minus measured, and its normalised square (``nis``) with degrees
-    of freedom. For a likelihood without residuals: the excess of its negative logarithm over the expected value (``excess_nll``),
-    the ``variance`` of that, and the ``evidence``, its log-probability by Laplace's method, None where it was not computed.
+    ``delta`` (S,): the correction of the error state. ``covariance`` (S, S): the covariance after the correction.
+    ``residual`` (K, g): whitened residuals of K sightings at the prediction, predicted minus measured.
+    ``nis``: the normalised innovation squared. ``dof``: its degrees of freedom.
+
+    The last three fields are for likelihoods without residuals, such as that of RFID reads.
+    ``excess_nll``: the negative log-likelihood at the prediction minus its expected value. ``variance``: the variance of
+    ``excess_nll``. ``evidence``: the marginal log-likelihood by Laplace's method, or None if it was not computed.
     """
 
     delta: Array
@@ -50,18 +55,25 @@ def update_state(
     converged: float = CONVERGED,
     common: int = 0,
 ) -> Correction:
-    """Robust, iterated Kalman update in information form, or in square-root form if that is numerically insufficient.
+    """Correct a Gaussian by K sightings, with a robust, iterated Kalman update.
 
-    ``covariance`` (S, S): of the error state. ``linearize(delta)``: whitened residual (K, g) and Jacobian (K, g, D) by the first D
-    components of the error state, at the correction ``delta`` (S,). ``weight``: the weight (K,) of squared residuals (K,), robust
-    and tempered; at zero it is the tempering, which the innovation excludes. In the first iteration a sighting whose normalised
-    innovation squared is outside the gate has its noise multiplied by the squared excess, which reduces its influence without
-    locking the filter out. Further iterations divide the noise by the weight at the updated state (iteratively reweighted least
-    squares), until a step is below ``converged``. ``common``: errors that all sightings have in common, unit Gaussians that follow
-    the error state as ``linearize`` gets it.
+    ``linearize(delta)``: returns the whitened residuals (K, g) at the correction ``delta`` (S,), and their Jacobian (K, g, D) by
+    the first D components of the error state.
+    ``covariance`` (S, S): covariance of the error state at the prediction.
+    ``weight``: maps squared norms (K,) of whitened residuals to weights (K,). A weight is a robust weight times a tempering
+    exponent of the likelihood. The weight of zero is therefore the tempering exponent.
+    ``iterations``: maximum number of iterations. They end earlier when a step is below ``converged``.
+    ``dof``: number of measured values, stored in the result.
+    ``common``: number of errors that all sightings have in common. They are independent unit Gaussians. ``linearize`` gets them
+    after the S components of the error state.
+
+    The first iteration linearises at the prediction. There the noise of a sighting is multiplied by the square of (normalised
+    innovation squared / gate) where this ratio exceeds 1, so that an outlier has less influence but is not rejected. Further
+    iterations divide the noise by the weight at the updated state (iteratively reweighted least squares). The normalised innovation
+    squared excludes the tempering. The update is in information form, or in square-root form if rounding makes that singular.
     """
     size, priors = len(covariance), [covariance]
-    if common:  # they are tempered like the sightings
+    if common:  # the common errors are tempered like the sightings: their variance is divided by the exponent
         tempering = weight(np.zeros(1))[0]
         priors = [np.eye(size + common) / share for share in sorted({1.0, tempering}, reverse=True)]
         for prior in priors:
@@ -79,8 +91,8 @@ def update_state(
     return replace(correction, delta=correction.delta[:size], covariance=correction.covariance[:size, :size])
 
 
-# Correction (S,) and covariance (S, S) from a Jacobian (K, g, D), residuals (K, g), their weights (K,), and the correction (D,) at
-# which they are linearised.
+# A function of a Jacobian (K, g, D), residuals (K, g), their weights (K,), and the correction (D,) at which they are linearised. It
+# returns the correction (S,) and the covariance (S, S).
 _Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
 
@@ -94,13 +106,15 @@ def _iterated(
     dof: int,
     converged: float,
 ) -> Correction:
+    """The iterations of :func:`update_state`. ``first_solve`` solves without tempering, ``solve`` with it."""
     zero = np.zeros(len(covariance))
-    residual, blocks = map(np.ascontiguousarray, linearize(zero))  # other memory orders would compile the code again
+    # numba would compile `normalised` and `inform` again for another memory order
+    residual, blocks = map(np.ascontiguousarray, linearize(zero))
     size = blocks.shape[2]
     squared = normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))
     widening = np.maximum(1.0, squared / GATES[blocks.shape[1]])
     delta, updated = first_solve(blocks, residual, np.ones(len(residual)), zero[:size])
-    # by the matrix inversion lemma
+    # the normalised innovation squared by the matrix inversion lemma
     pull = np.einsum("kij,ki->j", blocks, residual)
     nis = max(0.0, float(np.vdot(residual, residual) - pull @ updated[:size, :size] @ pull))
     tempering = weight(np.zeros(1))[0]
@@ -118,7 +132,7 @@ def _iterated(
 
 
 def _informed(prior: Array) -> _Solver:
-    """A solver with the ``prior`` information (S, S)."""
+    """A solver in information form. ``prior`` (S, S): the information of the prediction."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         information = prior.copy()
@@ -130,7 +144,8 @@ def _informed(prior: Array) -> _Solver:
 
 
 def _rooted(root: Array) -> _Solver:
-    """A solver with the lower ``root`` (S, S) of the prior covariance, whose result is always positive definite."""
+    """A solver in square-root form, whose covariance is always positive definite. ``root`` (S, S): lower Cholesky root of the
+    covariance of the prediction."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size, scale = len(at), np.sqrt(np.repeat(weight, blocks.shape[1]))
@@ -147,10 +162,13 @@ def _rooted(root: Array) -> _Solver:
 
 @compiled(error_model="numpy")
 def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array, total: Array) -> Array:
-    """Add the information of K residuals to ``total`` (S, S), and return the vector (D,) that the correction solves for.
+    """Add the information of K residuals to ``total`` (S, S), and return their information vector (D,).
 
-    ``residual`` (K, g) and ``jacobian`` (K, g, D): linearised at the correction ``at`` (S,); ``columns`` (D,): those of the
-    Jacobian in the error state; ``weights`` (K,). The correction is the inverse of the information times this vector.
+    ``residual`` (K, g), ``jacobian`` (K, g, D): linearised at the correction ``at`` (S,).
+    ``columns`` (D,): the components of the error state that the columns of the Jacobian belong to.
+    ``weights`` (K,): weights of the sightings.
+
+    The correction is the inverse of the information matrix times the information vector.
     """
     wide = len(columns)
     pull = np.zeros(wide)
@@ -173,10 +191,11 @@ def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, 
 def corrected(
     prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
 ) -> tuple[Array, Array, Array]:
-    """The correction (S,), the covariance (S, S) after it, and the vector (D,) of :func:`inform`.
+    """One Kalman update in information form.
 
-    ``prior`` (S, S): the information of the prediction; the other arguments are those of :func:`inform`. LinAlgError if there is no
-    solution.
+    ``prior`` (S, S): the information of the prediction. The other arguments are those of :func:`inform`. Returns the correction
+    (S,), the covariance (S, S) after it, and the information vector (D,) of the residuals. Raises LinAlgError if the total
+    information is not positive definite.
     """
     total = prior.copy()
     pull = inform(residual, jacobian, columns, weights, at, total)
@@ -189,8 +208,11 @@ def corrected(
 
 @compiled(error_model="numpy")
 def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
-    """Normalised innovation squared (K,) of K independent whitened residuals (K, g) with Jacobians (K, g, D) by the
-    ``columns`` (D,) of a state with this ``covariance`` (S, S)."""
+    """The normalised innovation squared (K,) of each of K sightings.
+
+    ``residual`` (K, g): whitened. ``jacobian`` (K, g, D): by the components ``columns`` (D,) of the error state.
+    ``covariance`` (S, S): covariance of the error state.
+    """
     size, wide = residual.shape[1], len(columns)
     out, left, whitened = np.zeros(len(residual)), np.empty((size, size)), np.empty(size)
     for k in range(len(residual)):
@@ -206,7 +228,7 @@ def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: 
                         element += jacobian[k, i, a] * carried
                 for m in range(j):
                     element -= left[i, m] * left[j, m]
-                # with unit noise a pivot is at least 1, whatever rounding leaves of it
+                # a pivot is at least 1 because the noise is a unit matrix, but rounding may reduce it
                 left[i, j] = math.sqrt(max(element, 0.5)) if i == j else element / left[j, j]
             for m in range(i):
                 whitened[i] -= left[i, m] * whitened[m]

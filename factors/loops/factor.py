@@ -1,7 +1,8 @@
-"""A loop that may be false: the pose at one time in the frame of an earlier one, or only that both are at one place.
+"""The factor of a loop closure between two poses. The loop closure may be false, so the factor has a robust loss.
 
-Its loss is that of Geman and McClure, and may be widened at first: graduated non-convexity (Yang, Antonante, Tzoumas, Carlone, RA-L
-5(2), 2020) finds which of many loops agree with each other and with the odometry.
+The measurement is the later pose in the frame of the earlier pose, or only that both have the same position. The loss is that of
+Geman and McClure. Its scale may be increased in the first iterations: graduated non-convexity (Yang, Antonante, Tzoumas, Carlone,
+RA-L 5(2), 2020). This method finds the loop closures that agree with each other and with the odometry.
 """
 
 from __future__ import annotations
@@ -23,14 +24,16 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class LoopFactor:
-    """A robust factor on two poses.
+    """A loop closure as a robust factor on two poses.
 
-    ``measured`` (3,): the later pose in the frame of the earlier one, with standard deviations ``sigmas`` (3,) [m, m, rad] of its
-    body-frame perturbation; None if both are at one place, with the standard deviation ``sigmas`` (1,) [m] of each coordinate.
-    ``offset``, ``earlier_offset``: the motion from each variable's pose to that of the loop, whose error is added to the noise;
-    None if they are the same. ``robust``: scale of the loss, in standard deviations.
+    ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are known to be equal.
+    ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If ``measured`` is None, the
+    standard deviation (1,) [m] of each coordinate of the difference of the positions.
+    ``offset``: the motion from the later pose variable to the pose at the time of the loop closure. Its covariance is added to the
+    noise. None if both are the same pose. ``earlier_offset``: likewise for the earlier pose variable.
+    ``robust``: scale of the loss in standard deviations.
 
-    The values of the factor are the later pose (3,) and the earlier pose (3,).
+    The methods take a list of two values: the later pose (3,) and the earlier pose (3,).
     """
 
     measured: Array | None
@@ -45,13 +48,14 @@ class LoopFactor:
         return 2 if self.measured is None else 3
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (2,) or (3,), and its Jacobian by each pose."""
+        """The whitened residual (2,) or (3,) with robust weights, and its Jacobian by each pose."""
         error, by_later, by_earlier = self.whitened(values)
         weight = math.sqrt(geman_mcclure_weight(float(error @ error), self.robust))
         return weight * error, [weight * by_later, weight * by_earlier]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """Whitened residual, and its Jacobian by each pose, without robust weights."""
+        """The whitened residual (2,) or (3,), its Jacobian by the later pose, and that by the earlier pose, without robust
+        weights."""
         moved = [None if o is None else o.delta for o in (self.offset, self.earlier_offset)]
         later, earlier = (v if o is None else se2.compose(v, o) for v, o in zip(values, moved, strict=True))
         if self.measured is not None:
@@ -78,13 +82,14 @@ class LoopFactor:
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:
-        """How many times as wide the loss must be for its second derivative to be positive there, at least 1."""
+        """The factor, at least 1, by which the scale of the loss must be multiplied for the loss to be convex at these values."""
         error, _, _ = self.whitened(values)
         return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)
 
     @cached_property
     def _whitener(self) -> Array:
-        """The whitener of the residual. The direction of the odometry's error is unknown: the mean variance is added."""
+        """The matrix that whitens the residual. Where only positions are measured, it adds the mean variance of the odometry's two
+        coordinates, because the direction of the odometry's error in the earlier pose's frame is unknown."""
         covariances = [o.covariance for o in (self.offset, self.earlier_offset) if o is not None]
         if self.measured is None:
             added = sum(float(np.trace(covariance[:2, :2])) / 2.0 for covariance in covariances)

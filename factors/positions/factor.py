@@ -15,10 +15,14 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class PositionFactor:
-    """A position (2,) [m] in the world with ``covariance`` (2, 2) as a factor on the pose (3,).
+    """A measured position of a point of the robot, as a factor on the robot's pose.
 
-    ``arm`` (2,) [m]: the measured point in the robot frame. ``offset``: the motion from the pose to the measurement, None if the
-    times are equal. ``robust``: scale of the Geman-McClure loss in standard deviations.
+    ``position`` (2,) [m]: the measured position in the world frame, with ``covariance`` (2, 2).
+    ``arm`` (2,) [m]: the measured point in the robot frame, such as the place of the antenna.
+    ``offset``: the robot's motion from the time of the pose to that of the measurement. None if the times are equal.
+    ``robust``: scale of the Geman-McClure loss in standard deviations.
+
+    Methods with ``values`` take a list of one pose (3,).
     """
 
     position: Array
@@ -49,27 +53,28 @@ class PositionFactor:
         return residual, [jacobian]
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (2,) and its Jacobian (2, 3)."""
+        """The whitened residual (2,) with robust weights, and its Jacobian (2, 3)."""
         residual, (jacobian,) = self.whitened(values)
         weight = np.sqrt(self.weight(residual[0] @ residual[0]))
         return weight * residual[0], [weight * jacobian[0]]
 
     def losses(self, poses: Array) -> Array:
-        """The robust loss (N,) of poses (N, 3)."""
+        """The robust loss (N,) at poses (N, 3)."""
         squared = positive.squared(self.errors(poses), self._covariances(poses))
         return np.asarray(geman_mcclure_loss(squared, self.robust))
 
     def squared(self, pose: Array, covariance: Array) -> float:
-        """The squared Mahalanobis distance from the prediction ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+        """The normalised innovation squared: the squared Mahalanobis distance between the measured position and that predicted from
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
         residual, (jacobian,) = self.whitened([pose])
         return float(positive.squared(residual[0], np.eye(2) + jacobian[0] @ covariance @ jacobian[0].T))
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss."""
+        """The robust loss at the pose."""
         return float(self.losses(values[0][None])[0])
 
     def weight(self, squared: Array) -> Array:
-        """The robust weight of squared whitened residuals."""
+        """The robust weights of ``squared`` norms of whitened residuals."""
         return np.asarray(geman_mcclure_weight(squared, self.robust))
 
     def dof(self) -> int:
@@ -77,11 +82,11 @@ class PositionFactor:
         return 2
 
     def widened(self, width: float) -> PositionFactor:
-        """The factor with a loss ``width`` times as wide."""
+        """The factor with a robust loss that is ``width`` times as wide."""
         return replace(self, robust=width * self.robust)
 
     def _covariances(self, poses: Array) -> Array:
-        """Covariances (N, 2, 2) of the errors: of the measurement, and of the motion since the pose."""
+        """The covariances (N, 2, 2) of the errors in the world frame: the sum of those of the measurement and of ``offset``."""
         if self.offset is None:
             return np.broadcast_to(self.covariance, (len(poses), 2, 2))
         x, y = self.arm
@@ -90,6 +95,6 @@ class PositionFactor:
 
 
 def _axes(headings: Array) -> Array:
-    """Rotations (N, 2, 2) by headings (N,)."""
+    """The rotation matrices (N, 2, 2) of headings (N,)."""
     c, s = np.cos(headings), np.sin(headings)
     return np.stack((np.stack((c, -s), axis=-1), np.stack((s, c), axis=-1)), axis=-2)
