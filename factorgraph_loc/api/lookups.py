@@ -119,19 +119,21 @@ def new_rig(
     *,
     odometry: first.Drive = "differential",
     imu: bool = False,
-    landmarks: float | None = None,
+    landmarks: float | Mapping[str, float] | None = None,
     antennas: int | Sequence[str] = 0,
     camera: tuple[int, int] | None = None,
+    position: float | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Rig:
     """A first rig of a robot with some sensors, written with comments to ``out`` if it is given.
 
-    ``landmarks``: standard deviation of ranges to landmarks [m]; ``antennas``: number or names of RFID antennas; ``camera``: width
-    and height of its images [px]. InputError if a value is out of bounds, or the file exists.
+    ``landmarks``: standard deviation of ranges to landmarks [m], or a mapping from the names of several sensors to it.
+    ``antennas``: number or names of RFID antennas. ``camera``: width and height of its images [px]. ``position``: standard
+    deviation of measured positions [m]. InputError if a value is out of bounds, or the file exists.
     """
     names = tuple(map(str, range(1, antennas + 1))) if isinstance(antennas, int) else tuple(antennas)
-    rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, names, camera))
+    rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, names, camera, position))
     if out is not None:
         write_new_rig(rig, remarks, Path(out), overwrite=overwrite)
     return rig

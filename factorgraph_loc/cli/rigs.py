@@ -69,12 +69,19 @@ def new(
     odometry: Annotated[str | None, typer.Option(metavar="DRIVE", help=f"{', '.join(DRIVES)}.")] = None,
     imu: Annotated[bool | None, typer.Option("--imu/--no-imu", help="A gyro.")] = None,
     landmarks: Annotated[
-        str | None, typer.Option(metavar="METRES", help="Standard deviation of ranges to landmarks, or none.")
+        str | None,
+        typer.Option(
+            metavar="METRES|A=M,B=M",
+            help="Standard deviation of ranges to landmarks, for each of several radios, or none.",
+        ),
     ] = None,
     antennas: Annotated[
         str | None, typer.Option(metavar="NUMBER|A,B", help="RFID antennas around the body: how many, or their names.")
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="WxH", help="Size of its images, 640x480, or none.")] = None,
+    position: Annotated[
+        str | None, typer.Option(metavar="METRES", help="Standard deviation of measured positions, or none.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", metavar="FILE", help="The rig to write.")] = None,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -90,9 +97,10 @@ def new(
     robot = RobotOptions(
         _value("--odometry", odometry, "differential", f"one of {', '.join(DRIVES)}", DRIVES.__getitem__, asks),
         _value("--imu", None if imu is None else "yes" if imu else "no", "no", "yes or no", YES.__getitem__, asks),
-        _value("--landmarks", landmarks, "none", "the noise of a range in m, or none", _metres, asks),
+        _value("--landmarks", landmarks, "none", "the noise of a range in m, A=M,B=M, or none", _ranges, asks),
         _value("--antennas", antennas, "0", f"a number from 0 to {MOST_ANTENNAS}, or names", _antennas, asks),
         _value("--camera", camera, "none", "a size such as 640x480, or none", _size, asks),
+        _value("--position", position, "none", "the noise of a position in m, or none", _metres, asks),
     )
     given, name = None if out is None else str(out), "robot.rig.toml" if asks else ""
     file = _value("--out", given, name, "the file to write, such as robot.rig.toml", _file, asks)
@@ -132,6 +140,16 @@ def _antennas(text: str) -> tuple[str, ...]:
 
 def _metres(text: str) -> float | None:
     return None if text == "none" else float(text)
+
+
+def _ranges(text: str) -> float | dict[str, float] | None:
+    if "=" not in text:
+        return _metres(text)
+    pairs = [part.split("=") for part in text.split(",")]
+    sigmas = {name: float(sigma) for name, sigma in pairs}
+    if not all(sigmas) or len(sigmas) < len(pairs):
+        raise ValueError
+    return sigmas
 
 
 def _size(text: str) -> tuple[int, int] | None:

@@ -42,6 +42,7 @@ POSITIONS = re.compile("uwb|gps|gnss|position|(^|[-_.])(fix|ble)", re.IGNORECASE
 MAPS = ("tags", "landmarks")
 WINDOW = 1.0  # s over which distances are compared
 TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m: examples of what no file says
+SIGMA = 0.1  # m: an example of the noise of a range or a position
 APART = 5.0  # s that clocks may begin apart
 
 
@@ -91,18 +92,31 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
     ]
     if unused:
         roles.remarks.append(f"not used: {listed(unused)}")
-    if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
-        antennas = dict.fromkeys(roles.tables["rfid"].columns[roles.tables["rfid"].fields["antenna"]])
-        names = shlex.quote(",".join(antennas)) if len(antennas) < LISTED else listed(antennas)
-        roles.remarks.append(
-            f"the rig needs antennas of these names, as `fgloc rigs new --antennas {names}` writes them"
-        )
     beside = [] if "world" in options or any(path.parent.glob("*.world.toml")) else _map_in_parent(path, roles)
-    roles.remarks += beside
+    roles.remarks += _needs_of_rig(roles) + beside
     for role in [role for role in options if kind_of(role) != role]:
         kind, _, own = role.partition(".")
         options.setdefault(kind, {})[own] = options.pop(role)
     return proposal_of("mapped", path, folder, options, roles.remarks, with_map=not beside and "world" not in options)
+
+
+def _needs_of_rig(roles: _Roles) -> list[str]:
+    """What the rig has to have for the tables, with the commands that write it."""
+    out = []
+    if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
+        antennas = dict.fromkeys(roles.tables["rfid"].columns[roles.tables["rfid"].fields["antenna"]])
+        names = shlex.quote(",".join(antennas)) if len(antennas) < LISTED else listed(antennas)
+        out.append(f"the rig needs antennas of these names, as `fgloc rigs new --antennas {names}` writes them")
+    radios = [role for role in roles.tables if kind_of(role) == "bearing_range"]
+    sections = listed(f"[{role}]" for role in radios)
+    if len(radios) > 1:
+        each = ",".join(f"{role.partition('.')[2]}={SIGMA}" for role in radios)
+        out.append(f"the rig needs {sections}, as `fgloc rigs new --landmarks {each}` writes them")
+    if "position" in roles.tables:
+        out.append(f"the rig needs [position], as `fgloc rigs new --position {SIGMA}` writes it")
+    if radios and "landmarks" in roles.tables and roles.tables["landmarks"].has("z"):
+        out.append(f"the landmarks have heights: set z, the height of the sensor, in {sections} of the rig")
+    return out
 
 
 def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
@@ -163,7 +177,6 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
     measured = [g for g in rest if not _has_headings(g) and POSITIONS.search(g.name)]
     if measured:
         out.tables["position"] = measured[0]
-        out.remarks.append(f"{measured[0].name} has positions: give the rig the section [position]")
         rest = [g for g in rest if g not in measured]
     if "odometry" not in out.tables and rest:
         out.tables["odometry"] = rest.pop(0)

@@ -32,7 +32,7 @@ class Turns:
 
 
 @dataclass(frozen=True)
-class Match:
+class SameTurns:
     """Two tables that show the same turns.
 
     ``offset`` [s]: the clock of the first table minus the clock of the second; None if the turns agree at several offsets.
@@ -43,7 +43,7 @@ class Match:
     ratio: float
 
 
-def match(first: Turns, second: Turns) -> Match | None:
+def match(first: Turns, second: Turns) -> SameTurns | None:
     """Find the offset at which the turns of two tables agree best.
 
     Returns None if no offset makes them agree, such as on a straight drive, or if a table lasts longer than :data:`LONGEST`.
@@ -67,4 +67,4 @@ def match(first: Turns, second: Turns) -> Match | None:
         return None
     is_distinct = 1.0 - elsewhere > DISTINCT * (1.0 - likeness[best])
     offset = first.t[0] - second.t[0] + STEP * float(lags[best]) if is_distinct else None
-    return Match(offset, float(products[best] / in_b[best]))
+    return SameTurns(offset, float(products[best] / in_b[best]))

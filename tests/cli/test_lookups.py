@@ -125,6 +125,17 @@ def test_antennas_have_the_given_names(fgloc, refused, tmp_path):
     assert "--antennas is 'A,A'" in refused("rigs", "new", "--antennas", "A,A", "-o", tmp_path / "b.toml")
 
 
+def test_several_radios_and_positions_get_their_sections(fgloc, refused, tmp_path):
+    options = ("--landmarks", "front=0.1,rear=0.2", "--position", 0.3)
+    assert fgloc("rigs", "new", *options, "-o", tmp_path / "a.toml").exit_code == 0
+    rig = read_rig(tmp_path / "a.toml")
+    assert rig.sensors == ("odometry", "bearing_range.front", "bearing_range.rear", "position")
+    assert [rig.section(f"bearing_range.{name}").range_sigma for name in ("front", "rear")] == [0.1, 0.2]
+    assert rig.section("position").sigma == 0.3
+    for wrong in ("front=0.1,front=0.2", "front=", "=0.1", "front=0.1=0.2"):
+        assert f"--landmarks is '{wrong}'" in refused("rigs", "new", "--landmarks", wrong, "-o", tmp_path / "b.toml")
+
+
 def test_eight_antennas_stand_as_on_the_robot_of_the_paper(fgloc, tmp_path):
     fgloc("rigs", "new", "--antennas", 8, "-o", tmp_path / "a.toml")
     made, published = read_rig(tmp_path / "a.toml").rfid.antennas, rackham()

@@ -58,6 +58,7 @@ def test_several_tables_of_ranges_are_several_sensors(tmp_path):
     assert set(proposal.content["options"]["bearing_range"]) == {"left", "right"}
     assert set(log.streams["bearing_range.left"].range) == {2.0}
     assert set(log.streams["bearing_range.right"].range) == {3.0}
+    assert "`fgloc rigs new --landmarks left=0.1,right=0.1`" in proposal.text
 
 
 def test_counters_of_wheels_that_wrap_get_their_size_from_the_reference(tmp_path):

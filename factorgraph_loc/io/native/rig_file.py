@@ -97,14 +97,19 @@ def _comment(setting: Setting | None) -> str:
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """The sensors of a robot. ``landmarks``: standard deviation of a range [m], None without such a sensor; ``antennas``: their
-    names; ``camera``: width and height of its images [px]."""
+    """The sensors of a new robot.
+
+    ``landmarks``: standard deviation of a range [m], by name for several sensors of landmarks. ``position``: standard deviation of
+    a measured x or y [m]. ``antennas``: names of RFID antennas. ``camera``: width and height of its images [px]. None stands for a
+    sensor that the robot lacks.
+    """
 
     odometry: Drive = "differential"
     imu: bool = False
-    landmarks: float | None = None
+    landmarks: float | Mapping[str, float] | None = None
     antennas: tuple[str, ...] = ()
     camera: tuple[int, int] | None = None
+    position: float | None = None
 
 
 def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
@@ -120,9 +125,17 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
         sections["odometry"]["noise"] = {"lateral": Rig().odometry.noise.along.model_dump()}
     if robot.imu:
         sections["imu"] = {}
-    if robot.landmarks is not None:
+    if isinstance(robot.landmarks, Mapping):
+        sections |= {f"bearing_range.{name}": {"range_sigma": sigma} for name, sigma in robot.landmarks.items()}
+    elif robot.landmarks is not None:
         sections["bearing_range"] = {"range_sigma": robot.landmarks}
-        remarks.append("bearing_range: the sensor is taken to be at the robot's centre, looking forward")
+    if robot.position is not None:
+        sections["position"] = {"sigma": robot.position}
+    remarks += [
+        f"{name}: the sensor is assumed at the robot's centre: measure its x and y, and set them"
+        for name in sections
+        if kind_of(name) in ("bearing_range", "position")
+    ]
     if robot.antennas:
         sections["rfid"] = {"antennas": _antennas(robot.antennas), **READS}
         remarks.append(
@@ -134,8 +147,17 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
             "camera: lens and mounting are guesses, 60 degrees wide, looking forward; calibrate the lens with OpenCV"
         )
     if not sections:
-        raise InputError("the new rig has no sensors, expected odometry, landmarks, antennas or a camera")
-    return parse_model(Rig, {"name": name, "sensors": list(sections), **sections}, "the new rig"), remarks
+        raise InputError("the new rig has no sensors, expected odometry, landmarks, positions, antennas or a camera")
+    return parse_model(Rig, {"name": name, "sensors": list(sections), **_nested(sections)}, "the new rig"), remarks
+
+
+def _nested(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """The sections of a rig as its file has them: ``{"a": {"b": ...}}`` instead of ``{"a.b": ...}``."""
+    out: dict[str, Any] = {}
+    for key, section in sections.items():
+        kind, _, name = key.partition(".")
+        out |= {kind: {**out.get(kind, {}), name: section} if name else section}
+    return out
 
 
 def _antennas(names: Sequence[str]) -> dict[str, dict[str, float]]:
