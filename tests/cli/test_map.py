@@ -77,7 +77,10 @@ def test_a_map_is_extended(fgloc, on_disk, tmp_path):
         (["-o", "OUT/a.world.toml", "-e", "particle_filter"], "expected one that estimates landmarks"),
         (["-o", "OUT/a.world.toml", "--set", "batch.landmarks=known"], "--set is batch.landmarks"),
         (["-o", "OUT/there.world.toml"], "exists already"),
-        (["-o", "OUT/a.world.toml", "-e", "ekf"], "no sighting has a bearing, and ekf needs both to locate a landmark"),
+        (
+            ["-o", "OUT/a.world.toml", "-e", "ekf"],
+            "no sighting has a bearing, and ekf needs range and bearing to locate a landmark",
+        ),
     ],
 )
 def test_what_cannot_be_mapped_is_one_line(refused, short_log, tmp_path, options, message):

@@ -154,5 +154,7 @@ def test_biases_and_scale_of_ranges_are_learnt(name, landmarks, ranges):
 
 
 def test_the_ekf_needs_both(ranges):
-    with pytest.raises(InputError, match="no sighting has a bearing, and ekf needs both to locate a landmark"):
+    with pytest.raises(
+        InputError, match="no sighting has a bearing, and ekf needs range and bearing to locate a landmark"
+    ):
         run(ranges, replace(UNKNOWN, estimator="ekf"))

@@ -1,4 +1,4 @@
-"""Ranges and bearings of identified landmarks."""
+"""Measures ranges and bearings of identified landmarks."""
 
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType

@@ -1,4 +1,4 @@
-"""Calibration of constants and noise of a landmark sensor, from sightings along trajectories."""
+"""Calibration of a landmark sensor: its constants and its noise are estimated from sightings along reference trajectories."""
 
 from __future__ import annotations
 
@@ -30,22 +30,27 @@ from factors import se2
 from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
-MAX_OFFSET = 0.5  # s between the clocks of the sensor and the reference
-GROSS = 4.0  # least standard deviation of gross errors, in those of the others
+MAX_OFFSET = 0.5  # s; largest offset between the clocks of the sensor and the reference
+GROSS = 4.0  # minimum ratio of the standard deviations of gross and of normal errors
 SEPARATIONS = 20  # steps of expectation-maximisation
-SMALLEST = 1e-3  # m, rad, m per m; standard deviation
+SMALLEST = 1e-3  # m, rad, m per m; minimum standard deviation
 MIN_SIGHTINGS = 100
 MOST_SIGHTINGS = 12000  # per log
-BETTER_KIND = 0.9  # ratio of the scatters below which ranges are of the other kind, distance or depth
+# ranges are of the other kind (distance or depth) if the ratio of its errors to those of the given kind is below this
+BETTER_KIND = 0.9
 SIGMAS = ("range_sigma", "range_sigma_relative", "bearing_sigma")
-WINDOW = 10.0  # s; errors of the sightings in different windows are independent
-FIRST = BearingRangeSettings(range_sigma=0.1)  # settings of an unknown sensor
+WINDOW = 10.0  # s; errors of the sightings in different windows are treated as independent
+FIRST = BearingRangeSettings(range_sigma=0.1)  # initial settings if the rig has none
 
 
 @dataclass(frozen=True)
 class Sightings:
-    """K sightings of landmarks of the map: timestamps ``t`` (K,) by the sensor's clock, ``points`` (K, 2) or (K, 3), ``ranges`` and
-    ``bearings`` (K,). ``sound`` (K, 2): probability of range and bearing not to be gross errors."""
+    """K sightings of mapped landmarks in one log.
+
+    ``t`` (K,): timestamps [s] by the sensor's clock. ``points`` (K, 2): positions of the landmarks [m] in the world frame, or
+    (K, 3) with heights above the sensor. ``ranges`` (K,) [m] and ``bearings`` (K,) [rad]: NaN if not measured.
+    ``sound`` (K, 2): the probabilities that range and bearing are not gross errors.
+    """
 
     log: Log
     t: Array
@@ -55,8 +60,9 @@ class Sightings:
     sound: Array
 
     def whitened(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Range and bearing residuals (K, 2), predicted minus measured, in standard deviations; zero if not measured. ``moved``
-        (3,): a body-frame perturbation of the poses."""
+        """Return range and bearing residuals (K, 2), predicted minus measured, in standard deviations. They are zero if not
+        measured.
+        ``moved`` (3,): a body-frame perturbation (x, y, heading) that is applied to all reference poses."""
         assert self.log.reference is not None
         poses = self.log.reference.at(self.t + settings.time_offset)
         if np.any(moved):
@@ -64,11 +70,11 @@ class Sightings:
         return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
 
     def residuals(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Residuals in standard deviations, weighted by the probability not to be gross."""
+        """Return :meth:`whitened` residuals (K, 2), multiplied by the root of the probability ``sound``."""
         return np.sqrt(self.sound) * self.whitened(settings, moved)
 
     def errors(self, settings: BearingRangeSettings) -> Array:
-        """The residuals in m and rad, NaN if not measured."""
+        """Return range and bearing residuals (K, 2) in m and rad, predicted minus measured. They are NaN if not measured."""
         out = self.whitened(settings) * bearing_range.sigmas(settings.model(), self.ranges)
         out[np.isnan(self.ranges), 0] = np.nan
         out[np.isnan(self.bearings), 1] = np.nan
@@ -76,11 +82,13 @@ class Sightings:
 
 
 def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]:
-    """Standard deviation of errors (K,), constant and relative to ``ranges`` (K,), and the probability (K,) of each not to be
-    gross; NaN is not measured.
+    """Estimate the noise of ``errors`` (K,) that include gross errors. NaN marks an error that is not measured.
 
-    A mixture of two Gaussians about zero, by expectation-maximisation from the median absolute error (McLachlan and Peel,
-    "Finite mixture models", 2000, section 3.2). The wider one has the gross errors.
+    Returns the constant and the relative part of the standard deviation, and the probability (K,) that each error is not gross.
+    The standard deviation at range r is the root of constant^2 + (relative r)^2. ``ranges`` (K,): measured ranges [m].
+
+    A mixture of two zero-mean Gaussians is fitted by expectation-maximisation, which starts from the median absolute error
+    (McLachlan and Peel, "Finite mixture models", 2000, section 3.2). The wider Gaussian models the gross errors.
     """
     known = np.isfinite(errors)
     error, distance = errors[known], ranges[known]
@@ -102,8 +110,11 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
 
 
 def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
-    """Standard deviation of weighted errors: constant and relative part, by a step of scoring (Nelder and Pregibon, "An extended
-    quasi-likelihood function", Biometrika 74(2), 1987)."""
+    """Return the constant and the relative part of the standard deviation of ``errors`` (K,) with ``weights`` (K,).
+
+    One step of Fisher scoring from ``start``, the previous two parts (Nelder and Pregibon, "An extended quasi-likelihood
+    function", Biometrika 74(2), 1987).
+    """
     design = np.column_stack((np.ones(len(errors)), ranges**2))
     root = np.sqrt(weights) / (design @ np.square(start))
     constant, relative = np.sqrt(nnls(design * root[:, None], errors**2 * root)[0])
@@ -111,13 +122,14 @@ def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, f
 
 
 class LandmarkCalibrator(ConstantsCalibrator):
-    """The calibrator of a landmark sensor."""
+    """Estimates the constants and the noise of a landmark sensor."""
 
     section, channel = "bearing_range", "bearing_range"
     first, rounds = FIRST, 4
 
     def part(self, log: Log) -> Sightings:
-        """The sightings of mapped landmarks, with a margin for clock offsets; InputError if there are too few."""
+        """Return the sightings of mapped landmarks at least ``MAX_OFFSET`` inside the time span of the reference. Of many,
+        every n-th timestamp is used. Raises InputError if there are fewer than ``MIN_SIGHTINGS``."""
         stream, reference = log.streams["bearing_range"], log.reference
         assert isinstance(stream, BearingRangeStream)
         assert reference is not None
@@ -138,7 +150,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return Sightings(log, stream.t[rows], points, stream.range[rows], bearings[rows], np.ones((len(rows), 2)))
 
     def parameters(self, parts: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
-        """The constants, with priors about the rig's values; only the range scale without reference headings."""
+        """Return the constants to estimate, each with a prior around the rig's value. Without reference headings the mounting
+        and the time offset are not estimated."""
         has_range = any(np.isfinite(part.ranges).any() for part in parts)
         has_bearing = any(np.isfinite(part.bearings).any() for part in parts)
         has_heading = all(part.log.reference is not None and part.log.reference.has_heading for part in parts)
@@ -155,7 +168,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings]:
-        """The sightings with their probabilities not to be gross, and the settings with the scatter of the others as noise."""
+        """Return the sightings with new probabilities ``sound``, and the settings with the noise of the errors that are not
+        gross."""
         errors = np.concatenate([part.errors(settings) for part in parts])
         ranges = np.nan_to_num(np.concatenate([part.ranges for part in parts]))
         sigmas, sound = dict[str, float](), np.ones(errors.shape)
@@ -171,7 +185,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def estimated(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings, Posterior | None]:
-        """The data and settings of the kind of ranges, distance or depth, that has the smaller scatter."""
+        """Return sightings, settings and posterior of the best fit. Ranges are fitted as distances and as depths. The other
+        kind replaces the given one only if its range errors are clearly smaller (``BETTER_KIND``)."""
         given = super().estimated(parts, settings)
         if not any(np.any(np.isfinite(part.ranges) & np.isfinite(part.bearings)) for part in parts):
             return given
@@ -181,7 +196,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return changed if new < BETTER_KIND * old else given
 
     def finished(self, parts: Sequence[Sightings], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """The result with the scatter widened for errors that are correlated."""
+        """Return the result with standard deviations that are enlarged, because errors within a time window are correlated."""
         scatter: BearingRangeSettings = rig.bearing_range
         factor = pose_share(parts, scatter) ** -0.5
         wider = {name: factor * getattr(scatter, name) for name in SIGMAS}
@@ -194,7 +209,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
 
 
 def _residuals(part: Sightings, settings: BearingRangeSettings) -> Residuals:
-    """The errors of ranges and bearings."""
+    """Return the errors of ranges and bearings of one log for the report."""
     sigmas = bearing_range.sigmas(settings.model(), part.ranges)
     units = {"range": "m", "bearing": "rad"}
     return Residuals(part.log.name, units, part.t, part.ranges, part.errors(settings), sigmas)
@@ -204,7 +219,8 @@ CALIBRATOR = LandmarkCalibrator()
 
 
 def pose_share(parts: Sequence[Sightings], settings: BearingRangeSettings) -> float:
-    """The share of independent information on the pose in the sightings: see :func:`independent_share`."""
+    """Return the fraction of the sightings' information on the pose that is left after correlated errors are accounted for. See
+    :func:`independent_share`."""
 
     def residuals(moved: Array) -> Array:
         return np.concatenate([part.residuals(settings, moved) for part in parts])

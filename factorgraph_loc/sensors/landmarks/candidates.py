@@ -1,10 +1,10 @@
-"""Positions of landmarks that are sighted by range alone or by bearing alone.
+"""Estimates the position of a new landmark whose sightings have a range alone or a bearing alone.
 
-No single sighting determines such a position. The sightings of a stretch of path do, up to ambiguities: after a straight path the
-mirror image explains ranges equally well. Candidate positions start around the robot. They are refined with the error of the path
-added to the noise, then with that error as an unknown, which is marginalised. A position is accepted once no other one explains
-the sightings nearly as well. Several hypotheses for one range-only landmark: Blanco, Fernandez-Madrigal, Gonzalez, "Efficient
-probabilistic range-only SLAM", IROS 2008.
+No single sighting determines such a position. The sightings along a driven path do, up to ambiguities: after a straight path
+the mirror image explains ranges equally well. Candidate positions start around the robot. They are first refined with the
+odometry error as additional noise, then with the odometry error as an unknown that is marginalised. A position is accepted when
+no other position explains the sightings nearly as well. Source of several hypotheses for one range-only landmark: Blanco,
+Fernandez-Madrigal, Gonzalez, "Efficient probabilistic range-only SLAM", IROS 2008.
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ from factors.motion import ChainState, propagate
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
-MOST = 1000  # sightings of a landmark that wait
-USED = 80  # largest number that a position is computed from, evenly spaced
-DRIFT = 0.2  # rad; standard deviation of the rotation since the oldest of them
-APART = 0.1  # m; a sighting from nearer to the one before it gives way to the next one
-FEWEST, GROWTH = 8, 1.25  # number of sightings at the first attempt, and growth of that number until the next one
-DIRECTIONS = 24  # start positions around the robot
-RADII = (1.0, 3.0, 10.0, 30.0)  # m, if there is no range
-ITERATIONS, REFINEMENTS = 20, 8
+MOST = 1000  # stored sightings of a landmark
+USED = 80  # largest number of sightings that a position is computed from, evenly spaced
+DRIFT = 0.2  # rad; older sightings are not used if the standard deviation of the rotation since then exceeds this
+APART = 0.1  # m; the last sighting is replaced by the next one if the robot had moved less than this before it
+FEWEST, GROWTH = 8, 1.25  # number of sightings at the first attempt, and its factor from one attempt to the next
+DIRECTIONS = 24  # number of initial positions on a circle around the robot
+RADII = (1.0, 3.0, 10.0, 30.0)  # m; radii of the initial positions if there is no range
+ITERATIONS, REFINEMENTS = 20, 8  # largest numbers of iterations, with independent and with correlated odometry errors
 CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m
-FLAT = 1e-4 * np.eye(2)  # information of the flat prior [1/m^2]
-NEAR, MOST_FUSED = 0.5, 8  # m; distance of different positions, and largest number of these
-MARGIN = 12.0  # least excess loss of every other position; more if the median of squared residuals is above TYPICAL
-TYPICAL = 0.455  # median of a squared residual
-MISFIT = 2.0  # loss per sighting above which no position explains them
-ACCURATE, SHARE = 0.3, 0.15  # standard deviation of an accurate position: m, or share of its distance
+FLAT = 1e-4 * np.eye(2)  # information of the nearly flat prior [1/m^2]
+NEAR, MOST_FUSED = 0.5, 8  # m; minimum distance between distinct positions; largest number of distinct positions
+MARGIN = 12.0  # minimum excess of the losses of other positions; more if the median squared residual is above TYPICAL
+TYPICAL = 0.455  # median of the square of a standard normal residual
+MISFIT = 2.0  # if the mean loss of a sighting is above this, the best position is rejected
+ACCURATE, SHARE = 0.3, 0.15  # largest accepted standard deviation: m, or fraction of the distance if larger
 
 
 class PartialSighting(NamedTuple):
-    """A range or a bearing, NaN if not measured, at ``odometry``."""
+    """A sighting with a range [m] or a bearing [rad]; the missing value is NaN. ``odometry``: the odometry state at its
+    time."""
 
     odometry: ChainState
     range: float
@@ -50,8 +51,11 @@ class PartialSighting(NamedTuple):
 
 
 class LocatedPoint(NamedTuple):
-    """A position (2,) in the frame of the robot, its covariance (2, 2), the loss of the sightings there, and the median of their
-    squared residuals."""
+    """An estimated position of a landmark.
+
+    ``point`` (2,) [m] with ``covariance`` (2, 2): in the frame of the robot at the last sighting. ``loss``: the negative
+    log-likelihood of the sightings at that point. ``squared``: the median of their squared residuals.
+    """
 
     point: Array
     covariance: Array
@@ -61,17 +65,18 @@ class LocatedPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Candidate:
-    """Waiting sightings of one landmark, in order of time, and the number of them at the next attempt to locate it.
+    """The sightings of a landmark whose position is not known yet.
 
-    Immutable, because filters go back to an earlier state when a measurement is late. ``sources``: of each sighting, what becomes a
-    factor once the landmark is located."""
+    Immutable, because filters go back to an earlier state when a measurement is late. ``sightings``: in order of time.
+    ``sources``: for each sighting, an object of the caller, which makes a factor of it once the landmark is located.
+    ``due``: the number of sightings at which the next attempt to locate the landmark is made."""
 
     sightings: tuple[PartialSighting, ...] = ()
     sources: tuple[object, ...] = ()
     due: float = FEWEST
 
     def plus(self, sighting: PartialSighting, source: object) -> Candidate:
-        """The candidate with one more sighting."""
+        """Return a candidate with one more sighting. It replaces the last one if the robot had hardly moved before that."""
         end = len(self.sightings)
         if end > 1:
             previous, last = (np.array(s.odometry[1:3]) for s in self.sightings[-2:])
@@ -81,33 +86,37 @@ class Candidate:
 
     @property
     def is_due(self) -> bool:
-        """Whether the next attempt is due."""
+        """True if there are enough sightings for the next attempt to locate the landmark."""
         return len(self.sightings) >= self.due
 
     def tried(self) -> Candidate:
-        """The candidate after an attempt."""
+        """Return the candidate after a failed attempt, whose next attempt requires more sightings."""
         return replace(self, due=min(GROWTH * len(self.sightings), MOST))
 
     def position(
         self, model: BearingRangeModel, motion: Motion, constants: Array, uncertainty: Array
     ) -> LocatedPoint | None:
-        """The only position that explains the sightings, in the frame of the robot at the last one; None if there is none, or if
-        there are several. ``constants`` (P,) of the odometry with covariance ``uncertainty`` (P, P)."""
-        stretch = _Stretch(model, self.sightings, motion, constants, uncertainty)
-        if stretch.count < FEWEST:
+        """Return the position that explains the sightings. Returns None if no position explains them, or if several do.
+
+        ``constants`` (P,) with covariance ``uncertainty`` (P, P): estimated calibration constants of the odometry.
+        """
+        path = _PathSightings(model, self.sightings, motion, constants, uncertainty)
+        if path.count < FEWEST:
             return None
-        best, *alternatives = stretch.positions()
+        best, *alternatives = path.positions()
         allowed = best.loss + MARGIN * max(1.0, best.squared / TYPICAL)
         accuracy = max(ACCURATE, SHARE * float(np.hypot(*best.point)))
         if any(p.loss < allowed and np.hypot(*(p.point - best.point)) > accuracy for p in alternatives):
             return None
-        explains = best.loss < MISFIT * stretch.count
+        explains = best.loss < MISFIT * path.count
         return best if explains and positive.worst_sigma(best.covariance) <= accuracy else None
 
 
-class _Stretch:
-    """K sightings of one landmark along a path, which is known from odometry. All positions are in the frame of the robot at the
-    last sighting."""
+class _PathSightings:
+    """K sightings of one landmark along a path that is known from odometry.
+
+    All positions and poses are in the frame of the robot at the last sighting.
+    """
 
     def __init__(
         self,
@@ -134,16 +143,15 @@ class _Stretch:
         self._ranges, self._bearings = np.array([row.range for row in used]), np.array([row.bearing for row in used])
         self._is_measured = ~np.isnan(np.column_stack((self._ranges, self._bearings)))
         self._back = se2.inverse(np.array(forth)[back])  # poses at the sightings
-        self._carried = se2.adjoint(
-            np.array(forth)[back]
-        )  # from an error of the path to one of the pose at the sighting
-        # errors of two poses have those of the path since the later one in common
+        # matrices (K, 3, 3) from an error of the path to the error of the pose at a sighting
+        self._carried = se2.adjoint(np.array(forth)[back])
+        # covariance (K, K, 3, 3) of the path errors: those of two poses share the error of the path since the later pose
         self._common = np.array(covariances)[np.minimum(back[:, None], back)]
         turns = np.array(by_constants)[back]
         self._common += np.einsum("iap,pq,jbq->ijab", turns, uncertainty, turns)
 
     def positions(self) -> list[LocatedPoint]:
-        """The distinct positions that explain the sightings best, best first."""
+        """Return distinct positions of the landmark by increasing loss, and the mirror image of the best initial one."""
         starts = self._starts()
         points = self._refined(starts)
         points = points[np.argsort(self._losses(points))]
@@ -151,7 +159,8 @@ class _Stretch:
         return sorted((self._fused(point) for point in (*distinct, self._mirrored(points[0]))), key=_loss)
 
     def _starts(self) -> Array:
-        """Positions (N, 2) around the robot, at the last range if there is one."""
+        """Return initial positions (N, 2) on circles around the robot. Their radius is the last range, or RADII without
+        ranges."""
         known = self._ranges[self._is_measured[:, 0]] / self._model.range_scale
         angles = np.arange(DIRECTIONS) * 2.0 * np.pi / DIRECTIONS
         circle = np.column_stack((np.cos(angles), np.sin(angles)))
@@ -159,15 +168,16 @@ class _Stretch:
         return np.concatenate([radius * circle for radius in radii])
 
     def _mirrored(self, point: Array) -> Array:
-        """The mirror image (2,) of a position at the line that is nearest to the path."""
+        """Return the mirror image (2,) of a position at the line that is fitted to the path."""
         middle = self._back[:, :2].mean(axis=0)
         ahead = np.linalg.svd(self._back[:, :2] - middle)[2][0]
         away = point - middle
         return np.asarray(middle + 2.0 * (away @ ahead) * ahead - away)
 
     def _linearized(self, points: Array, path: Array | None = None) -> tuple[Array, Array]:
-        """Whitened residuals (N, K, 2) of positions (N, 2), and their Jacobians (N, K, 2, WIDTH). ``path`` (K, 3): poses at the
-        sightings, by default those of the odometry."""
+        """Return residuals (N, K, 2) at positions (N, 2), in standard deviations of the sensor, and their Jacobians
+        (N, K, 2, 11). The columns are those of :func:`linearize_each`. ``path`` (K, 3): the poses at the sightings, by default
+        from odometry."""
         count, size = self.count, len(points)
         sightings = np.repeat(points, count, axis=0), np.tile(self._ranges, size), np.tile(self._bearings, size)
         poses = np.tile(self._back if path is None else path, (size, 1))
@@ -175,7 +185,8 @@ class _Stretch:
         return error.reshape(size, count, 2), jacobian.reshape(size, count, 2, -1)
 
     def _widened(self, points: Array) -> tuple[Array, Array]:
-        """Residuals (N, K, 2) and Jacobians (N, K, 2, 2) by the position, in standard deviations of sensor and path."""
+        """Return residuals (N, K, 2) at positions (N, 2), and their Jacobians (N, K, 2, 2) by the position. Both are divided by
+        the standard deviation that results from sensor noise and odometry error."""
         error, jacobian = self._linearized(points)
         by_path = jacobian[..., :POINT] @ self._carried
         numbers = np.arange(self.count)
@@ -188,7 +199,7 @@ class _Stretch:
         return np.asarray(geman_mcclure_loss(squared, self._model.robust).sum(axis=1))
 
     def _refined(self, starts: Array) -> Array:
-        """Positions (N, 2) after Levenberg-Marquardt, with the errors of the path as independent noise."""
+        """Return positions (N, 2) refined by Levenberg-Marquardt. The odometry errors are treated as independent noise."""
 
         def at(points: Array, _: Integers) -> tuple[Array, Array, Array]:
             error, jacobian = self._widened(points)
@@ -201,9 +212,12 @@ class _Stretch:
         return minima(at, starts, ITERATIONS, CONVERGED, largest=LONGEST_STEP).states
 
     def _fused(self, point: Array) -> LocatedPoint:
-        """A position with the path marginalised. Whitened residuals e have the covariance R = 1 + J C J'. C is the covariance of
-        the path, and J is the Jacobian by it. On the most likely path the residuals are R^-1 e, and the path has changed by
-        -C J' R^-1 e. Residuals are linearised there."""
+        """Refine a position (2,) with the path as an unknown that is marginalised.
+
+        Residuals e in standard deviations of the sensor have the covariance R = I + J C J'. C is the covariance of the path,
+        and J is the Jacobian of e by the path. The most likely path has residuals R^-1 e, and differs from the odometry by
+        -C J' R^-1 e. Residuals are linearised on that path.
+        """
         measured, weight, change = self._is_measured, np.ones(self.count), np.zeros((self.count, 3))
         row_of = np.nonzero(measured)[0]
         common, robust = self._common[row_of[:, None], row_of], self._model.robust
@@ -235,7 +249,7 @@ def _loss(position: LocatedPoint) -> float:
 
 
 def _distinct(points: Array) -> list[Array]:
-    """Those of positions (N, 2) that are not near an earlier one."""
+    """Return the rows of ``points`` (N, 2) without those within NEAR of an earlier kept row."""
     kept: list[Array] = []
     for point in points:
         if all(np.hypot(*(point - earlier)) > NEAR for earlier in kept):

@@ -1,11 +1,15 @@
 """Localization from identified landmarks alone, at an unknown start or after a kidnapping; and detection of a lost track.
 
-The sightings of the last minute are related to the present pose by odometry. Candidate poses are generated from few of them (one
-landmark: a circle around it; two: the alignment of two points) and scored against all sightings by the robust likelihood; the
-best are refined by Gauss-Newton, and those that remain distinct are hypotheses. Their weights are posterior probabilities by
-Laplace's method (MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6): likelihood times the volume
-of the mode, under a flat prior or, if the start position is known, under that. Generating hypotheses from few features and
-testing them with the others: Jensfelt, Kristensen, IEEE Transactions on Robotics and Automation 17(5), 2001."""
+The odometry relates the sightings of the last minute to the present pose. Candidate poses are generated from few sightings: one
+landmark gives a circle around it, two landmarks give the alignment of two points. All sightings score each candidate by the
+robust likelihood. The best candidates are refined by Levenberg-Marquardt. Those that remain distinct are the hypotheses of the
+pose.
+
+The weight of a hypothesis is its posterior probability by Laplace's method: the likelihood times the volume of the mode
+(MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6). The prior is flat, or that of a known start
+position. Source of the generation of hypotheses from few features and their test by the rest: Jensfelt, Kristensen, IEEE
+Transactions on Robotics and Automation 17(5), 2001.
+"""
 
 from __future__ import annotations
 
@@ -32,35 +36,37 @@ from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
 from factors.update import GATE
 
-DURATION = 60.0  # s of sightings that are used
-INTERVAL = 1.0  # s; closer sightings of a landmark have nearly equal errors and count once
-ROWS = 60  # newest sightings that are used
-REFINED = 24  # number of refined candidates
-# squared Mahalanobis distances: between equal hypotheses, and between one and the joint solution of its sightings
+DURATION = 60.0  # s; older sightings are not used
+INTERVAL = 1.0  # s; sightings of one landmark that are closer have nearly equal errors, so only one is used
+ROWS = 60  # largest number of sightings in a search
+REFINED = 24  # number of candidates that are refined
+# squared Mahalanobis distances: hypotheses below SAME are equal; one whose refined pose is beyond DIVERGED is rejected
 SAME, DIVERGED = 9.0, 25.0
-NEGLIGIBLE = 1e-3  # weight of a hypothesis
-MARGIN = 5.0  # m; distance from the landmarks of the map at which the robot may be
-WIDE = 3.0  # m; standard deviation above which a hypothesis is not treated as Gaussian
-# to refute a track a hypothesis must explain: that many landmarks, that share of the sightings, and so many more of them
+NEGLIGIBLE = 1e-3  # hypotheses with a smaller weight are discarded
+MARGIN = 5.0  # m; largest assumed distance of the robot from the bounding box of the map's landmarks
+WIDE = 3.0  # m; a hypothesis with a larger standard deviation is not treated as Gaussian
+# a hypothesis refutes the track if it explains this many landmarks and this fraction of the sightings,
+# and if its robust loss is smaller by REFUTED times the largest possible loss
 REFUTING_LANDMARKS, REFUTING_SHARE, REFUTED = 3, 0.8, 0.5
 
-CLEAR_WEIGHT = 0.99
-# largest standard deviations of an unambiguous hypothesis: m (or that of a range, if larger), rad
+# an unambiguous hypothesis has at least this weight, explains this many sightings, and has no larger standard deviations than
+# CLEAR_POSITION [m] (or that of a range, if larger) and CLEAR_HEADING [rad]
+CLEAR_WEIGHT, CLEAR_SIGHTINGS = 0.99, 4
 CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
-CLEAR_SIGHTINGS = 4
-FOUND_HEADING = 0.3  # rad; for a known start position, where only the heading can be confused
-STAMPS, MONITORED = 4, 2.0  # minimum number of timestamps, and their duration in s
-KEPT = 100  # timestamps
-BEYOND = 2.0  # times the gate
-SHARE = 0.6  # of the landmarks
+FOUND_HEADING = 0.3  # rad; replaces CLEAR_HEADING if the start position is known
+STAMPS, MONITORED = 4, 2.0  # a track is judged by at least this many timestamps, over at least this time [s]
+KEPT = 100  # number of stored timestamps
+BEYOND = 2.0  # a landmark contradicts the track if its squared innovation exceeds this multiple of the gate
+SHARE = 0.6  # the track is suspicious if more than this fraction of the landmarks contradicts it
 SEARCH_INTERVAL = 1.0  # s between searches while the track is suspicious
 
 
 @dataclass(frozen=True)
 class Hypothesis(Mode):
-    """A mode whose weight is its posterior probability.
+    """A possible pose of the robot, as a Gaussian. Its ``weight`` is its posterior probability.
 
-    ``explained``: number of sightings within the gate; ``share``: relative to all; ``landmarks``: number of different landmarks.
+    ``explained``: number of sightings whose residuals at the pose are within the gate. ``share``: their fraction of all
+    sightings. ``landmarks``: number of different landmarks in these sightings.
     """
 
     explained: int
@@ -69,11 +75,13 @@ class Hypothesis(Mode):
 
 
 class LandmarkFinder:
-    """A :class:`~factorgraph_loc.sensors.base.Finder`; see the module.
+    """Finds the pose by landmarks of the map, without a prediction. It implements
+    :class:`~factorgraph_loc.sensors.base.Finder`.
 
-    ``factor``: the factor of the map's landmarks in a measurement, on the pose at its time. ``positions`` (L, 2): of the landmarks.
-    ``hypotheses``: of the last search, most likely first; ``best``: the pose at the last sighting if one hypothesis is
-    unambiguous, else None.
+    ``factor``: a function that returns the factor of a measurement's mapped landmarks, or None without any.
+    ``positions`` (L, 2): positions of the map's landmarks.
+    ``hypotheses``: the results of the last search, most likely first.
+    ``best``: the pose at the last sighting if one hypothesis is unambiguous, otherwise None.
     """
 
     at_once = False
@@ -95,7 +103,7 @@ class LandmarkFinder:
 
     @property
     def suspicious_since(self) -> float | None:
-        """The time since which most landmarks are not where they are predicted."""
+        """The time [s] since which most landmarks contradict the track, or None."""
         return self._monitor.suspicious_since
 
     def look(self, m: BearingRange, odometry: ChainState) -> bool:
@@ -125,7 +133,7 @@ class LandmarkFinder:
         self._monitor.clear()
 
     def add(self, odometry: ChainState, factor: BearingRangeFactor) -> None:
-        """Add landmarks seen at ``odometry``; late and repeated sightings are accepted."""
+        """Store the sightings of a factor, made at the odometry state ``odometry``. They may be late or repeated."""
         self._model = factor.model
         points, ranges = factor.points[:, :HEIGHT], on_floor(factor.model, factor.points, factor.ranges)
         places, values = points.tolist(), zip(ranges.tolist(), factor.bearings.tolist(), strict=True)
@@ -134,7 +142,7 @@ class LandmarkFinder:
         self.forget(odometry.t - DURATION)
 
     def forget(self, oldest: float) -> None:
-        """Drop the sightings older than ``oldest`` [s]."""
+        """Delete the sightings before the time ``oldest`` [s]."""
         old = [(key, rows) for key, rows in self._sightings.items() if rows[0].odometry.t < oldest]
         for key, rows in old:
             del rows[: bisect.bisect_left(rows, oldest, key=_time)]
@@ -142,7 +150,7 @@ class LandmarkFinder:
                 del self._sightings[key]
 
     def search(self) -> None:
-        """Find the hypotheses at the time of the last sighting."""
+        """Compute ``hypotheses`` and ``best`` at the time of the last sighting."""
         rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
         earlier, previous = self.hypotheses, self._window
         self.hypotheses, self.best, self._window = (), None, None
@@ -167,8 +175,11 @@ class LandmarkFinder:
         self.best = self._clear(window)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last sighting, sampled from the hypotheses; those too wide to be Gaussian are replaced by samples
-        from the likelihood of that sighting (sensor resetting: Lenser, Veloso, ICRA 2000). None before the first search."""
+        """Return ``count`` poses (N, 3) at the last sighting, sampled from the hypotheses. Returns (0, 3) if nothing was found.
+
+        Hypotheses that are too wide to be Gaussian are replaced by samples from the likelihood of the last sighting (sensor
+        resetting: Lenser, Veloso, ICRA 2000).
+        """
         if self._window is None:
             return np.empty((0, 3))
         narrow = [h for h in self.hypotheses if np.linalg.eigvalsh(h.covariance[:2, :2])[-1] < WIDE**2]
@@ -181,9 +192,12 @@ class LandmarkFinder:
         return np.concatenate(poses)
 
     def refutes(self, pose: Array, covariance: Array) -> bool:
-        """Whether a track's ``pose`` (3,) at the last sighting, with body-frame ``covariance`` (3, 3), must be wrong: an
-        unambiguous hypothesis explains nearly all sightings, and far more than the track. Wrongly mapped landmarks may also
-        agree on a pose, but the others contradict it."""
+        """True if the track must be wrong: an unambiguous hypothesis explains nearly all sightings, and far more than the track
+        does.
+
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the last sighting. A hypothesis that is based on
+        wrongly mapped landmarks does not count, because correctly mapped landmarks contradict it.
+        """
         if self.best is None or self._window is None:
             return False
         if self.hypotheses[0].share < REFUTING_SHARE or self.hypotheses[0].landmarks < REFUTING_LANDMARKS:
@@ -194,7 +208,8 @@ class LandmarkFinder:
         return bool(track - best > REFUTED * 0.5 * scale**2 * len(window.points))
 
     def _log_prior(self, window: SightingWindow, poses: Array, covariances: Array) -> Array:
-        """Log prior probability (N,) of modes with body-frame covariances (N, 3, 3)."""
+        """Return the log prior probability (N,) of the regions around ``poses`` (N, 3) with body-frame covariances
+        (N, 3, 3)."""
         volume: Array = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1]
         density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
         return np.asarray(np.minimum(volume + density, 0.0))
@@ -202,7 +217,11 @@ class LandmarkFinder:
     def _weighed(
         self, window: SightingWindow, poses: Array, covariances: Array, squared: Array, logs: Array
     ) -> tuple[Hypothesis, ...]:
-        """Distinct hypotheses with posterior probabilities; the alternative is a pose outside that explains nothing."""
+        """Return the distinct hypotheses with their posterior probabilities, most likely first.
+
+        ``poses`` (N, 3) with body-frame ``covariances`` (N, 3, 3). ``squared`` (N, K): squared residuals of the K sightings.
+        ``logs`` (N,): log probabilities, not normalised. The normalisation includes a pose elsewhere that explains no sighting.
+        """
         covariances = se2.body_to_world(poses, covariances)
         kept: list[int] = []
         for i in np.argsort(-logs):
@@ -226,13 +245,14 @@ class LandmarkFinder:
         )
 
     def _clear(self, window: SightingWindow) -> PosePrior | None:
-        """The most likely hypothesis if it is unambiguous, with the moments of the joint solution of its sightings."""
+        """Return the most likely hypothesis if it is unambiguous, otherwise None. The pose and covariance are refined with
+        correlated odometry errors."""
         if not self.hypotheses:
             return None
         best = self.hypotheses[0]
         if best.weight < CLEAR_WEIGHT or best.share <= 0.5:
             return None
-        # a single landmark may be misidentified, unless the start agrees
+        # a single landmark may be misidentified, so one is enough only if it agrees with the known start
         if best.explained < CLEAR_SIGHTINGS or best.landmarks < (2 if self.start is None else 1):
             return None
         pose, covariance = window.fused(best.pose, window.whitener(), iterations=8)
@@ -251,21 +271,21 @@ def _time(row: Sighting) -> float:
 
 
 def _insert(rows: list[Sighting], row: Sighting) -> None:
-    """Add a sighting to those of its landmark, which are in order of time, and thin them."""
+    """Insert ``row`` into the sightings ``rows`` of its landmark, and keep them in order of time and an interval apart."""
     if rows and row.odometry.t <= rows[-1].odometry.t:
         rows[:] = [r for r in rows if r.odometry.t != row.odometry.t]
         rows.append(row)
         rows.sort(key=_time)
         rows[:] = _thinned(rows)
         return
-    # all but the last are an interval apart
+    # all rows before the last are an interval apart
     if len(rows) > 1 and rows[-1].odometry.t < rows[-2].odometry.t + INTERVAL:
         rows.pop()
     rows.append(row)
 
 
 def _thinned(rows: list[Sighting]) -> list[Sighting]:
-    """Sightings of one landmark that are at least an interval apart, and the last one."""
+    """Return the sightings of one landmark that are at least INTERVAL apart, and the last one."""
     kept = rows[:1]
     for row in rows[1:]:
         if row.odometry.t >= kept[-1].odometry.t + INTERVAL:
@@ -274,7 +294,8 @@ def _thinned(rows: list[Sighting]) -> list[Sighting]:
 
 
 def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
-    """Indices of at most ``count`` poses (N, 3) by increasing loss (N,), without those near a better one."""
+    """Return indices of at most ``count`` of the poses (N, 3), by increasing loss (N,). A pose is left out if a better one
+    differs from it by less than ``apart`` (3,) in each component."""
     kept: list[int] = []
     losses = losses.copy()
     while len(kept) < count and np.isfinite(losses).any():
@@ -286,24 +307,25 @@ def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.
 
 
 def _distance(pose: Array, mean: Array, covariance: Array) -> float:
-    """Squared Mahalanobis distance between poses (3,) with covariance (3, 3) in the world frame."""
+    """Return the squared Mahalanobis distance between two poses (3,), with ``covariance`` (3, 3) in the world frame."""
     difference = pose - mean
     difference[2] = se2.wrap_scalar(difference[2])
     return float(positive.squared(difference, covariance))
 
 
 class TrackMonitor:
-    """Detects that most landmarks of the last timestamps are far outside the gate.
+    """Detects that most landmarks of the last timestamps contradict the track: their innovations are far outside the gate.
 
-    That is only a suspicion, because a wrong map has the same effect. A search decides whether there is a better pose.
+    This is only a suspicion, because a wrong map has the same effect. A search decides if there is a better pose.
     """
 
     def __init__(self) -> None:
         self._stamps: list[tuple[float, int, int]] = []
-        self.suspicious_since: float | None = None  # s, since which most landmarks are outside
+        self.suspicious_since: float | None = None  # s, or None if the track is not suspicious
 
     def add(self, t: float, factor: BearingRangeFactor, pose: Array, covariance: Array) -> None:
-        """Add the landmarks of a timestamp, with the predicted ``pose`` (3,) and its body-frame ``covariance`` (3, 3)."""
+        """Record how many landmarks of the timestamp ``t`` [s] contradict the predicted ``pose`` (3,) with its body-frame
+        ``covariance`` (3, 3)."""
         beyond = factor.count_beyond(BEYOND * GATE, pose, covariance)
         while self._stamps and self._stamps[-1][0] >= t:
             self._stamps.pop()
@@ -315,17 +337,19 @@ class TrackMonitor:
         self.suspicious_since = self._beginning() if lasts else None
 
     def clear(self) -> None:
-        """Forget the history: a new track starts."""
+        """Discard the history, because a new track starts."""
         self._stamps.clear()
         self.suspicious_since = None
 
     def _beginning(self) -> float:
-        """The change point: it maximises the number of landmarks outside after and inside before it."""
+        """Return the time [s] at which the contradiction begins. It maximises the number of contradicting landmarks after it
+        and of agreeing landmarks before it."""
         excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
         return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
 
     def _last(self) -> list[tuple[float, int, int]]:
-        """The fewest last timestamps that are sufficient, empty if there are too few."""
+        """Return the fewest last timestamps that suffice to judge the track, or [] if there are too few. Each item has the time
+        [s], the number of contradicting landmarks, and the number of all landmarks."""
         for i in range(len(self._stamps) - STAMPS, -1, -1):
             if self._stamps[i][0] <= self._stamps[-1][0] - MONITORED:
                 return self._stamps[i:]

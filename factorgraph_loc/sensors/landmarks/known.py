@@ -1,4 +1,4 @@
-"""Measurements of landmarks as factors, by what the map and the rig say about each landmark."""
+"""Turns measurements of landmarks into factors. The map and the rig determine the kind of factor of each landmark."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 NamedFactor = tuple[str, BearingRangeFactor]
-EXACT = 0.2  # landmarks whose survey has a sigma below this share of `range_sigma` are exact
+EXACT = 0.2  # a landmark is treated as exact if the sigma of its survey is below this fraction of `range_sigma`
 
 
 class KnownLandmarks:
-    """Turns measurements into factors. Landmarks that map or rig lack are counted as ignored.
+    """Turns measurements into factors, and counts sightings that cannot be used in ``diagnostics``.
 
-    ``use`` of the map: ``known`` uses its landmarks and ignores others, ``extended`` also estimates the others, ``unknown``
-    estimates all landmarks; only their heights are those of the map. ``estimated``: indices of the sensor's constants that
-    are estimated. ``carries``: whether the estimator estimates landmarks with an inexact survey; otherwise the survey's
-    covariance is added to the noise.
-    ``locates``: whether it estimates others that are sighted by range or bearing alone; ``biased``: whether ranges have a bias
-    for each landmark.
+    ``use``: how the map is used. ``known`` uses mapped landmarks and ignores others. ``extended`` uses mapped landmarks and
+    estimates others. ``unknown`` estimates all landmarks and uses only the heights of the map.
+    ``estimated``: indices of the sensor's constants that are estimated.
+    ``carries``: True if the estimator estimates mapped landmarks with an inexact survey. Otherwise the survey's covariance is
+    added to the noise.
+    ``locates``: True if the estimator can locate new landmarks from ranges alone or bearings alone.
+    ``biased``: True if the ranges of each landmark have an unknown bias.
     """
 
     def __init__(
@@ -46,9 +47,9 @@ class KnownLandmarks:
         landmarks = {} if use == "unknown" else world.landmarks
         places = dict(zip(world.landmarks, points_of(world.landmarks.values(), settings.z), strict=True))
         self._positions = {name: places[name] for name in landmarks}
-        # heights are known where positions are to be estimated
+        # a landmark whose position is estimated still has the height of the map
         self._heights = {name: np.concatenate((np.zeros(HEIGHT), place[HEIGHT:])) for name, place in places.items()}
-        # of a landmark that is not in the map; with a height of zero if landmarks of the map have one
+        # initial position of a landmark that the map lacks; it has a height (zero) if mapped landmarks have heights
         self._nowhere = np.zeros_like(next(iter(places.values()), np.zeros(HEIGHT)))
         limit = 2.0 * (EXACT * settings.range_sigma) ** 2
         surveys = {name: m.spread() for name, m in landmarks.items()}
@@ -59,17 +60,22 @@ class KnownLandmarks:
         self._diagnostics = diagnostics
 
     def factor(self, m: BearingRange) -> BearingRangeFactor | None:
-        """The factor of the landmarks that are not estimated, on the pose at the measurement's time; None without any."""
+        """Return one factor of all mapped landmarks that are not estimated. It depends on the pose at the measurement's time.
+        Returns None if the measurement has no such landmark."""
         return self.factors(m)[0]
 
     def factors(
         self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
     ) -> tuple[BearingRangeFactor | None, list[NamedFactor], list[NamedFactor], list[NamedFactor]]:
-        """:meth:`factor`, on the pose at the measurement's time or on one that lies ``offset`` before it. Further factors have the
-        names of their landmarks. They are of landmarks of the map whose ranges have a bias, of those with an inexact survey, and of
-        those without one. The last two depend on the position of the landmark, as the last value.
+        """Return the factors of a measurement, in four groups.
 
-        ``twist`` (3,): the robot's velocity at that time, needed if the sensor's time offset is estimated.
+        1. One factor of all mapped landmarks that are not estimated, or None without such landmarks.
+        2. Mapped landmarks whose ranges have a bias: one factor each, with the landmark's name.
+        3. Mapped landmarks with an inexact survey: one factor each, which also depends on the landmark's position.
+        4. Landmarks whose position is unknown: one factor each, which also depends on the landmark's position.
+
+        ``offset``: the motion from the pose that the factors depend on to the measurement, None if the times are equal.
+        ``twist`` (3,): the robot's velocity at the measurement. It is required if the sensor's time offset is estimated.
         """
         fixed, single, surveyed, unknown = self._usable(m)
         count = len(fixed) + len(single) + len(surveyed) + len(unknown)
@@ -110,8 +116,8 @@ class KnownLandmarks:
         return factor, *single_factors
 
     def _usable(self, m: BearingRange) -> tuple[list[int], list[int], list[int], list[int]]:
-        """Rows of landmarks of the map without and with a bias, of those with an inexact survey, and of other landmarks. Rows that
-        are not used are counted."""
+        """Return the row numbers of a measurement for each of the four groups of :meth:`factors`. Count rows that are not
+        used."""
         fixed, single, surveyed, unknown = list[int](), list[int](), list[int](), list[int]()
         lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
         for i, (name, no_range, no_bearing) in enumerate(lacks):
@@ -131,5 +137,5 @@ class KnownLandmarks:
         return fixed, single, surveyed, unknown
 
     def survey(self, name: str) -> tuple[Array, Array]:
-        """Position (2,) and covariance (2, 2) of a landmark in the map."""
+        """Return the position (2,) and covariance (2, 2) of a mapped landmark with an inexact survey."""
         return self._positions[name][:2], self._surveys[name]

@@ -1,4 +1,4 @@
-"""Measurements of identified landmarks, their stream, and its table."""
+"""Measurements of identified landmarks: their types, the columns of their files, and the settings of the sensor."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ BEARING_RANGE = Table(
     (
         STAMP,
         named("landmark", "the name of a landmark"),
-        # radios report 0 without an answer, and gross errors may be negative: these are missing values
+        # radios report 0 if they get no answer, and gross errors may be negative; both are treated as missing ranges
         number(
             "range",
             LENGTH,
@@ -52,9 +52,10 @@ BEARING_RANGE = Table(
 
 @dataclass(frozen=True, slots=True)
 class BearingRange:
-    """Identified landmarks seen at one time.
+    """A measurement of K identified landmarks at the time ``t`` [s].
 
-    ``landmarks``: K names. ``range`` (K,) [m] and ``bearing`` (K,) [rad, in the sensor frame]: NaN if not measured.
+    ``landmarks``: their names. ``range`` (K,) [m] and ``bearing`` (K,) [rad, in the sensor frame]: NaN if not measured.
+    ``source``: the name of the sensor.
     """
 
     sensor: ClassVar[str] = "bearing_range"
@@ -68,13 +69,16 @@ class BearingRange:
 
     @property
     def count(self) -> int:
-        """Number of landmarks seen."""
+        """The number of sighted landmarks."""
         return len(self.landmarks)
 
 
 @dataclass(frozen=True)
 class BearingRangeStream(ScanStream):
-    """Rows of landmarks: name, range [m] and bearing [rad], NaN if not measured. Rows of one timestamp form one measurement."""
+    """All sightings of a log, one landmark per row. Rows of one timestamp form one measurement.
+
+    ``landmark``: names. ``range`` [m] and ``bearing`` [rad]: NaN if not measured.
+    """
 
     kind: ClassVar[type[Any]] = BearingRange
     landmark: Sequence[str]
@@ -83,7 +87,7 @@ class BearingRangeStream(ScanStream):
 
 
 class BearingRangeUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
+    """Standard deviations of the sensor's constants before a run. A constant is estimated if its value is above 0."""
 
     x: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
     """standard deviation of the constant"""
@@ -92,9 +96,9 @@ class BearingRangeUncertainty(FileModel):
     bearing_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
     """standard deviation of the constant"""
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """standard deviation of the constant, relative"""
+    """relative standard deviation of the constant"""
     range_bias: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
-    """standard deviation of reported minus true ranges, a constant of each landmark, not with particles"""
+    """standard deviation of the range bias, which is constant for each landmark; the particle filter does not estimate it"""
     depth_axis: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
     """standard deviation of the constant"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
@@ -102,7 +106,7 @@ class BearingRangeUncertainty(FileModel):
 
 
 class BearingRangeSettings(SensorSettings):
-    """A sensor of identified landmarks. See :class:`factors.landmarks.model.BearingRangeModel` for the model."""
+    """Mounting, constants and noise of a landmark sensor. The model is :class:`factors.landmarks.model.BearingRangeModel`."""
 
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     x: Offset = 0.0
@@ -110,7 +114,7 @@ class BearingRangeSettings(SensorSettings):
     y: Offset = 0.0
     """position of the sensor on the robot, to the left"""
     z: Offset = 0.0
-    """height of the sensor, by which ranges to landmarks with another height are slant ranges"""
+    """height of the sensor; ranges to landmarks at another height are slant ranges"""
     heading: Angle = 0.0
     """direction of the sensor on the robot"""
     bearing_bias: Angle = 0.0
@@ -118,13 +122,13 @@ class BearingRangeSettings(SensorSettings):
     range_scale: Annotated[float, Field(ge=0.2, le=5.0)] = 1.0
     """reported divided by true range"""
     range_kind: Literal["distance", "depth"] = "distance"
-    """distance, or depth along one axis, as a camera measures it by the size of a marker"""
+    """meaning of a range: the distance, or the depth along one axis (a camera measures depth by the size of a marker)"""
     depth_axis: Angle = 0.0
-    """direction of that axis, in the sensor frame"""
+    """direction of the depth axis in the sensor frame"""
     range_sigma: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")]
-    """standard deviation of a range; that of a range r is the root of range_sigma^2 + (range_sigma_relative r)^2"""
+    """constant part of the standard deviation of a range r, which is the root of range_sigma^2 + (range_sigma_relative r)^2"""
     range_sigma_relative: Annotated[float, Field(ge=0.0, le=1.0), InUnit("m per m")] = 0.0
-    """part of it that grows with the range"""
+    """part of the standard deviation that grows with the range"""
     bearing_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.05
     """standard deviation of a bearing"""
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
@@ -147,20 +151,21 @@ class BearingRangeSettings(SensorSettings):
 
 
 class SightingSettings(FileModel):
-    """Visibility of landmarks, not through walls."""
+    """Rate and visibility of simulated landmark sightings. Walls hide landmarks."""
 
     rate: Hertz = 2.0
     """measurements per second"""
     max_range: Metres = 6.0
-    """largest distance of visible landmarks"""
+    """largest distance at which a landmark is visible"""
     field_of_view: Annotated[float, Field(ge=0.01, le=6.3), InUnit("rad")] = 6.3
-    """angle about the sensor's axis within which they are seen"""
+    """full angle of the field of view, centred on the sensor's axis"""
 
 
 class Landmark(FileModel):
-    """A point landmark: position [m] in the world frame, its height ``z``, and its uncertainty.
+    """A point landmark of the map, with position and height ``z`` [m] in the world frame.
 
-    ``sigma``: standard deviation of the survey in x and y [m]. ``covariance``: (xx, xy, yy) [m^2], instead of ``sigma``.
+    ``sigma``: standard deviation of the surveyed x and y [m]. ``covariance``: may be given instead of ``sigma``, as
+    (xx, xy, yy) [m^2].
     """
 
     x: Coordinate
@@ -170,12 +175,13 @@ class Landmark(FileModel):
     covariance: Covariance | None = None
 
     def spread(self) -> Array:
-        """The covariance (2, 2) of the position [m^2]."""
+        """Return the covariance (2, 2) of the surveyed position [m^2]."""
         return spread_of(self.sigma, self.covariance)
 
 
 def points_of(landmarks: Iterable[Landmark], z: float) -> Array:
-    """Positions (K, 2) of landmarks, or (K, 3) with their heights above a sensor at ``z`` [m] if any has another height."""
+    """Return positions (K, 2) of landmarks if all have the height ``z`` [m] of the sensor. Otherwise return positions (K, 3),
+    whose last column is the height above the sensor."""
     places = np.array([(mark.x, mark.y, mark.z - z) for mark in landmarks]).reshape(-1, 3)
     return places if places[:, 2].any() else np.ascontiguousarray(places[:, :2])
 
@@ -194,9 +200,13 @@ LANDMARKS = Table(
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """The landmarks of a world file: inline, or in a foreign table with a mapping to the fields landmark, x, y and optionally z,
-    and sigma, or sigma_x and sigma_y; the larger one is used. InputError names file, row and field of an invalid value, or of a
-    duplicate name."""
+    """Return the section ``landmarks`` of a world file. If its ``content`` refers to a table, read the landmarks from that
+    table.
+
+    A mapping in ``content`` assigns the table's columns to the fields landmark, x, y, and optionally z, and sigma or both
+    sigma_x and sigma_y. The larger of sigma_x and sigma_y is used. ``source``: the world file for messages. ``folder``: the
+    folder of the table. Raises InputError with file, row and field for an invalid value or a duplicate name.
+    """
     if not isinstance(content, dict) or not isinstance(content.get("file"), str):
         return content
     mapping = parse_model(ColumnMapping, content, f"{source} [landmarks]")

@@ -1,4 +1,4 @@
-"""The landmark sensor of a run."""
+"""The landmark sensor of a run: it turns measurements into observations, and initialises landmarks that the map lacks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NOT_LOCATED = "landmark not located yet"
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
-    """Merge the factors of one measurement on one pose."""
+    """Merge factors on the same pose into one factor of all their landmarks."""
     first, *rest = factors
     if not rest:
         return first
@@ -47,16 +47,19 @@ def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
     )
 
 
-SURVEYED_ITERATIONS = 4
-WORK = 8  # of a landmark, per pose, if a compiled call weighs many poses
-SMALL = 40  # size of error states whose matrices are inverted by compiled code
-MAX_PENDING = 5  # sightings per landmark that wait for another to agree
+SURVEYED_ITERATIONS = 4  # linearisations of an observation with inexactly surveyed landmarks
+WORK = 8  # cost of the likelihood of one landmark at one pose, relative to that of an RFID tag
+SMALL = 40  # largest error state whose matrices are inverted by compiled code
+MAX_PENDING = 5  # stored sightings of a new landmark until two of them agree
 
 
 @dataclass(frozen=True)
 class LandmarkObservation(ResidualObservation):
-    """Landmarks seen at one time: one term for those of the map, and one term for each other landmark. ``surveyed``: some have a
-    survey prior, which requires several linearisations if the first sighting is from afar."""
+    """The observation of one measurement. One term has all landmarks with a known position, each estimated landmark has its own
+    term.
+
+    ``surveyed``: True if the position of a landmark is estimated from a survey. Its correction requires several linearisations.
+    """
 
     surveyed: bool = False
 
@@ -70,7 +73,7 @@ class LandmarkObservation(ResidualObservation):
 
     @property
     def measured(self) -> BearingRangeFactor:
-        """All landmarks as one factor."""
+        """The factors of all terms, merged into one factor."""
         return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
 
     def correct(
@@ -92,7 +95,7 @@ class LandmarkObservation(ResidualObservation):
             if factor.estimated and term.blocks[0] in values:
                 parameters = np.zeros((len(poses), len(PARAMETERS)))
                 parameters[:, list(factor.estimated)] = values[term.blocks[0]]
-            if factor.free:  # an error of the landmark's position is equivalent to one of the robot's
+            if factor.free:  # a shift of the landmark has the same effect as the opposite shift of the robot
                 places = values[term.blocks[-1]]
                 factor, at = replace(factor, points=places[:1]), poses.copy()
                 at[:, :2] -= places - places[0]
@@ -104,7 +107,8 @@ class LandmarkObservation(ResidualObservation):
         return frozenset(map(tuple, self.measured.points.tolist()))
 
     def at_its_time(self) -> Self | None:
-        """The landmarks of the map, on the pose at the time of the measurement."""
+        """Return the observation on the pose at the time of the measurement. Returns None if it also depends on estimated
+        blocks."""
         if self.blocks:
             return None
         factor = self.measured
@@ -113,7 +117,9 @@ class LandmarkObservation(ResidualObservation):
         )
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """The observation on the pose only: constants are fixed, other landmarks have covariances ``spreads``."""
+        """Return the observation as a function of the pose only. Constants and landmarks are fixed at ``values``. The
+        covariances
+        ``spreads`` of landmarks and range biases are added to the noise."""
         if len(self.terms) == 1 and not self.terms[0].blocks:
             return self
         fixed = []
@@ -125,37 +131,46 @@ class LandmarkObservation(ResidualObservation):
             here = factor.fixed([values[name] for name in names], point, shorter)
             uncertain = np.zeros((2, 2)) if here.point_covariances is None else here.point_covariances[0]
             uncertain = uncertain if own is None else spreads[own]
-            if bias is not None:  # an error of the range is one of the position in that direction
+            if (
+                bias is not None
+            ):  # an error of the range has the effect of a shift of the landmark along the line of sight
                 uncertain = uncertain + spreads[bias] * np.eye(2)
             fixed.append(here if len(names) == len(term.blocks) else replace(here, point_covariances=uncertain[None]))
         factor = together(fixed)
         return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 
 
-Sighted = tuple[float, LandmarkObservation]  # with the time [s] of the pose that saw it
+Sighted = tuple[
+    float, LandmarkObservation
+]  # the time [s] of the pose that the observation refers to, and the observation
 
 
 @dataclass(frozen=True)
 class NewLandmarks:
-    """Sightings of landmarks that are not initialized yet: two must agree on the position, because one may be an outlier.
+    """Stored sightings of landmarks that are not initialised yet, by the name of the landmark's block.
 
-    Immutable, because filters go back to an earlier state when a measurement is late. ``partial``: those with a range or a bearing
-    alone.
+    Immutable, because filters go back to an earlier state when a measurement is late.
+    ``pending``: sightings with range and bearing, each with the landmark's position (2,) and covariance (2, 2). Two sightings
+    must agree on the position, because one may be an outlier.
+    ``partial``: sightings with a range alone or a bearing alone.
     """
 
     pending: Mapping[str, tuple[tuple[Array, Array, Sighted], ...]] = field(default_factory=dict)
     partial: Mapping[str, Candidate] = field(default_factory=dict)
 
     def without(self, name: str) -> NewLandmarks:
-        """The sightings of all landmarks but one."""
+        """Return the sightings of all landmarks except ``name``."""
         pending = {key: rows for key, rows in self.pending.items() if key != name}
         return NewLandmarks(pending, {key: rows for key, rows in self.partial.items() if key != name})
 
     def propose(
         self, name: str, point: Array, covariance: Array, sighting: Sighted
     ) -> tuple[NewLandmarks, Sighted | None]:
-        """Add a sighting that puts the landmark at ``point`` (2,) with ``covariance`` (2, 2). Returns the new pending sightings,
-        and an earlier sighting that agrees, or None."""
+        """Add a sighting that locates the landmark at ``point`` (2,) with ``covariance`` (2, 2).
+
+        Returns the remaining sightings, and an earlier sighting that agrees with the new one. If none agrees, the second value
+        is None, and the new sighting is stored.
+        """
         waiting = self.pending.get(name, ())
         for earlier, noise, candidate in reversed(waiting):
             apart = point - earlier
@@ -166,9 +181,12 @@ class NewLandmarks:
 
 
 class LandmarkSensor(Sensor):
-    """Identified landmarks. For ``use`` of the map see :class:`KnownLandmarks`. Another landmark becomes a block
-    ``bearing_range/NAME``, which all sensors of the kind share, once two sightings agree on its position, or several with a range
-    or a bearing alone determine it."""
+    """The sensor of identified landmarks, bound to a run. For the ``use`` of the map see :class:`KnownLandmarks`.
+
+    A landmark that the map lacks becomes a block ``bearing_range/NAME`` of the state, which all landmark sensors share. It is
+    initialised when two sightings agree on its position, or when several sightings by range alone or bearing alone determine
+    it.
+    """
 
     modality = "bearing_range"
     lost = "landmarks were not where they were expected"
@@ -182,7 +200,7 @@ class LandmarkSensor(Sensor):
         self._landmarks = KnownLandmarks(
             settings, world, self._diagnostics, use, constants.indices, carries=True, locates=locates, biased=biased
         )
-        # sightings before the start are counted when they are used there
+        # factors for the search of the pose; its own diagnostics, so that no sighting is counted twice
         self._sought = KnownLandmarks(settings, world, Diagnostics())
         self._shared = (self.name,) if constants.names else ()
         self._new: NewLandmarks = NewLandmarks()
@@ -203,7 +221,8 @@ class LandmarkSensor(Sensor):
             block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
-            if view.value(block) is None:  # the estimator does not estimate it
+            # if the estimator did not accept the block, the survey's covariance becomes noise
+            if view.value(block) is None:
                 prior = replace(factor, point_covariances=spread[None], free=False)
                 terms.append(self._term(name, prior, view))
             else:
@@ -231,13 +250,13 @@ class LandmarkSensor(Sensor):
                 yield new
 
     def _new_bias(self, name: str, view: View) -> Iterator[NewVariable]:
-        """The bias of a landmark's ranges, if it is new."""
+        """Yield a new block for the range bias of a landmark, unless the estimator has it."""
         block = f"{self.modality}/{name}/bias"
         if view.value(block) is None:
             yield NewVariable(block, np.zeros(1), np.zeros((1, 3)), {}, np.array([[self._bias**2]]), ())
 
     def _term(self, name: str, factor: BearingRangeFactor, view: View) -> Term:
-        """A factor of one landmark; without its bias if the estimator does not estimate that."""
+        """Return the term of one landmark. The factor has no range bias if the estimator does not estimate one."""
         block = f"{self.modality}/{name}"
         if factor.biased and view.value(f"{block}/bias") is None:
             factor = replace(factor, biased=False)
@@ -245,7 +264,8 @@ class LandmarkSensor(Sensor):
         return Term(factor, (*self._shared, *biases, *((block,) if factor.free else ())), 2)
 
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """A new landmark if an earlier sighting agrees with this one, with its position from this sighting."""
+        """Return a new landmark, located by this sighting, if an earlier sighting agrees with it. Otherwise store the sighting
+        and return None."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
         factor = replace(cast(BearingRangeFactor, term.factor), biased=False)
         point, (by_pose, *by_shared), noise = factor.locate([view.pose, *shared])
@@ -256,7 +276,8 @@ class LandmarkSensor(Sensor):
         return None if earlier is None else replace(new, sightings=(earlier, current))
 
     def _located(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """A new landmark if its sightings, each with a range or a bearing alone, determine its position."""
+        """Return a new landmark if its sightings by range alone or bearing alone determine its position. Otherwise store the
+        sighting and return None."""
         factor = cast(BearingRangeFactor, term.factor)
         (along_floor,) = on_floor(factor.model, factor.points, factor.ranges).tolist()
         sighting = PartialSighting(self._motion.state(t), along_floor, float(factor.bearings[0]))
@@ -321,7 +342,8 @@ def _rotation(heading: float) -> Array:
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:
-    """The sensor of a run, or None if it is not used. With particles its time offset is not estimated."""
+    """Return the landmark sensor of a run, or None if the run does not use it. The particle filter does not estimate its time
+    offset."""
     settings = binding.setup.rig.find(BearingRangeSettings)
     if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
         return None

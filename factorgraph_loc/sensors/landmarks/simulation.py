@@ -1,6 +1,7 @@
-"""Simulated range and bearing of visible landmarks, from the model of a rig, and their expected information for planning.
+"""Simulates ranges and bearings of visible landmarks, and predicts their information for planning.
 
-For planning, repeated sightings from one pose are replaced by their mean with reduced noise. Landmarks out of sight add nothing.
+For planning, repeated sightings from one pose are replaced by their mean with reduced noise. A landmark out of sight has no
+effect.
 """
 
 import math
@@ -30,7 +31,7 @@ from factors.se2 import Array
 
 
 def simulate(ride: Ride) -> Simulated:
-    """The sightings of a simulated drive through a world with landmarks."""
+    """Return the stream of sightings of a simulated drive. It is empty without landmarks in the world."""
     if not ride.world.landmarks:
         return Simulated()
     settings, times = ride.settings.sightings, ride.times(ride.settings.sightings.rate)
@@ -40,7 +41,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Rate [Hz] of the simulated sightings; ValueError without a landmark sensor."""
+    """Return {"landmarks": the largest number of simulated sightings per second}. Raises ValueError if the world has landmarks,
+    but the rig has no landmark sensor."""
     if settings.world.landmarks and settings.rig.find(BearingRangeSettings) is None:
         raise ValueError("the world has landmarks, expected a rig with bearing_range")
     return {"landmarks": settings.sightings.rate * settings.world.landmarks}
@@ -55,14 +57,16 @@ def sighting_stream(
     rng: np.random.Generator,
     z: float = 0.0,
 ) -> BearingRangeStream:
-    """Sightings at ``times`` (N,) from ``poses`` (N, 3): the landmarks in range, in the field of view and not behind a wall, of a
-    sensor at ``z`` [m]."""
+    """Simulate the sightings of all visible landmarks at ``times`` (N,) [s] from robot ``poses`` (N, 3).
+
+    ``settings``: range and field of view of the sensor. ``z``: its height [m]. Random noise is drawn from ``rng``.
+    """
     points, names = points_of(world.landmarks.values(), z), list(world.landmarks)
     n, k = in_sight(model, world, poses, settings)
     ranges, bearings = bearing_range.predict(model, poses[n], points[k])
     sigma = bearing_range.sigmas(model, ranges)
     noise = sigma * rng.standard_normal((len(n), 2))
-    # a range is positive whatever the noise
+    # noise must not make a range negative
     ranges = np.maximum(ranges + noise[:, 0], 1e-3)
     return BearingRangeStream(times[n], [names[i] for i in k.tolist()], ranges, se2.wrap(bearings + noise[:, 1]))
 
@@ -70,7 +74,10 @@ def sighting_stream(
 def in_sight(
     model: BearingRangeModel, world: World, poses: Array, settings: SightingSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Visible pairs of ``poses`` (N, 3) and landmarks: indices (K,) of both."""
+    """Return the indices of K poses and K landmarks, pair by pair, so that each landmark is visible from its pose.
+
+    ``poses`` (N, 3): of the robot. A visible landmark is in range, in the field of view, and not behind a wall.
+    """
     points = world.positions()
     sensors = se2.compose(poses, np.array(model.mounting))
     local = se2.transform_to(sensors[:, None], points[None])
@@ -84,7 +91,7 @@ def in_sight(
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSightings:
-    """A :class:`~factorgraph_loc.sensors.interfaces.LiveSensor` of landmarks."""
+    """A simulated landmark sensor on a moving robot. It implements :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`."""
 
     model: BearingRangeModel
     world: World
@@ -99,13 +106,13 @@ class SimulatedSightings:
         return self.settings.rate
 
     def measure(self, t: float, pose: Array) -> BearingRange:
-        """The sightings at ``t``."""
+        """Simulate the measurement at the time ``t`` [s] from the robot's ``pose`` (3,)."""
         sightings = sighting_stream(self.model, self.world, np.array((t,)), pose[None], self.settings, self.rng)
         return BearingRange(t, tuple(sightings.landmark), sightings.range, sightings.bearing)
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedSightings | None:
-    """The sensor of a rig, or None if the rig lacks it or the world has no landmarks."""
+    """Return the simulated landmark sensor of a rig, or None if the rig lacks one or the world has no landmarks."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     return SimulatedSightings(rig.of(BearingRangeSettings).model(), world, settings.sightings, rng)
@@ -113,8 +120,11 @@ def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) ->
 
 @dataclass(frozen=True, eq=False)
 class LandmarkForecast:
-    """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` for landmarks, ``looks_per_metre``; ``settings`` determine
-    which are visible."""
+    """Predicts the information of landmark sightings on candidate paths. It implements
+    :class:`~factorgraph_loc.sensors.interfaces.Forecast`.
+
+    ``looks_per_metre``: number of measurements per metre of path. ``settings``: range and field of view of the sensor.
+    """
 
     world: World
     model: BearingRangeModel
@@ -123,7 +133,8 @@ class LandmarkForecast:
     goals: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Information of the visible landmarks."""
+        """Return the information (N, 3, 3) on ``poses`` (N, 3) by visible landmarks, each along a path length
+        ``ways`` (N,) [m]."""
         points = self.world.positions()
         n, k = in_sight(self.model, self.world, poses, self.settings)
         pairs = poses[n], points[k], *bearing_range.predict(self.model, poses[n], points[k])
@@ -133,7 +144,7 @@ class LandmarkForecast:
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Weigh particles by simulated sightings."""
+        """Add log-likelihoods of simulated sightings to ``out``. See :class:`~factorgraph_loc.sensors.interfaces.Forecast`."""
         sightings, scans = metres * self.looks_per_metre / len(poses), len(out)
         points = self.world.positions()
         for s in range(len(poses)):
@@ -151,8 +162,8 @@ class LandmarkForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> LandmarkForecast | None:
-    """The forecast for a robot with ``speed`` [m/s], with the settings of a simulation; None without a landmark sensor or
-    landmarks."""
+    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: those of the simulation. Returns None
+    without a landmark sensor or without landmarks."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     sightings = settings.sightings
@@ -169,6 +180,7 @@ def _add(
     landmarks: NDArray[np.int64],
     out: Array32,
 ) -> None:
+    """Add to ``out[j, i]`` the log-likelihood of particle i, given the sightings that were simulated from particle j."""
     for n in range(len(scans)):
         j, k = scans[n], landmarks[n]
         for i in range(len(ranges)):

@@ -1,8 +1,8 @@
-"""Landmarks in a log: summary with warnings about sightings and map, positions in the robot frame, and checks before a run.
+"""Summarises the landmarks of a log, warns about problems of sightings and map, and checks a log before a run.
 
-With a reference, the position of each landmark is also estimated from its sightings at the reference poses: by the robust median
-of ranges and bearings, or by robust trilateration from ranges alone. A landmark far from its map position is a suspect. Sightings
-are also compared with the predictions from the reference at various time shifts.
+If the log has a reference, the position of each landmark is estimated from its sightings at the reference poses. The method is
+the median of positions by range and bearing, or robust trilateration if there are only ranges. A landmark far from its map
+position is a suspect. Sightings are also compared with predictions from the reference at various time shifts.
 """
 
 from __future__ import annotations
@@ -39,20 +39,23 @@ from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
 UNKNOWN_LANDMARK = "landmark {landmark} is not in the map: {sightings} sightings"
-MIN_SIGHTINGS = 10  # minimum for a statement about a landmark
+MIN_SIGHTINGS = 10  # minimum number of sightings to judge a landmark
 MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
-MIN_PASSES = 3
-PASS = 10.0  # s; errors within a pass are correlated, so passes are counted, not sightings
-MOST = 2000  # sightings that are compared at time shifts
+PASS = 10.0  # s; errors within such a time interval are correlated, so intervals are counted, not sightings
+MIN_PASSES = 3  # minimum number of these intervals
+MOST = 2000  # number of sightings that are compared at time shifts
 TALL = 0.5  # m; minimum difference of heights that is reported
-MOUNTING = (0.5, 0.0, 0.0, 0.0)  # m, m, m, rad: initial height, x, y and turn of a sensor whose mounting is estimated
+MOUNTING = (0.5, 0.0, 0.0, 0.0)  # m, m, m, rad: initial height, x, y and rotation for the fit of a mounting
 _REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A landmark with a wrong position in the map: ``offset`` (2,) [m] from there; ``swapped_with``: landmark at whose position
-    it is."""
+    """A landmark whose position in the map is probably wrong.
+
+    ``offset`` (2,) [m]: its position by the sightings minus its position in the map. ``sightings``: their number.
+    ``swapped_with``: another landmark if the two seem to be interchanged in the map, otherwise None.
+    """
 
     landmark: str
     offset: Array
@@ -60,7 +63,7 @@ class Suspect:
     swapped_with: str | None = None
 
     def warning(self) -> Notice:
-        """The warning about it."""
+        """Return the warning about this landmark."""
         sentence = "landmark {landmark}: {sightings} sightings put it {distance:.2f} m from its position in the map"
         values = self.landmark, self.sightings, np.hypot(*self.offset)
         if self.swapped_with:
@@ -69,8 +72,12 @@ class Suspect:
 
 
 def summarize(log: Log) -> Summary:
-    """Landmarks that are never seen (``unseen``), the number of sightings by name that the map lacks (``unknown``), and landmarks
-    with a wrong position in the map (``suspects``)."""
+    """Return a summary of the log's landmarks, with warnings. Its entries are:
+
+    - ``unseen``: names of mapped landmarks without any sighting.
+    - ``unknown``: the number of sightings of each name that the map lacks.
+    - ``suspects``: landmarks whose position in the map is probably wrong.
+    """
     unseen, unknown = _unmatched(log)
     suspects = find_suspects(log)
     other_case = "landmark {landmark} is in the map with other capital letters"
@@ -86,8 +93,8 @@ def summarize(log: Log) -> Summary:
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
-    """The landmarks whose position from sightings at reference poses differs from the map by more than ``MIN_OFFSET`` and five
-    standard errors; none without a reference."""
+    """Return the landmarks whose position by sightings from reference poses differs from the map. The difference exceeds both
+    ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
     implied: dict[str, tuple[Array, int]] = {}
     for name, sightings in _seen_from_reference(log).items():
         passes = len(np.unique(sightings.t // PASS))
@@ -105,7 +112,11 @@ def find_suspects(log: Log) -> tuple[Suspect, ...]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Sightings of one landmark from the reference: times (N,), sensor poses (N, 3), calibrated ranges and bearings (N,)."""
+    """N sightings of one landmark, with poses from the reference.
+
+    ``t`` (N,): times [s]. ``sensors`` (N, 3): poses of the sensor in the world. ``ranges`` (N,) [m]: calibrated, along the
+    floor. ``bearings`` (N,) [rad]: calibrated, NaN if not measured.
+    """
 
     t: Array
     sensors: Array
@@ -118,7 +129,8 @@ class _Seen:
 
 
 def _seen_from_reference(log: Log) -> dict[str, _Seen]:
-    """The sightings with a range, by landmark of the map, within the reference."""
+    """Return the sightings of each mapped landmark that have a range and lie within the reference. Returns {} without a
+    reference or sightings."""
     stream = log.streams.get("bearing_range")
     if (
         log.reference is None
@@ -144,7 +156,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
 
 
 def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
-    """Median of the positions from the sightings, and their robust standard deviation [m]."""
+    """Return the median (2,) of a landmark's positions by single sightings, and their robust standard deviation [m]."""
     rows = np.isfinite(sightings.bearings)
     direction = sightings.sensors[rows, 2] + sightings.bearings[rows]
     points = sightings.sensors[rows, :2] + sightings.ranges[rows, None] * np.stack(
@@ -155,7 +167,8 @@ def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
 
 
 def _by_range(sightings: _Seen, place: Array) -> tuple[Array, float]:
-    """Robust trilateration from the map's position, and the spread [m], whose standard error is the spread over sqrt(passes)."""
+    """Return the position (2,) by robust trilateration, which starts at ``place`` (2,), and a standard deviation [m]. The
+    position's standard error is this value divided by the root of the number of independent sightings."""
 
     def residual(point: Array) -> Array:
         away: Array = sightings.sensors[:, :2] - point
@@ -171,7 +184,8 @@ def _by_range(sightings: _Seen, place: Array) -> tuple[Array, float]:
 
 
 def _partner(world: World, name: str, implied: Mapping[str, tuple[Array, int]]) -> str | None:
-    """The other suspect if each of the two is nearer to the other's map position than to its own."""
+    """Return the landmark that seems to be interchanged with ``name`` in the map, or None. Each of the two is nearer to the map
+    position of its partner than to its own. ``implied``: positions (2,) and numbers of sightings of all suspects."""
     for candidate in implied:
         if candidate != name:
             mine, theirs = _place(world, name), _place(world, candidate)
@@ -191,7 +205,7 @@ def _distance(a: Array, b: Array) -> float:
 
 
 def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
-    """Landmarks of the map that are never seen, and the number of sightings by name that the map lacks."""
+    """Return the mapped landmarks without any sighting, and the number of sightings of each name that the map lacks."""
     stream = log.streams.get("bearing_range")
     if not isinstance(stream, BearingRangeStream):
         return (), {}
@@ -201,7 +215,8 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
 
 
 def _shifted(log: Log) -> list[Notice]:
-    """A warning if sightings of mapped landmarks fit the reference better at another time than with another mounting or height."""
+    """Return a warning if the sightings fit the reference clearly better after a time shift, or with landmarks at another
+    height. A time shift must also be better than another mounting."""
     stream, reference = log.streams.get("bearing_range"), log.reference
     if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:
         return []
@@ -216,7 +231,8 @@ def _shifted(log: Log) -> list[Notice]:
     model = settings.model()
 
     def errors(shift: float, height: float = 0.0, x: float = 0.0, y: float = 0.0, turn: float = 0.0) -> Array:
-        """Errors (N, 2) in standard deviations, NaN if unknown, after a shift [s] and changes of the mounting [m, rad]."""
+        """Return range and bearing errors (N, 2) in standard deviations, NaN if unknown. ``shift``: a time shift [s].
+        ``height``: of the landmarks above the sensor [m]. ``x``, ``y`` [m], ``turn`` [rad]: changes of the mounting."""
         mounted = replace(model, mounting=tuple(np.add(model.mounting, (x, y, turn)).tolist()))
         ranges, bearings = bearing_range.predict(mounted, reference.at(t - shift, max_gap=3.0 * SLOWEST), places)
         far = (np.hypot(ranges, height) - stream.range[rows]) / model.range_sigma
@@ -224,7 +240,7 @@ def _shifted(log: Log) -> list[Notice]:
         return np.column_stack((far, aside if reference.has_heading else np.full_like(far, np.nan)))
 
     def fitted(shift: float) -> tuple[float, float]:
-        """The cost at a shift with the mounting and height that fit best, and that height [m]."""
+        """Return the cost at a time shift [s] with the best mounting and height, and the magnitude of that height [m]."""
         start = np.array(MOUNTING if reference.has_heading else MOUNTING[:1])
         fit = scipy.optimize.least_squares(
             lambda mounting: np.nan_to_num(errors(shift, *mounting)).ravel(), start, loss="soft_l1"
@@ -246,14 +262,15 @@ def _shifted(log: Log) -> list[Notice]:
 
 
 def _cost(errors: Array) -> float:
-    """The sum of the median absolute errors (N, 2) of ranges and bearings; infinite with too few of them."""
+    """Return the sum of the median absolute errors of ranges and bearings (the columns of ``errors`` (N, 2)). It is infinite if
+    both have too few values."""
     usable = [kept for column in errors.T if len(kept := column[np.isfinite(column)]) >= FEWEST // 2]
     return sum(float(np.median(np.abs(kept))) for kept in usable) if usable else np.inf
 
 
 def check(use: Use) -> Use:
-    """InputError if landmarks are to be estimated by an estimator that needs ranges with bearings, but no sighting has both or
-    shows a landmark of the map."""
+    """Raise InputError if the chosen estimator cannot locate the landmarks of the log. This is so if it needs ranges with
+    bearings, and no sighting has both or shows a mapped landmark that is used. Otherwise return ``use`` unchanged."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
     if wanted == "known" or use.estimates_points or not streams:
@@ -265,18 +282,18 @@ def check(use: Use) -> Use:
     lacks = "bearing" if any(np.any(np.isfinite(stream.range)) for stream in streams) else "range"
     name = use.estimator
     raise InputError(
-        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, and {name} needs both to locate a landmark: "
-        f"take the smoother, or give a map (--world) with {name}.landmarks=known"
+        f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, and {name} needs range and bearing to locate a "
+        f"landmark: take the smoother, or give a map (--world) with {name}.landmarks=known"
     )
 
 
 def _streams(log: Log) -> dict[str, BearingRangeStream]:
-    """The sightings of each sensor."""
+    """Return the streams of sightings by the name of their sensor."""
     return {name: stream for name, stream in log.streams.items() if isinstance(stream, BearingRangeStream)}
 
 
 def draw(log: Log) -> Marks:
-    """The landmarks of the map, on the floor, and the times of their sightings."""
+    """Return what a viewer shows: the positions of the map's landmarks at floor level, and the times of their sightings."""
     places = log.world.positions()
     positions = np.column_stack((places, np.zeros(len(places))))
     stream = log.streams.get("bearing_range")
@@ -287,7 +304,7 @@ def draw(log: Log) -> Marks:
 
 
 def require_mappable(log: Log) -> None:
-    """InputError if the log's sightings cannot locate any landmark."""
+    """Raise InputError if no landmark can be mapped, because the log has no sightings or its rig has no landmark sensor."""
     streams = [stream for stream in _streams(log).values() if len(stream.t)]
     if not streams:
         raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so there is nothing to map")
@@ -296,7 +313,7 @@ def require_mappable(log: Log) -> None:
 
 
 def not_located(log: Log, located: Container[str]) -> list[Notice]:
-    """A note on landmarks that were sighted without being located."""
+    """Return a note that lists the sighted landmarks that are not in ``located``. Returns [] if all are."""
     counts = Counter(name for stream in _streams(log).values() for name in stream.landmark)
     missing = [f"{name} ({count} sightings)" for name, count in sorted(counts.items()) if name not in located]
     return [notice("not_located", "not located: {landmarks}", listed(missing))] if missing else []

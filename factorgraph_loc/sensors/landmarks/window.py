@@ -1,4 +1,7 @@
-"""Recent sightings of landmarks as constraints on the present pose, vectorised over poses."""
+"""Scores and refines candidates of the present pose by recent sightings of landmarks, vectorised over the candidates.
+
+The odometry relates each sighting to the present pose, the pose at the last sighting.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +20,21 @@ from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
-RECENT = 6  # landmarks whose last sightings generate candidates
-CIRCLE = 72  # candidates around a landmark
-HEADINGS = 24  # per candidate, if there is no bearing
-RADII = (0.7, 1.5, 3.0, 6.0)  # m, if there is no range
-BASELINE = 0.3  # m; minimum distance of two landmarks that are aligned
-CONVERGED = 1e-4  # m, rad: step of a candidate after which it is not refined further
-FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the flat prior: 1/m^2, 1/m^2, 1/rad^2
+RECENT = 6  # number of landmarks whose last sightings generate candidates
+CIRCLE = 72  # number of candidate headings for a pose that has sighted one landmark
+HEADINGS = 24  # number of candidate bearings of that landmark if its bearing is not measured
+RADII = (0.7, 1.5, 3.0, 6.0)  # m; candidate ranges if the range is not measured
+BASELINE = 0.3  # m; minimum distance of two landmarks that determine a heading
+CONVERGED = 1e-4  # m, rad; a candidate whose step is smaller is not refined further
+FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the nearly flat prior: 1/m^2, 1/m^2, 1/rad^2
 
 
 class Sighting(NamedTuple):
-    """A landmark seen at ``odometry``; ``point`` (2,) is its position in the map."""
+    """One sighting of a mapped landmark.
+
+    ``odometry``: the odometry state at its time. ``point`` (2,): the landmark's position in the map [m]. ``range`` [m] and
+    ``bearing`` [rad]: NaN if not measured.
+    """
 
     odometry: ChainState
     point: Array
@@ -36,8 +43,11 @@ class Sighting(NamedTuple):
 
 
 class SightingWindow:
-    """K sightings as constraints on the present pose, and the start if its position is known. ``now``: the odometry at the last
-    one; ``points`` (K, 2): in the map."""
+    """Constraints on the present pose by K sightings, and by the start of the run if its position is known.
+
+    ``rows``: the sightings in order of time. The present pose is the pose at the last sighting. ``now``: the odometry state
+    there. ``points`` (K, 2): positions of the sighted landmarks in the map.
+    """
 
     def __init__(
         self, model: BearingRangeModel, rows: list[Sighting], motion: Motion, start: KnownPosition | None = None
@@ -48,19 +58,21 @@ class SightingWindow:
         self._ranges, self._bearings = np.array([r.range for r in rows]), np.array([r.bearing for r in rows])
         since = [motion.relative(r.odometry, self.now) for r in rows]
         self._forth = np.array([i.delta for i in since])
-        self._back = se2.inverse(self._forth)  # pose at each sighting relative to the present one
-        self._carried = se2.adjoint(self._forth)  # from a perturbation of the present pose to that at the sighting
+        self._back = se2.inverse(self._forth)  # pose at each sighting relative to the present pose
+        # matrices (K, 3, 3) from a body-frame perturbation of the present pose to that of the pose at a sighting
+        self._carried = se2.adjoint(self._forth)
         self._covariance = np.array([i.covariance for i in since])
         self._drift = self._carried @ self._covariance @ self._carried.transpose(0, 2, 1)
         self._missing = np.isnan(np.column_stack((self._ranges, self._bearings)))
         self._sigmas = sigmas(model, self._ranges)
 
     def starts(self) -> Array:
-        """Present poses (N, 3) from the start position, empty if it is unknown."""
+        """Return candidates (N, 3) of the present pose from the known start position, or (0, 3) if it is unknown."""
         return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
 
     def circles(self) -> Array:
-        """Present poses (N, 3) that agree with the last seen landmark, on a circle around it."""
+        """Return candidates (N, 3) of the present pose that agree with the last sighting. At that time they lie around its
+        landmark."""
         k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
@@ -68,7 +80,8 @@ class SightingWindow:
         return self._placed(k, *(g.ravel() for g in grid))
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Present poses (N, 3) sampled from the start, or from the likelihood of the last sighting if that is unknown."""
+        """Return samples (N, 3) of the present pose: from the known start position, otherwise from the last sighting's
+        likelihood."""
         if self._start is not None:
             return self._start.drawn(rng, count, self.now)
         k, noise = len(self.points) - 1, rng.standard_normal((2, count))
@@ -82,13 +95,15 @@ class SightingWindow:
         return self._placed(k, headings, ranges, bearings)
 
     def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
-        """Present poses (N, 3) that had headings (N,) at a sighting, with its landmark at ranges and bearings (N,)."""
+        """Return present poses (N, 3) from assumptions about sighting ``k``: ``headings`` (N,) of the robot at its time,
+        ``ranges`` (N,) and ``bearings`` (N,) of its landmark."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
         relative = se2.transform_from(turned, located(self._model, ranges, bearings))
         return se2.compose(np.column_stack((self.points[k] - relative, headings)), self._forth[k])
 
     def alignments(self) -> Array:
-        """Present poses (N, 3) that align two landmarks with range and bearing with the map."""
+        """Return candidates (N, 3) of the present pose, one per pair of landmarks sighted with range and bearing. Each one
+        aligns the observed positions of its pair with the map."""
         full = [k for k in self._recent() if not self._missing[k].any()]
         pairs = np.array(list(combinations(full, 2)), dtype=int).reshape(-1, 2)
         mapped, observed = self.points[pairs], self._from_present()[pairs]
@@ -101,15 +116,16 @@ class SightingWindow:
         return np.asarray(poses[wide])
 
     def grain(self) -> Array:
-        """Covariance (3, 3) of the region of a candidate: the spacing of candidates and the noise they were generated from."""
+        """Return the covariance (3, 3) of a candidate's error, from the spacing of the candidates and the noise of
+        sightings."""
         heading = 2.0 * np.pi / HEADINGS / 2.0 if self._missing[-1, 1] else 0.1
         distances = self._ranges[~self._missing[:, 0]]
         position = 0.1 + 0.05 * float(np.median(distances) if len(distances) else RADII[-1])
         return np.diag(np.square((position, position, heading)))
 
     def whitener(self, noise: Array | None = None) -> Array:
-        """Whitening matrices (K, 2, 2) of the residuals for the sensor noise, the odometry error, and the error of the present
-        pose with body-frame covariance ``noise`` (3, 3), all linearised at the measured range and bearing."""
+        """Return matrices (K, 2, 2) that whiten the residuals for sensor noise and odometry error, linearised at the measured
+        range and bearing. ``noise`` (3, 3): an additional body-frame covariance of the present pose."""
         error = self._drift
         if noise is not None:
             error = error + self._carried @ noise @ self._carried.transpose(0, 2, 1)
@@ -122,18 +138,20 @@ class SightingWindow:
         return positive.whitener(covariance)
 
     def squared(self, poses: Array, whitener: Array) -> Array:
-        """Squared whitened residuals (N, K) at present poses (N, 3)."""
+        """Return squared norms (N, K) of the whitened residuals at present poses (N, 3)."""
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
     def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:
-        """Losses (N,) of present poses (N, 3): robust losses of the sightings plus the loss of the start."""
+        """Return the losses (N,) of present poses (N, 3): the robust losses of the sightings, plus the loss of the known start.
+        ``noise`` (3, 3): an additional body-frame covariance of the present pose, used for the start."""
         loss: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return loss if self._start is None else loss + self._start.loss(poses, self.now, noise)
 
     def refined(
         self, poses: Array, whitener: Array, iterations: int, noise: Array | None = None
     ) -> tuple[Array, Array]:
-        """Poses (N, 3) after Levenberg-Marquardt iterations on the losses, with body-frame covariances (N, 3, 3)."""
+        """Return present poses (N, 3) refined by Levenberg-Marquardt on :meth:`losses`, and their body-frame covariances
+        (N, 3, 3)."""
 
         def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
             information, gradient = self._normal_equations(poses, whitener, noise)
@@ -146,11 +164,15 @@ class SightingWindow:
         return optima.states, np.asarray(np.linalg.inv(optima.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """The pose (3,) of a hypothesis after Gauss-Newton with correlated odometry errors, and its body-frame covariance (3, 3).
-        The path since the sightings is marginalised. Whitened residuals e have the covariance R = 1 + J C J'. C is the covariance
-        of the path, and J is the whitened Jacobian by it. On the most likely path the residuals are R^-1 e."""
+        """Refine a present pose (3,) by Gauss-Newton with correlated odometry errors. Returns it and its body-frame covariance
+        (3, 3).
+
+        The path since the sightings is marginalised. Residuals e in standard deviations of the sensor have the covariance
+        R = I + J C J'. C is the covariance of the path, and J is the Jacobian of e by the path. On the most likely path the
+        residuals are R^-1 e.
+        """
         covariances = self._covariance
-        if self._start is not None:  # the first row, which has no robust loss
+        if self._start is not None:  # the known start is the first row; it has no robust loss
             covariances = np.concatenate((self._start.whitened(pose, self.now)[2][None], covariances))
         rows = np.arange(len(covariances))
         common = covariances[np.maximum(rows[:, None], rows)]
@@ -175,27 +197,28 @@ class SightingWindow:
         return pose, covariance
 
     def _recent(self) -> list[int]:
-        """The last sighting of each landmark, newest first."""
+        """Return the row numbers of the last sightings of at most RECENT landmarks, newest first."""
         last = {tuple(p): k for k, p in enumerate(self.points.tolist())}
         return sorted(last.values(), reverse=True)[:RECENT]
 
     def _from_robot(self) -> Array:
-        """The landmarks (K, 2) in the robot frame when seen; a missing range is replaced by a medium one, a missing bearing by
-        0."""
+        """Return positions (K, 2) of the landmarks in the robot frame at the sighting. A missing range is replaced by
+        ``RADII[2]``, a missing bearing by 0."""
         ranges = np.where(self._missing[:, 0], RADII[2], self._ranges)
         return located(self._model, ranges, np.where(self._missing[:, 1], 0.0, self._bearings))
 
     def _from_present(self) -> Array:
-        """The landmarks (K, 2) in the present robot frame."""
+        """Return positions (K, 2) of the landmarks in the present robot frame."""
         return se2.transform_from(self._back, self._from_robot())
 
     def _residuals(self, poses: Array) -> Array:
-        """Residuals (N, K, 2) in standard deviations of the sensor at present poses (N, 3)."""
+        """Return residuals (N, K, 2) at present poses (N, 3), in standard deviations of the sensor."""
         at = se2.compose(poses[:, None], self._back)
         return residuals(self._model, at, self.points, self._ranges, self._bearings)
 
     def _linearized(self, poses: Array) -> tuple[Array, Array]:
-        """Residuals (N, K, 2) at present poses (N, 3), and their Jacobians (N, K, 2, 3) by the perturbation of these."""
+        """Return residuals (N, K, 2) at present poses (N, 3), in standard deviations of the sensor, and their Jacobians
+        (N, K, 2, 3) by the body-frame perturbation of the present pose."""
         at, count = se2.compose(poses[:, None], self._back), len(poses)
         sightings = np.tile(self.points, (count, 1)), np.tile(self._ranges, count), np.tile(self._bearings, count)
         error, jacobian = linearize_each(self._model.packed, at.reshape(-1, 3), *sightings)
@@ -203,7 +226,8 @@ class SightingWindow:
         return error.reshape(*at.shape[:2], 2), jacobian
 
     def _normal_equations(self, poses: Array, whitener: Array, noise: Array | None) -> tuple[Array, Array]:
-        """Robustly weighted information (N, 3, 3), including that of a nearly flat prior or the start, and gradient (N, 3)."""
+        """Return the robustly weighted information (N, 3, 3) and gradient (N, 3) of :meth:`losses` at present poses (N, 3). The
+        information includes a nearly flat prior."""
         error, jacobian = self._linearized(poses)
         error, jacobian = (whitener @ error[..., None])[..., 0], whitener @ jacobian
         weight = geman_mcclure_weight(np.sum(error**2, axis=-1), self._model.robust)
