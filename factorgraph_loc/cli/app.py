@@ -26,15 +26,15 @@ from factorgraph_loc.threads import use_one_thread
 from factorgraph_loc.version import __version__
 
 DEBUG = "--debug"
-_UsageError: Any = typer.BadParameter.__mro__[1]  # click's, or that of Typer's own copy of click
-UNFORESEEN = 70  # EX_SOFTWARE of sysexits.h: an internal error
+_UsageError: Any = typer.BadParameter.__mro__[1]  # the class UsageError of click, or of the copy of click inside Typer
+UNFORESEEN = 70  # exit code of an internal error: EX_SOFTWARE of sysexits.h
 
 
 class Commands(TyperGroup):
-    """Turns errors into a line on stderr and an exit code."""
+    """The group of all commands. It prints an error of a command as one line on stderr and sets the exit code."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Accept ``--debug`` anywhere on the line."""
+        """Move ``--debug`` to the start of the arguments, so that users may write it anywhere on the command line."""
         if DEBUG in args:
             args = [DEBUG, *(arg for arg in args if arg != DEBUG)]
         return super().parse_args(ctx, args)
@@ -60,9 +60,9 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    epilog="Exit codes: 0 success; 1 a run failed (the others are reported); 2 invalid input, or a file or standard output "
-    "cannot be written; 70 internal error; 129, 130 and 143 hung up, interrupted and terminated; 141 the reader of the "
-    "output closed the pipe.",
+    epilog="Exit codes: 0 success; 1 a run failed (other runs are reported); 2 invalid input, or a file or standard output "
+    "cannot be written; 70 internal error; 129 hung up; 130 interrupted; 143 terminated; 141 the reader of the output "
+    "closed the pipe.",
 )
 app.command()(inspecting.datasets)
 app.command()(lookups.estimators)
@@ -112,7 +112,7 @@ def run() -> None:
     try:
         with unwrapped(), standard_streams():
             app()
-    except OutputError as error:  # also for --help and --version
+    except OutputError as error:  # raised also while --help or --version are printed
         show.note(f"error: {error}")
         sys.exit(error.exit_code)
     except Exception as error:

@@ -1,7 +1,7 @@
 """Shell completion of names and settings.
 
-Completion of names must be fast, and must not import numerical libraries. Settings are read from the classes that define them,
-with an import time of a second.
+Completion of names is fast, because it imports no numerical library. Completion of settings imports the classes that define the
+settings, which takes a second.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,7 +14,7 @@ Completion = Callable[[str], list[str]]
 
 
 def _one_of(names: Callable[[], Iterable[str]]) -> Completion:
-    """Completes one of the names."""
+    """Return a completion of a single name. ``names`` returns all valid names."""
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names() if name.startswith(incomplete)]
@@ -23,7 +23,8 @@ def _one_of(names: Callable[[], Iterable[str]]) -> Completion:
 
 
 def _some_of(names: Callable[[], Iterable[str]]) -> Completion:
-    """Completes the last of several comma-separated names, without repetition."""
+    """Return a completion of the last name in a comma-separated list. Names that are already in the list are not proposed.
+    ``names`` returns all valid names."""
 
     def complete(incomplete: str) -> list[str]:
         first, comma, last = incomplete.rpartition(",")
@@ -33,7 +34,7 @@ def _some_of(names: Callable[[], Iterable[str]]) -> Completion:
     return complete
 
 
-logs = _one_of(manifests)  # without a match the shell completes file names
+logs = _one_of(manifests)  # if no manifest matches, the shell completes file names
 estimator = _one_of(lambda: ESTIMATORS)
 estimators = _some_of(lambda: ESTIMATORS)
 preset = _one_of(lambda: PRESETS)
@@ -48,7 +49,7 @@ map_estimator = _one_of(lambda: MAP_ESTIMATORS)
 
 
 def setting(incomplete: str) -> list[str]:
-    """The name of a setting NAME.KEY=VALUE: that of the estimator first, then the key."""
+    """Complete a setting NAME.KEY=VALUE of an estimator: first the estimator NAME, then the key KEY."""
     name, dot, _ = incomplete.partition(".")
     if not dot:
         return [f"{known}." for known in estimator(name)]
@@ -61,7 +62,7 @@ def setting(incomplete: str) -> list[str]:
 
 
 def simulation_setting(incomplete: str) -> list[str]:
-    """The name of a setting KEY=VALUE of a simulation, but not of its rig."""
+    """Complete the key of a setting KEY=VALUE of a simulation. Keys of the rig (``rig.KEY``) are not proposed."""
     from factorgraph_loc.files.settings import settings_in
     from factorgraph_loc.simulation import SimulationSettings
 
@@ -70,7 +71,7 @@ def simulation_setting(incomplete: str) -> list[str]:
 
 
 def active_setting(incomplete: str) -> list[str]:
-    """The name of a setting KEY=VALUE of an active run, or of its world."""
+    """Complete the key of a setting KEY=VALUE of ``fgloc active``. It sets the robot, the policy or the simulated world."""
     from factorgraph_loc.files.settings import settings_in
     from factorgraph_loc.planning.settings import ActiveSettings
 

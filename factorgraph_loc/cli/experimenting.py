@@ -1,5 +1,8 @@
-"""``fgloc experiment``: many runs described in a file, with stored results and a report; ``fgloc active``: simulated robots that
-plan their paths to localize themselves."""
+"""The commands ``fgloc experiment`` and ``fgloc active``.
+
+``fgloc experiment`` executes many runs that a file describes, stores their results and writes a report. ``fgloc active`` simulates
+robots that plan their paths so as to localize themselves.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
     from factorgraph_loc.experiments.experiment import Done, Prepared
 
 
-SHOWN = 10  # failures and damaged runs that are printed
+SHOWN = 10  # maximum number of failures, and of damaged results, that are printed
 
 app = typer.Typer(no_args_is_help=True, help="Experiments: run them, show their status, report their results.")
 
@@ -40,32 +43,32 @@ Changes = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Value for a key of FILE; LABEL.KEY for an estimator, simulation.KEY for simulated logs; may be repeated.",
+        help="Replace the value of a key of FILE. LABEL.KEY sets an estimator, simulation.KEY simulated logs. May be repeated.",
     ),
 ]
 OutFolder = Annotated[
     Path | None,
-    typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; by default the one that FILE states."),
+    typer.Option("--out", "-o", metavar="OUT", help="Folder for the results. Default: the folder that FILE names."),
 ]
 
 
 @dataclass(frozen=True)
 class ExperimentOptions:
-    """The options of all commands."""
+    """The options that the commands of ``fgloc experiment`` share, except ``new``."""
 
     set_: Changes = None
     out: OutFolder = None
     data_root: DataRoot = None
 
     def given(self) -> dict[str, Any]:
-        """The arguments of the functions of the Python interface."""
+        """Return the options as keyword arguments for the functions of ``experiments.experiment``."""
         changes = dict(key_and_value(text, "--set") for text in self.set_ or ())
         return {"changes": changes, "out": self.out, "data_root": self.data_root}
 
 
 @app.command()
 def new(file: File, overwrite: Overwrite = False, json: Json = False) -> None:
-    """Write a first experiment file, with comments.
+    """Write an example of an experiment file, with comments.
 
     Example: fgloc experiment new lags.toml
     """
@@ -93,7 +96,7 @@ def run(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the runs and estimate their duration.")] = False,
     json: Json = False,
 ) -> None:
-    """Execute the runs of an experiment that have no result yet; can be interrupted and resumed at any time.
+    """Execute the runs of an experiment that have no result yet. The same command resumes an interrupted experiment.
 
     Example: fgloc experiment run lags.toml
     """
@@ -140,7 +143,7 @@ def status(
     options: ExperimentOptions,
     json: Json = False,
 ) -> None:
-    """Show how many runs of an experiment are done, failed, missing or damaged; results are compared with their checksums.
+    """Count the runs of an experiment that are done, failed, missing or damaged. A damaged result differs from its checksum.
 
     Example: fgloc experiment status lags.toml
     """
@@ -163,7 +166,7 @@ def status(
 @app.command()
 @takes_options
 def report(file: File, *, options: ExperimentOptions, json: Json = False) -> None:
-    """Write the stored results of an experiment as one HTML page, report.html in OUT; damaged ones are left out.
+    """Write the stored results of an experiment as one HTML page, report.html in OUT. Damaged results are left out.
 
     Example: fgloc experiment report lags.toml
     """
@@ -217,11 +220,15 @@ def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
     if len(runs) > SHOWN:
         show.line(f"damaged: {len(runs) - SHOWN} more")
     if runs:
-        show.line(f"`fgloc experiment run {file}` runs them again")
+        show.line(f"`fgloc experiment run {file}` repeats the damaged runs")
 
 
 def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """One line per label, set of sensors and point of the sweep: median, minimum and maximum of each metric."""
+    """Return the header and the rows of the table of results.
+
+    Each row summarizes the runs (``rows``) of one label, one set of sensors and one combination of swept values. Each cell has the
+    median, minimum and maximum of one of the ``metrics`` over these runs.
+    """
     from statistics import median
 
     from factorgraph_loc.evaluation.tables import SCORED, counted
@@ -257,7 +264,7 @@ Policies = Annotated[
     str,
     typer.Option(
         metavar="A,B",
-        help=f"{', '.join(POLICIES)}; the others are compared with the first.",
+        help=f"{', '.join(POLICIES)}; each further policy is compared with the first.",
         autocompletion=completion.policies,
     ),
 ]
@@ -294,7 +301,7 @@ def active(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Drive simulated robots from an unknown start until they are localized, and compare policies on the same seeds.
+    """Simulate robots that drive from an unknown start until they are localized. Policies are compared on the same seeds.
 
     Example: fgloc active office --seeds 0:5 -o out/active
     """

@@ -1,4 +1,5 @@
-"""``fgloc datasets``, ``info``, ``manifest``, ``convert`` and ``simulate``: logs, without a run of an estimator."""
+"""The commands ``fgloc datasets``, ``info``, ``manifest``, ``convert`` and ``simulate``, which list, summarize, describe, convert
+and simulate logs."""
 
 from __future__ import annotations
 
@@ -43,11 +44,13 @@ def info(
     source: LogOptions,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="FILE", help="Picture (PNG) of the log from above; not of a ROS bag."),
+        typer.Option(
+            "--out", "-o", metavar="FILE", help="PNG file for a plot of the log from above; not of a ROS bag."
+        ),
     ] = None,
     json: Json = False,
 ) -> None:
-    """Summarize a log, with warnings about its content; for a ROS bag, its topics.
+    """Summarize a log, with warnings about its content. For a ROS bag, list the topics.
 
     Example: fgloc info monday.toml -o monday.png
     """
@@ -88,7 +91,7 @@ def convert(
     format: Annotated[Literal["csv", "parquet"], typer.Option(help="Format of the tables.")] = "csv",
     *,
     source: LogOptions,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the log that OUT is.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a log in the folder OUT.")] = False,
     json: Json = False,
 ) -> None:
     """Write a log as a folder in the native format.
@@ -167,7 +170,7 @@ def manifest(
     ],
     json: Json = False,
 ) -> None:
-    """Propose a manifest: which file of a folder, or topic of a ROS bag, is which sensor. Write it to a file and check it.
+    """Propose a manifest, which assigns the files of a folder, or the topics of a ROS bag, to sensors. Save and check the output.
 
     Example: fgloc manifest monday > monday.toml; fgloc info monday.toml
     """
@@ -177,7 +180,8 @@ def manifest(
     if proposal.folder != Path.cwd().resolve():
         name = proposal.content["path"]
         show.note(
-            f"the manifest names {name} only: save it in {proposal.folder}, or give --data-root {proposal.folder}"
+            f"the path {name} in the manifest is relative: save the manifest in {proposal.folder}, "
+            f"or give --data-root {proposal.folder}"
         )
     if json:
         show.document({"manifest": proposal.content, "remarks": proposal.remarks})
@@ -186,7 +190,7 @@ def manifest(
 
 
 def info_of_bag(bag: Path, json: Json) -> None:
-    """Print the topics of a bag."""
+    """Print the topics of a ROS bag as a table, or as JSON if ``json`` is set."""
     from factorgraph_loc.io.bags.manifest import manifest_of_bag
 
     proposal = manifest_of_bag(bag, Path.cwd())
@@ -206,7 +210,7 @@ def _topic_row(t: TopicUse) -> tuple[str, ...]:
 
 
 OutFolder = Annotated[
-    Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write; with --seeds, a folder of folders.")
+    Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder to write; with --seeds, one folder per log in it.")
 ]
 Changes = Annotated[
     list[str] | None,
@@ -250,7 +254,7 @@ def simulate(
     drive = () if duration is None else (f"drive.duration={duration}",)
     changes = nested_changes((*(set_ or ()), *drive))
     if "images" in changes and not images:
-        raise InputError("--set images.KEY configures images, expected --images with it")
+        raise InputError("--set images.KEY has no effect without --images: add --images")
     settings = named_settings(what, changes)
     written = []
     for drawn in chosen:

@@ -1,4 +1,4 @@
-"""``fgloc calibrate`` and ``fgloc map``: a rig from logs with reference poses; a map of landmarks, RFID tags or points."""
+"""The commands ``fgloc calibrate``, which calibrates a rig, and ``fgloc map``, which makes a map of landmarks, tags or points."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def calibrate(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Calibrate a rig from logs, all with reference poses or all without; write the rig and a report.
+    """Calibrate a rig from logs, and write the rig and a report. Either all logs have reference poses, or none has.
 
     Example: fgloc calibrate monday.toml friday.toml -o cart.rig.toml
     """
@@ -63,7 +63,7 @@ def calibrate(
 
 @dataclass(frozen=True)
 class MapArguments:
-    """The arguments of ``build_map`` of the Python interface, except the settings."""
+    """The options of ``fgloc map`` that are arguments of :func:`factorgraph_loc.api.learning.build_map`, except the settings."""
 
     estimator: Annotated[
         str,
@@ -80,14 +80,14 @@ class MapArguments:
         str | None,
         typer.Option(
             metavar="WHAT",
-            help="landmarks, tags or points; by default points if the log has images, landmarks if it has sightings of them.",
+            help="landmarks, tags or points. Default: points if the log has images, landmarks if it has sightings, else tags.",
         ),
     ] = None
     poses: Annotated[
         str | None,
         typer.Option(
             metavar="SOURCE",
-            help="For tags: reference, or odometry to estimate the poses too; by default the reference if there is one.",
+            help="Robot poses for a map of tags: reference, or odometry to estimate them too. Default: a reference in the log.",
         ),
     ] = None
     tag_height: Annotated[
@@ -95,7 +95,8 @@ class MapArguments:
         typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),
     ] = None
     drop_dead: Annotated[
-        bool, typer.Option("--drop-dead", help="Only write the log's map without the tags that are believed dead.")
+        bool,
+        typer.Option("--drop-dead", help="Map nothing; write the log's map without the tags that are believed dead."),
     ] = False
     prior: Prior = None
     overwrite: Overwrite = False
@@ -116,7 +117,7 @@ def map_(
     source: LogOptions,
     json: Json = False,
 ) -> None:
-    """Make a map of the landmarks, RFID tags or points in a log; compare it with the log's map of landmarks or tags, if any.
+    """Make a map of the landmarks, RFID tags or points in a log. Known landmarks and tags are compared with the log's map.
 
     Example: fgloc map monday.toml -o hall.world.toml
     """
@@ -140,7 +141,7 @@ def map_(
         files = {"map": str(out), "picture": str(picture)}
         show.document(document(made.details) | {"frame": made.frame, "files": files})
         return
-    for line in (*tell(made.details), f"the frame of the new map is {made.frame}"):
+    for line in (*print_elements(made.details), f"the frame of the new map is {made.frame}"):
         show.line(line)
     show.line()
     show.line(f"the map is in {out}, a picture of it in {picture}")
@@ -155,8 +156,8 @@ if TYPE_CHECKING:
     Made = LandmarkMap | MadeTags | PointReport | DroppedTags
 
 
-def tell(made: Made) -> tuple[str, ...]:
-    """Print the table of map elements, if any, and return further lines."""
+def print_elements(made: Made) -> tuple[str, ...]:
+    """Print the table of the landmarks or tags of a new map; points have none. Return further lines to print."""
     from factorgraph_loc.experiments.maps import DroppedTags
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
@@ -174,15 +175,15 @@ def tell(made: Made) -> tuple[str, ...]:
         return (made.made.summary("tags"), *_notes_on_tags(made))
     return (
         f"{made.points} points are in the new map, with {made.observations} observations in {made.keyframes} keyframes"
-        + (f", {made.fused} of them known before" if made.fused else ""),
+        + (f", {made.fused} of them from the log's map" if made.fused else ""),
         f"reprojection residual: {made.rms:.2f} px root mean square, {made.mad:.2f} px median",
         f"parallax {made.parallax:.3f} rad, standard deviation in the worst direction {made.sigma:.3f} m (medians)",
-        f"the cameras were moved by {made.shifted:.3f} m and {made.turned:.4f} rad (medians)",
+        f"the adjustment moved the cameras by {made.shifted:.3f} m and {made.turned:.4f} rad (medians)",
     )
 
 
 def document(made: Made) -> dict[str, Any]:
-    """All figures as plain values."""
+    """Return the results of mapping as a dictionary for ``--json``."""
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
 
@@ -222,7 +223,7 @@ def _rows(made: LandmarkMap, verdicts: Mapping[str, str]) -> list[tuple[str, ...
 
 
 def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """The entry of each landmark or tag; ``verdicts`` replace some of the map's."""
+    """Return the values of each landmark or tag by its name. ``verdicts``: by name, texts that replace the verdict of the map."""
     return {
         entry.landmark: {
             "given": None if entry.given is None else entry.given.tolist(),
@@ -238,18 +239,18 @@ def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[s
 
 
 def _reasons(made: MadeTags) -> dict[str, str]:
-    """Why each tag that is not located is not."""
+    """Return by name why a tag could not be located, for all tags that are not located."""
     return {name: str(why) for name, why in made.open.items()}
 
 
 def _notes(made: LandmarkMap) -> list[str]:
-    """Lines on results that are not in the table."""
+    """Return lines about results that the table lacks: notes, and landmarks of the given map that no measurement observes."""
     unseen = ", ".join(made.unseen)
     return [*map(str, made.notes), *([f"not observed, kept from the given map: {unseen}"] if unseen else [])]
 
 
 def _notes_on_tags(made: MadeTags) -> list[str]:
-    """Lines on results that are not in the table: unmapped tags, and the RMS distance from the given positions."""
+    """Return lines about results that the table lacks: notes, tags that are not located, the distance from given positions."""
     listed = {entry.landmark for entry in made.made.entries}
     unmapped = {name: why for name, why in made.open.items() if name not in listed}
     lines = [*map(str, made.made.notes)]

@@ -1,4 +1,4 @@
-"""``fgloc estimators``, ``sensors``, ``readers``, ``presets`` and ``policies``: what there is to choose from."""
+"""The commands ``fgloc estimators``, ``sensors``, ``readers``, ``presets`` and ``policies``, which list what a user can choose."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 def _name(what: str, complete: completion.Completion) -> Any:
-    return typer.Argument(metavar="NAME", help=f"Print the {what} of this one.", autocompletion=complete)
+    return typer.Argument(metavar="NAME", help=f"Print the {what} of the entry NAME.", autocompletion=complete)
 
 
 def estimators(name: Annotated[str | None, _name("settings", completion.estimator)] = None, json: Json = False) -> None:
-    """List the estimators, or the settings of one.
+    """List the estimators, or the settings of the estimator NAME.
 
     Example: fgloc estimators smoother
     """
@@ -42,7 +42,7 @@ def estimators(name: Annotated[str | None, _name("settings", completion.estimato
 
 
 def readers(name: Annotated[str | None, _name("options", completion.reader)] = None, json: Json = False) -> None:
-    """List the readers of logs, or the options of one.
+    """List the readers of logs, or the options of the reader NAME.
 
     Example: fgloc readers mapped
     """
@@ -60,7 +60,7 @@ def readers(name: Annotated[str | None, _name("options", completion.reader)] = N
 def sensors(
     name: Annotated[str | None, _name("tables and settings", completion.sensor)] = None, json: Json = False
 ) -> None:
-    """List the sensors, or the tables and the rig's settings of one.
+    """List the sensors, or the tables and rig settings of the sensor NAME.
 
     Example: fgloc sensors rfid
     """
@@ -78,7 +78,7 @@ def sensors(
 
 
 def presets(name: Annotated[str | None, _name("settings", completion.preset)] = None, json: Json = False) -> None:
-    """List the presets of simulated logs, or the settings of one.
+    """List the presets of simulated logs, or the settings of the preset NAME.
 
     Example: fgloc presets office
     """
@@ -96,7 +96,7 @@ def presets(name: Annotated[str | None, _name("settings", completion.preset)] = 
 
 
 def policies(json: Json = False) -> None:
-    """List the policies of active robots, and the settings of `fgloc active`.
+    """List the policies by which `fgloc active` chooses paths, and the settings of `fgloc active`.
 
     Example: fgloc policies
     """

@@ -1,4 +1,4 @@
-"""The entry point of ``fgloc``. Imports are inside the function, so that signals are handled while they run."""
+"""The entry point of ``fgloc``. Other modules are imported inside :func:`main`, so that a signal during the imports is handled."""
 
 import gc
 import sys
@@ -6,7 +6,7 @@ import sys
 
 def main() -> None:
     """Run the command ``fgloc``, then exit."""
-    gc.set_threshold(50_000)  # to search its many modules for garbage takes a tenth of a short command
+    gc.set_threshold(50_000)  # more frequent garbage collection would take a tenth of the time of a short command
     try:
         from factorgraph_loc.cli.stopping import stoppable, unwrapped
 

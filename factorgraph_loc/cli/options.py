@@ -39,7 +39,7 @@ LogNames = Annotated[
 DataRoot = Annotated[
     Path | None,
     typer.Option(
-        help="Folder of data that manifests and experiments may name; by default the environment's FGLOC_DATA."
+        help="Data folder, to which paths in manifests and experiments may lead. Default: the variable FGLOC_DATA."
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
@@ -57,7 +57,7 @@ Prior = Annotated[
     str | None,
     typer.Option(
         metavar="PRIOR",
-        help="Start: reference, log, unknown, X,Y [m] or X,Y,HEADING [rad]; by default the log's start, else the reference.",
+        help="Start pose: reference, log, unknown, X,Y [m] or X,Y,HEADING [rad]. Default: the log's start, else the reference.",
         autocompletion=completion.prior,
     ),
 ]
@@ -80,7 +80,7 @@ Settings = Annotated[
 
 @dataclass(frozen=True)
 class LogOptions:
-    """The options for reading logs."""
+    """The options that select and configure the reader of a log, and replace its rig or map."""
 
     reader: Annotated[
         str | None,
@@ -100,13 +100,13 @@ class LogOptions:
     ] = None
 
     def load(self, names: Sequence[str]) -> list[Log]:
-        """The logs of several names; a name may refer to several logs."""
+        """Read the logs with the given names. One name may refer to several logs."""
         from factorgraph_loc.io.readers import load
 
         return [log for name in names for log in load(name, **self._given())]
 
     def load_one(self, name: str) -> Log:
-        """The log of a name that must refer to one log."""
+        """Read the log with a given name. Raises InputError if the name refers to several logs."""
         from factorgraph_loc.io.readers import read_log
 
         return read_log(name, **self._given())
@@ -120,7 +120,7 @@ class LogOptions:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The options of runs."""
+    """The options that ``fgloc run`` and ``fgloc compare`` share."""
 
     sensors: Annotated[
         str | None,
@@ -140,23 +140,26 @@ class RunOptions:
     align: Annotated[
         Alignment,
         typer.Option(
-            help="Show the errors after this alignment with the reference too: first pose onto first pose, or by least "
+            help="Also show the errors after an alignment with the reference: first pose onto first pose, or by least "
             "squares in the plane, in space, or in space with a scale."
         ),
     ] = "none"
     rpe: Annotated[
-        bool, typer.Option("--rpe", help="Show relative errors too, over a metre of path and over a second.")
+        bool, typer.Option("--rpe", help="Also show relative errors over a metre of path and over a second.")
     ] = False
     overwrite: Overwrite = False
 
     def given(self) -> dict[str, Any]:
-        """The arguments of ``run`` and ``compare`` of the Python interface, except the settings."""
+        """Return the options as keyword arguments for the functions ``run`` and ``compare``, except the settings."""
         given = {key: value for key, value in vars(self).items() if key not in ("set_", "rpe")}
         return given | {"sensors": parse_list(self.sensors) if self.sensors else None}
 
 
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the fields of dataclasses as options, in place of its parameters of these types."""
+    """Decorate a command that has parameters whose types are dataclasses, such as :class:`LogOptions`.
+
+    On the command line each field of such a dataclass is an option of its own. The command receives the filled dataclasses.
+    """
     given = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {p.name: p.annotation for p in given.parameters.values() if is_dataclass(p.annotation)}
     parameters: list[inspect.Parameter] = []
@@ -181,15 +184,18 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def parse_list(text: str) -> tuple[str, ...]:
-    """``a,b`` as ("a", "b")."""
+    """Split a comma-separated list: ``a, b`` becomes ("a", "b")."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def parse_settings(
     texts: Sequence[str], estimators: Sequence[str], sections: Sequence[str] = ()
 ) -> dict[str, dict[str, Any]]:
-    """``smoother.lag=10`` as {"smoother": {"lag": 10}}; InputError for an estimator that is not run. ``sections``: names that are
-    no estimators."""
+    """Parse the values of ``--set``: ``smoother.lag=10`` becomes {"smoother": {"lag": 10}}.
+
+    ``estimators``: names of the estimators that are run. ``sections``: other names that a setting may start with. Raises
+    InputError if a setting starts with another name.
+    """
     from factorgraph_loc.files.models import set_key
     from factorgraph_loc.fusion.registry import check_names
 
@@ -208,7 +214,7 @@ def parse_settings(
 
 
 def nested_changes(texts: Sequence[str]) -> dict[str, Any]:
-    """The values of ``--set`` as nested tables."""
+    """Parse the values of ``--set`` to nested dictionaries: ``a.b=3`` becomes {"a": {"b": 3}}."""
     from factorgraph_loc.files.models import set_key
 
     changes: dict[str, Any] = {}
@@ -218,7 +224,7 @@ def nested_changes(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
-    """``a.b=3`` as ("a.b", 3)."""
+    """Parse the value of an option: ``a.b=3`` becomes ("a.b", 3). ``option``: the name of the option, for the error."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or not value.strip() or text != well_formed(text):
         raise InputError(f"{option} is {quoted(text)}, expected KEY=VALUE")
@@ -226,7 +232,7 @@ def key_and_value(text: str, option: str) -> tuple[str, Any]:
 
 
 def _scalar(text: str) -> Any:
-    """A value as in TOML; text that is not TOML, and dates, stay text."""
+    """Parse a value of TOML. Text that is not TOML, and a date, is returned unchanged."""
     from factorgraph_loc.files.models import parse_toml
 
     try:

@@ -1,4 +1,4 @@
-"""``fgloc rigs``: the rigs that there are, and a first one for a robot."""
+"""The command ``fgloc rigs``, which lists the known rigs, prints a rig, and writes a new rig for a robot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ app = typer.Typer(rich_markup_mode=None)
 
 @app.callback(invoke_without_command=True)
 def rigs(context: typer.Context, json: Json = False) -> None:
-    """List the rigs that there are; print one; write a new one.
+    """List the known rigs, print a rig, or write a new rig.
 
     Example: fgloc rigs
     """
@@ -42,11 +42,11 @@ def rigs(context: typer.Context, json: Json = False) -> None:
 @app.command("show")
 def show_(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="One of the list, or a rig's file.", autocompletion=completion.rig)
+        str, typer.Argument(metavar="NAME", help="A name of the list, or a rig file.", autocompletion=completion.rig)
     ],
     json: Json = False,
 ) -> None:
-    """Print a rig as TOML, each key with its meaning.
+    """Print a rig as TOML, with a comment on each key.
 
     Example: fgloc rigs show plaza
     """
@@ -67,7 +67,7 @@ def show_(
 @app.command()
 def new(
     odometry: Annotated[str | None, typer.Option(metavar="DRIVE", help=f"{', '.join(DRIVES)}.")] = None,
-    imu: Annotated[bool | None, typer.Option("--imu/--no-imu", help="A gyro.")] = None,
+    imu: Annotated[bool | None, typer.Option("--imu/--no-imu", help="Whether there is a gyro.")] = None,
     landmarks: Annotated[
         str | None,
         typer.Option(
@@ -78,7 +78,7 @@ def new(
     antennas: Annotated[
         str | None, typer.Option(metavar="NUMBER|A,B", help="RFID antennas around the body: how many, or their names.")
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="WxH", help="Size of its images, 640x480, or none.")] = None,
+    camera: Annotated[str | None, typer.Option(metavar="WxH", help="Image size, 640x480, or none.")] = None,
     position: Annotated[
         str | None, typer.Option(metavar="METRES", help="Standard deviation of measured positions, or none.")
     ] = None,
@@ -86,7 +86,7 @@ def new(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Write the rig of a robot with some sensors, with comments. At a terminal, options that are not given are asked for.
+    """Write a rig with comments for a robot with the given sensors. At a terminal, the command asks for missing options.
 
     Example: fgloc rigs new --antennas left,right -o cart.rig.toml
     """
@@ -115,8 +115,12 @@ def new(
 
 
 def _value(option: str, given: str | None, default: str, expected: str, parse: Callable[[str], T], asks: bool) -> T:
-    """The value of an option: the given one, else the answer to a question if it ``asks``, else the default. ``parse`` raises
-    KeyError or ValueError for an invalid value; ``expected`` describes valid ones."""
+    """Return the parsed value of an option.
+
+    ``given``: the text on the command line. If it is None and ``asks`` is set, the user is asked until the answer is valid.
+    ``default``: the text that is used without an answer. ``expected``: describes valid texts in messages. ``parse``: raises
+    KeyError or ValueError for an invalid text. Raises InputError for an invalid text that is no answer of the user.
+    """
     while True:
         text = default if given is None else given
         if given is None and asks:

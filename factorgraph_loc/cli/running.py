@@ -1,4 +1,4 @@
-"""``fgloc run`` and ``fgloc compare``: one estimator on one log, or several on several."""
+"""The commands ``fgloc run``, which runs one estimator on one log, and ``fgloc compare``, which runs several on several logs."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from factorgraph_loc.fitting.posterior import FittedConstant
     from factorgraph_loc.model.result import RunResult
 
-SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # the others are in the files
+SHOWN_CONSTANTS, SHOWN_EVENTS = 10, 5  # maximum numbers that are printed; the files of the results have all
 
-COLUMNS = {  # of the table of a run, by score
+COLUMNS = {  # titles of the columns of the table of a run, by the name of the score
     "position_rmse": "position RMSE [m]",
     "position_p95": "95 % [m]",
     "position_max": "max [m]",
@@ -185,8 +185,9 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
         ]
         show.table(("", *COLUMNS.values()), rows)
     else:
-        hardly = f", or too little: {scored} poses scored" if (scored := scores["final.scored"]) is not None else ""
-        show.line(f"there is no reference to score against{hardly}")
+        scored = scores["final.scored"]
+        has_none = "the run is not scored, because the log has no reference"
+        show.line(has_none if scored is None else f"no scores: the reference covers too few poses, {scored}")
     if scores["landmarks.count"]:
         error, anees = (number(scores[f"landmarks.{what}"], n) for what, n in (("rmse", 3), ("anees", 2)))
         show.line(f"learnt landmarks: {scores['landmarks.count']}, aligned RMSE {error} m, ANEES {anees}, ideal 2")
@@ -195,7 +196,7 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
 
 
 def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
-    """The tables that are asked for; nothing without a reference."""
+    """Print the tables of further scores that the options request. A table without any value is not printed."""
     from factorgraph_loc.evaluation.tables import further_tables
 
     for title, keys in further_tables([scores], rpe=rpe).items():

@@ -1,4 +1,4 @@
-"""``fgloc score``: one trajectory against another; ``fgloc features``: repeatability and matching of point features."""
+"""The commands ``fgloc score``, which compares two trajectories, and ``fgloc features``, which compares kinds of point features."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from factorgraph_loc.text import quoted
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """The arguments of ``score`` of the Python interface."""
+    """The options of ``fgloc score`` that are arguments of :func:`factorgraph_loc.api.results.score`."""
 
     align: Annotated[
         Alignment,
@@ -41,19 +41,20 @@ class ScoreOptions:
     all_pairs: Annotated[
         bool,
         typer.Option(
-            "--all-pairs", help="Relative errors over pieces from each pose on, instead of one after the other."
+            "--all-pairs",
+            help="Compute relative errors over overlapping pieces, one from each pose, not over consecutive ones.",
         ),
     ] = False
     align_poses: Annotated[
-        int | None, typer.Option(metavar="N", help="Align by the first N poses; by default by all.")
+        int | None, typer.Option(metavar="N", help="Align by the first N poses only. Default: by all poses.")
     ] = None
     delta: Annotated[
         list[str] | None,
-        typer.Option(metavar="5m|2s", help="Relative errors over this distance or duration too; may be repeated."),
+        typer.Option(metavar="5m|2s", help="Add relative errors over this distance or duration. May be repeated."),
     ] = None
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="OUT", help="Folder for the results; without it they are printed."),
+        typer.Option("--out", "-o", metavar="OUT", help="Folder for the results. Default: results are only printed."),
     ] = None
     overwrite: Overwrite = False
 
@@ -64,11 +65,13 @@ def score(
         str,
         typer.Argument(
             metavar="ESTIMATE",
-            help="A file of poses (TUM, KITTI or EuRoC), BAG:TOPIC, BAG:/tf:PARENT.CHILD, the folder of a run, or a log, which "
-            "stands for its reference.",
+            help="A file of poses (TUM, KITTI or EuRoC), BAG:TOPIC, BAG:/tf:PARENT.CHILD, the folder of a run, or a log, whose "
+            "reference is used.",
         ),
     ],
-    reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Another one, of any of these kinds.")],
+    reference: Annotated[
+        str, typer.Argument(metavar="REFERENCE", help="Another trajectory, given in any form of ESTIMATE.")
+    ],
     aligned: Annotated[bool, typer.Option("-a", help="As in evo: --align se3.")] = False,
     *,
     options: ScoreOptions,

@@ -1,4 +1,4 @@
-"""Terminal output: plain tables that are never truncated, also in a pipe."""
+"""Output of the commands: lines, tables and JSON on stdout, and messages on stderr. Nothing is truncated, also in a pipe."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def line(text: str = "") -> None:
 
 
 def lines(text: str) -> None:
-    """Print text of several lines on stdout, such as a file."""
+    """Print text of several lines on stdout, such as the content of a file. Non-printable characters are escaped."""
     for row in text.split("\n"):
         line(row)
 
 
 def note(text: str) -> None:
-    """Print a line for people on stderr, such as a warning."""
+    """Print a message, such as a warning, as a line on stderr."""
     print(plain(text, None), file=sys.stderr, flush=True)
 
 
 def warnings(doubts: Sequence[object]) -> None:
-    """Print warnings on stderr, one per line; only the first :data:`WARNINGS` of them."""
+    """Print the first :data:`WARNINGS` warnings on stderr, one per line, and the number of the remaining ones."""
     for doubt in doubts[:WARNINGS]:
         note(f"warning: {one_line(str(doubt))}")
     if len(doubts) > WARNINGS:
@@ -42,7 +42,10 @@ def warnings(doubts: Sequence[object]) -> None:
 
 
 def outcome(doubts: Sequence[str], failures: Sequence[str], most: int | None = None, more: str = "") -> None:
-    """Print warnings and failures of several runs on stderr; at ``most`` so many failures, then that there are ``more``."""
+    """Print warnings and failures of several runs on stderr, one per line.
+
+    ``most``: maximum number of failures to print, None for all. ``more``: text that follows the number of the remaining ones.
+    """
     warnings(doubts)
     for failure in failures[:most]:
         note(f"failed: {failure}")
@@ -60,10 +63,10 @@ def document(content: Any) -> None:
 def table(
     header: Sequence[str], rows: Sequence[Sequence[str]], wrapped: Sequence[str] = (), *, grouped: bool = False
 ) -> None:
-    """Print a table on stdout: the first column left-aligned, numbers right-aligned.
+    """Print a table on stdout. The first column is left-aligned, and columns of numbers are right-aligned.
 
-    ``wrapped``: columns of text, which take several lines in a narrow terminal; nothing is truncated. ``grouped``: rows of figures
-    by their first two columns, with a rule below the header, whose words are on lines of their own.
+    ``wrapped``: names of the columns whose text is wrapped in a narrow terminal; no text is truncated. ``grouped``: the first two
+    columns are labels. A line separates rows with different first labels, and each word of the header is on its own line.
     """
     from rich import box
     from rich.console import Console
@@ -81,7 +84,7 @@ def table(
     for row, following in zip(rows, [*rows[1:], None], strict=True):
         ends = grouped and (following is None or following[0] != row[0])
         out.add_row(*(plain(cell, MESSAGE) for cell in row), end_section=ends)
-    # with a height, as rich takes a dumb terminal for 80 columns otherwise
+    # without a height, rich would assume 80 columns in a dumb terminal
     console = Console(markup=False, emoji=False, highlight=False, width=1000, height=1000)
     if sys.stdout.isatty():
         whole = console.measure(out).maximum
@@ -90,7 +93,7 @@ def table(
 
 
 def _terminal_width() -> int:
-    """The width of the terminal that stdout is, which need not be the interpreter's own stream."""
+    """Return the width of the terminal to which stdout is connected, in characters. ``sys.stdout`` may have been replaced."""
     try:
         return os.get_terminal_size(sys.stdout.fileno()).columns
     except OSError:
@@ -98,10 +101,10 @@ def _terminal_width() -> int:
 
 
 def first_use() -> None:
-    """Announce before a run that kernels have to be compiled, if none are yet."""
-    from factors.odometry.kernels import relative  # which every run needs
+    """Announce that numba will compile functions, if the cache has no compiled function yet. Call this before a run."""
+    from factors.odometry.kernels import relative  # a compiled function that every run calls
 
-    function: Any = relative  # as numba makes it
+    function: Any = relative  # numba replaces it by an object with statistics
     cache = function.stats.cache_path
     if cache is None or not any(Path(cache).glob("*.relative-*.nbi")):
         note("the first use compiles for up to a minute; later ones do not")
@@ -109,9 +112,10 @@ def first_use() -> None:
 
 @contextmanager
 def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
-    """A progress bar on stderr, as a function of done, total and an optional remark; silent if stderr is no terminal.
+    """Show a progress bar on stderr in this block. If stderr is no terminal, nothing is shown.
 
-    ``counted``: show done and total as counts, else a percentage.
+    Yields a function ``update(done, total, remark="")`` that moves the bar. ``what``: title of the bar. ``counted``: if set, the
+    bar shows ``done`` and ``total`` as counts, otherwise a percentage.
     """
     from rich.console import Console
     from rich.progress import (
@@ -133,7 +137,7 @@ def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
 
 
 def fields(content: Mapping[str, str]) -> None:
-    """Print names and values, one pair per line."""
+    """Print the names and values of a dictionary, one pair per line."""
     width = max(map(len, content))
     for name, value in content.items():
         line(f"{name:<{width}}  {value}")

@@ -1,5 +1,7 @@
-"""Ends of the command: on a signal it removes temporary files first. If standard output or standard error are closed, full or
-cannot encode text, it ends with one line and an exit code.
+"""Orderly ends of a command after a signal, and when its output cannot be written.
+
+After a signal the command removes its temporary files and prints one line. If standard output is closed or its disk is full, the
+command ends with one line and an exit code.
 """
 
 import io
@@ -16,13 +18,13 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import error_text
 
-RETRY_INTERVAL = 0.05  # s
+RETRY_INTERVAL = 0.05  # s until a signal is sent again whose exception was lost
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
-PIPE_CLOSED = 141  # 128 and the number of SIGPIPE, as in shells
+PIPE_CLOSED = 141  # exit code: 128 plus the number of SIGPIPE, as in shells
 
 
 class Stop(KeyboardInterrupt):
-    """A signal that ends the command."""
+    """Raised in the main thread when a signal ends the command. ``number``: the signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -30,8 +32,8 @@ class Stop(KeyboardInterrupt):
 
 
 def end(stop: KeyboardInterrupt) -> int:
-    """Remove temporary files and print one line on stderr with the cause and the notes of the exception. Returns the exit code,
-    128 plus the number of the signal."""
+    """Remove temporary files and print one line on stderr with the signal and the notes of the exception. Return the exit code,
+    which is 128 plus the number of the signal."""
     from factorgraph_loc.files.temporary import remove_own
 
     remove_own()
@@ -42,8 +44,9 @@ def end(stop: KeyboardInterrupt) -> int:
 
 @contextmanager
 def unwrapped() -> Iterator[None]:
-    """Raise the :class:`Stop` behind an exception in place of that: while compiled modules are loaded they turn it into an
-    ImportError.
+    """Replace an exception in this block by the :class:`Stop` that caused it, if any.
+
+    Compiled modules that are being imported turn a :class:`Stop` into an ImportError.
     """
     try:
         yield
@@ -58,10 +61,10 @@ def unwrapped() -> Iterator[None]:
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Raise the signals of :data:`WORDS` as :class:`Stop` in this block, except those that were ignored before.
+    """Raise :class:`Stop` when a signal of :data:`WORDS` arrives in this block. Signals that the process ignores stay ignored.
 
-    A second signal ends the process as usual. If Python cannot propagate the exception, in a destructor or callback, the signal
-    is sent again.
+    A second signal ends the process immediately. Python drops exceptions in destructors and callbacks. If it drops a
+    :class:`Stop`, the signal is sent again.
     """
     handlers: dict[signal.Signals, Any] = {}
     hook = sys.unraisablehook
@@ -92,11 +95,11 @@ def stoppable() -> Iterator[None]:
 
 
 class OutputError(InputError):
-    """Standard output is closed, or its file system is full."""
+    """Standard output cannot be written, because it is closed or its disk is full."""
 
 
 class _Output(io.TextIOWrapper):
-    """Standard output. If the reader of a pipe closes it, the command ends silently."""
+    """Standard output. If the reader of a pipe has closed it, the command ends silently; other errors raise OutputError."""
 
     def write(self, text: str, /) -> int:
         try:
@@ -119,7 +122,7 @@ class _Output(io.TextIOWrapper):
 
 
 class _Messages(_Output):
-    """Standard error; failures to write are ignored, because they cannot be reported."""
+    """Standard error. Write errors are ignored, because they cannot be reported anywhere."""
 
     def give_up(self, _: OSError) -> None:
         _discard(2)
@@ -127,16 +130,17 @@ class _Messages(_Output):
 
 @contextmanager
 def standard_streams() -> Iterator[None]:
-    """Replace the standard streams of the interpreter in this block, and flush them at its end.
+    """Replace ``sys.stdout`` and ``sys.stderr`` by streams that handle write errors. Flush them at the end of the block.
 
-    A closed descriptor is opened on the null device, so that no other file gets its number.
+    A closed descriptor 0, 1 or 2 is opened on the null device, so that no other file gets its number.
     """
-    for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):  # read-only 1 keeps refusing writes
+    # descriptor 1 is opened for reading, so that writes to a closed standard output still fail
+    for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, mode), True)  # gets the lowest free number, which is this one
-    if sys.stdout is sys.__stdout__:  # otherwise it was replaced, as in a test
+            os.set_inheritable(os.open(os.devnull, mode), True)  # the lowest free descriptor is ``number``
+    if sys.stdout is sys.__stdout__:  # false if a caller, such as a test, has replaced it
         sys.stdout = _replaced(sys.stdout, 1, _Output, "replace")
     if sys.stderr is sys.__stderr__:
         sys.stderr = _replaced(sys.stderr, 2, _Messages, "backslashreplace")
@@ -148,7 +152,11 @@ def standard_streams() -> Iterator[None]:
 
 
 def _replaced(stream: TextIO | None, number: int, kind: type[io.TextIOWrapper], errors: str) -> io.TextIOWrapper:
-    """A stream of ``kind`` on the target of ``stream``; None if the descriptor was closed."""
+    """Return a stream of class ``kind`` that writes to the descriptor of ``stream``.
+
+    ``number``: the descriptor to use if ``stream`` is None, which means that it was closed when Python started. ``errors``: how
+    characters that cannot be encoded are replaced.
+    """
     if not isinstance(stream, io.TextIOWrapper):
         return kind(os.fdopen(number, "wb", closefd=False), "utf-8", errors)
     encoding, unbuffered, by_line = stream.encoding, stream.write_through, stream.line_buffering
@@ -156,7 +164,7 @@ def _replaced(stream: TextIO | None, number: int, kind: type[io.TextIOWrapper], 
 
 
 def _discard(number: int) -> None:
-    """Redirect the descriptor and its buffered data to the null device."""
+    """Redirect a descriptor to the null device, so that data in its buffer are discarded."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, number)
     os.close(null)

@@ -1,4 +1,4 @@
-"""``fgloc view`` and ``fgloc export``: results and their log in a viewer, and in the formats of other programs."""
+"""The commands ``fgloc view``, which shows runs and their log in a viewer, and ``fgloc export``, which writes foreign formats."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ What = Annotated[
     list[str],
     typer.Argument(
         metavar="RUN...|LOG",
-        help="Folders of `fgloc run` or `fgloc compare`, and their log if `fgloc datasets` does not list it; or a log only.",
+        help="Folders of results of `fgloc run` or `fgloc compare`; add their log if `fgloc datasets` lacks it. Or only a log.",
     ),
 ]
 
@@ -28,20 +28,20 @@ What = Annotated[
 def view(
     what: What,
     rrd: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write a file for the viewer instead of opening it.")
+        Path | None, typer.Option(metavar="FILE", help="Write this file for Rerun instead of opening Rerun.")
     ] = None,
     bind: Annotated[
         str,
         typer.Option(
             metavar="ADDRESS",
-            help="IP address that the viewer listens on, without credentials; only this machine reaches the default one.",
+            help="IP address on which the viewer listens without a password. The default is reachable from this machine only.",
         ),
     ] = LOOPBACK,
     *,
     source: LogOptions,
     json: Json = False,
 ) -> None:
-    """Show a log and its runs over time, in Rerun.
+    """Show a log and its runs over time in the viewer Rerun.
 
     Example: fgloc view out/plaza1
     """
@@ -56,7 +56,7 @@ def view(
 
 
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
-    """The content of the view or the written files, for ``--json``."""
+    """Return the names of the log and of the runs, and the runs' folders, for ``--json``."""
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 
@@ -76,7 +76,7 @@ def export(
     source: LogOptions,
     json: Json = False,
 ) -> None:
-    """Write runs for Foxglove and RViz, or the final trajectory of a run or the reference of a log for other programs.
+    """Write runs for Foxglove and RViz. Or write the final trajectory of a run, or the reference of a log, for other programs.
 
     Example: fgloc export out/plaza1 -o plaza1.tum
     """

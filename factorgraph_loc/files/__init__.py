@@ -1,4 +1,4 @@
-"""Validated reading and atomic writing of files: text, tables, arrays, images, and models of settings."""
+"""Validated reading and atomic writing of files: text, tables, arrays, images, and settings (pydantic models)."""
 
 __all__ = [
     "bounded",

@@ -1,7 +1,8 @@
-"""Reading of files within limits of size and time, and without the messages that C and Rust libraries print about damaged ones.
+"""Reading of files within limits of size and memory, without the messages that C and Rust libraries print about damaged files.
 
-All files are opened here: only regular files, because a FIFO blocks and a device never ends. Sizes, including declared ones, are
-checked before memory is allocated. libpng and libjpeg ignore OpenCV's log level; polars prints from its threads before it raises.
+All input files are opened by this module. They must be regular files, because a FIFO blocks and a device never ends. The size of a
+file, and sizes that its header declares, are checked before memory is allocated. Messages of libraries must be suppressed at the
+descriptor: libpng and libjpeg ignore the log level of OpenCV, and polars prints from its threads before it raises.
 """
 
 import errno
@@ -19,19 +20,21 @@ from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.text import error_text, plain, quoted
 
 SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
-YAML = 2**16  # bytes of a YAML file, which is a hundred times slower to read
+YAML = 2**16  # bytes of a YAML file, which is a hundred times slower to read than TOML
 DEFINITION = 2**20  # characters of the definition of a ROS message, which is compiled to functions
-DATA = 2**30  # bytes of a table, a text or a MATLAB file, packed and unpacked
-IMAGE = 2**28  # bytes of an image's file
-GRID = 2**26  # bytes of a grid, unpacked
-PIXELS = 2**26  # of an image; the limit of OpenCV is 2^30
+DATA = 2**30  # bytes of a table, a text or a MATLAB file, compressed and uncompressed
+IMAGE = 2**28  # bytes of an image file
+GRID = 2**26  # bytes of an uncompressed occupancy grid
+PIXELS = 2**26  # pixels of an image; the limit of OpenCV is 2^30
 CELLS = 2**27  # rows times columns that a Parquet file declares
 MEMORY, MEMORY_PER_BYTE = 2**30, 32  # bytes that reading a file may take, and in addition for each byte of the file
 CHECK_INTERVAL = 0.01  # s between checks of the memory
-LARGEST_POINTER = 1024  # bytes, as its specification says
+LARGEST_POINTER = 1024  # bytes of a pointer file of Git LFS, by its specification
 
-_limited = threading.Event()  # whether this process limits the memory that reading a file takes
-POINTER = b"version https://git-lfs.github.com/spec/v1"  # first line of what Git LFS leaves in place of a file
+_limited = threading.Event()  # set if this process limits the memory that reading a file takes
+POINTER = (
+    b"version https://git-lfs.github.com/spec/v1"  # first line of a pointer file, which replaces a file not downloaded
+)
 _KINDS = {
     stat.S_IFREG: "a file",
     stat.S_IFDIR: "a folder",
@@ -43,14 +46,14 @@ _KINDS = {
 
 
 class NoFileNameError(InputError):
-    """A name that no file can have."""
+    """A name cannot be the name of a file, because it is too long or contains an invalid character."""
 
 
 def kind(path: Path, source: object = None) -> str:
-    """The kind of a path: "a file", "a folder", "a named pipe", "a socket", "a device", or "" if nothing exists.
+    """Return the kind of a path: "a file", "a folder", "a named pipe", "a socket", "a device", or "" if nothing exists there.
 
-    NoFileNameError if no file can have that name, InputError if access is denied; ``source`` is named in messages, by default the
-    path.
+    ``source``: the file or option that contains the path, for messages; None for the path itself. Raises NoFileNameError if no file
+    can have that name, and InputError if access is denied.
     """
     try:
         return _kind(path.stat())
@@ -62,23 +65,29 @@ def kind(path: Path, source: object = None) -> str:
                 f"{source or plain(path)}: {quoted(str(path))} cannot be the name of a file: too long"
             ) from error
         raise InputError(f"{source or plain(path)}: {quoted(str(path))} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # NUL, or half of a pair of UTF-16
+    except ValueError as error:  # a NUL character, or half of a UTF-16 surrogate pair
         raise NoFileNameError(f"{source or plain(path)}: {quoted(str(path))} cannot be the name of a file") from error
 
 
 def require_size(source: object, what: str, size: int, limit: int) -> None:
-    """InputError if ``size``, in bytes or as ``what`` says, exceeds ``limit``; call this before allocating memory."""
+    """Raise InputError if ``size`` exceeds ``limit``. Call this before memory of that size is allocated.
+
+    ``source``: the file. ``what``: the quantity that ``size`` measures, such as "its size in bytes"; both are for the message.
+    """
     if not 0 <= size <= limit:
         raise InputError(f"{plain(source)}: {what} is {size:,}, expected at most {limit:,}")
 
 
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
-    """Open a regular file of at most ``limit`` bytes for reading; InputError if that is impossible."""
+    """Open a regular file of at most ``limit`` bytes for reading in this block.
+
+    Raises InputError if the file is missing, not regular, larger, unreadable, or a pointer file of Git LFS.
+    """
     if kind_of_path := kind(path):
         _require_file(path, kind_of_path)
     try:
-        # non-blocking, in case a FIFO has replaced the file since
+        # non-blocking: a FIFO may have replaced the file after the check
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb")
     except OSError as error:
         raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
@@ -92,29 +101,30 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """The content of a regular file of at most ``limit`` bytes; InputError as in :func:`opened`."""
+    """Return the content of a regular file of at most ``limit`` bytes. Raises InputError as :func:`opened`."""
     with opened(path, limit) as file:
         try:
             content = file.read()
         except OSError as error:
             raise InputError(f"{plain(path)}: cannot be read: {error.strerror}") from error
-    require_size(path, "its size in bytes", len(content), limit)  # it may have grown
+    require_size(path, "its size in bytes", len(content), limit)  # the file may have grown since it was opened
     return content
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copy the regular file ``source`` to the new file ``target``. InputError if ``source`` cannot be read, OSError if ``target``
-    cannot be written."""
+    """Copy the regular file ``source`` to the new file ``target``. Raises InputError if ``source`` cannot be read, and OSError if
+    ``target`` exists or cannot be written."""
     with opened(source, sys.maxsize) as file, target.open("xb") as copy:
         shutil.copyfileobj(file, copy, 2**20)
 
 
 @contextmanager
 def foreign(source: object, what: str) -> Iterator[None]:
-    """Convert any exception of another library on invalid content to an InputError that says ``what`` the file is not.
+    """Convert any exception of a parser in this block to an InputError with the message "SOURCE: WHAT: ...".
 
-    Use it for calls of parsers only. They raise nearly anything on damaged files: numpy tokenize.TokenError, zlib its own error,
-    polars PanicException, which is not an Exception.
+    ``source``: the file. ``what``: the problem, such as "is not TOML". The block should contain only the call of the parser. On
+    damaged files parsers raise unusual exceptions: numpy tokenize.TokenError, zlib its own error, and polars PanicException, which
+    does not derive from Exception.
     """
     try:
         yield
@@ -126,21 +136,22 @@ def foreign(source: object, what: str) -> Iterator[None]:
         raise InputError(f"{plain(source)}: {what}: it is nested too deeply") from error
     except BaseException as error:
         if not isinstance(error, Exception) and type(error).__module__ != "pyo3_runtime":
-            raise  # a signal
+            raise  # KeyboardInterrupt, SystemExit or the like
         raise InputError(f"{plain(source)}: {what}: {error_text(error)}") from error
 
 
 def limit_memory() -> None:
-    """From now on, end this process where reading a file takes too much memory; see :func:`limited_memory`. For commands."""
+    """Enable :func:`limited_memory` in this process. Commands call this; programs that import the package do not."""
     _limited.set()
 
 
 @contextmanager
 def limited_memory(source: object, size: int) -> Iterator[None]:
-    """End a command with one line if this block, which reads ``source`` of ``size`` bytes, takes more than :data:`MEMORY`.
+    """End the process with one line on stderr if this block takes too much memory. No effect without :func:`limit_memory`.
 
-    A few kilobytes may unpack to gigabytes, and polars does not report the size in advance. A limit of the operating system is no
-    alternative: compiled parsers abort without a message if memory is refused.
+    ``source``: the file that the block reads. ``size``: its size in bytes. The limit is :data:`MEMORY` plus
+    :data:`MEMORY_PER_BYTE` times the size. A file of a few kilobytes may unpack to gigabytes, and polars does not report that size
+    in advance. A limit set in the operating system is no alternative, because compiled parsers then abort without a message.
     """
     if not _limited.is_set():
         yield
@@ -167,7 +178,7 @@ def limited_memory(source: object, size: int) -> Iterator[None]:
 
 
 def resident_memory(pid: int | None) -> float:
-    """Resident memory of a process in bytes; 0 if unknown."""
+    """Return the resident memory of the process with number ``pid`` in bytes, or 0 if it is unknown."""
     try:
         return float(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError):
@@ -185,10 +196,10 @@ def _require_file(path: Path, kind: str) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Discard writes to descriptor 2 in this block; only in the main thread, otherwise it has no effect.
+    """Discard all output to descriptor 2 (stderr) in this block. No effect outside of the main thread.
 
-    The descriptor is shared by all threads, so their messages are lost too. Therefore a block should contain only the call that
-    reads one file. In several threads, such blocks could leave the descriptor redirected for good.
+    All threads share the descriptor, so messages of other threads are discarded too. Therefore the block should contain only the
+    call that reads one file. If several threads did this at once, the descriptor could stay redirected.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

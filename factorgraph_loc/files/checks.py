@@ -1,4 +1,8 @@
-"""Checks that all readers apply to their rows: an InputError with the row, or a warning if the data can be corrected."""
+"""Checks that all readers of logs apply to the rows of their files.
+
+Each check raises an InputError that names the invalid row. If the data can be corrected, it adds a warning instead. In this module
+``rows`` (N,) are the row numbers in the file ``source``, and ``warnings`` is a list to which warnings are appended.
+"""
 
 from collections.abc import Hashable, Iterable, Sequence
 
@@ -10,19 +14,21 @@ from factorgraph_loc.text import Notice, listed, notice
 from factors.odometry.model import composed
 from factors.se2 import Array, Integers
 
-MAX_LATE_NS = 500_000_000  # the delay that estimators can handle
-ROUNDING = 1e-6  # s; tolerance of differences of timestamps
+MAX_LATE_NS = 500_000_000  # ns; maximum delay of a measurement that estimators can process
+ROUNDING = 1e-6  # s; tolerance of comparisons of time differences
 
 
 def require_finite(source: object, rows: Integers, names: Sequence[str], table: Array) -> None:
-    """InputError at a number of ``table`` (N, K) that is NaN or infinite; ``rows`` (N,): row numbers in ``source``; ``names``: of
-    the K columns."""
+    """Raise InputError at the first number of ``table`` (N, K) that is NaN or infinite. ``names``: the names of the K columns."""
     for name, values in zip(names, table.T, strict=True):
         require(np.isfinite(values), source, rows, name, values, "a finite number")
 
 
 def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
-    """Indices (M,) of the rows to keep of a stream with non-decreasing timestamps (N,): the last one of equal timestamps."""
+    """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last one.
+
+    Raises InputError if a timestamp is older than the one before it.
+    """
     _require_order(source, rows, t_ns)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
     if dropped := len(t_ns) - len(keep):
@@ -34,7 +40,11 @@ def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[Noti
 def increments_in_order(
     source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[Notice]
 ) -> tuple[Integers, Array]:
-    """Timestamps (M,) and motions (M, 3) since the one before: ``moves`` (N, 3) with equal timestamps (N,) are composed."""
+    """Merge the odometry increments that have equal timestamps ``t_ns`` (N,), by composition of their motions.
+
+    ``moves`` (N, 3): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there. Returns distinct timestamps
+    (M,) and the motion (M, 3) since the timestamp before. Raises InputError if a timestamp is older than the one before it.
+    """
     _require_order(source, rows, t_ns)
     last, out = composed(t_ns, moves)
     if joined := len(t_ns) - len(last):
@@ -44,7 +54,7 @@ def increments_in_order(
 
 
 def _require_order(source: object, rows: Integers, t_ns: Integers) -> None:
-    """InputError at the first row whose timestamp is older than the one before it."""
+    """Raise InputError at the first row whose timestamp is older than that of the row before it."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
@@ -55,7 +65,11 @@ def _require_order(source: object, rows: Integers, t_ns: Integers) -> None:
 def arrivals(
     source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], *, max_late_ns: int | None = MAX_LATE_NS
 ) -> None:
-    """Check timestamps (N,) in order of arrival: one older than an earlier one is late, and an InputError above ``max_late_ns``."""
+    """Check the delays of timestamps ``t_ns`` (N,) in order of arrival. A timestamp older than a previous one is late.
+
+    Late timestamps cause a warning. Raises InputError if one is older than the newest before it by more than ``max_late_ns``; None
+    permits any delay.
+    """
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
     if max_late_ns is not None and np.any(late > max_late_ns):
@@ -68,15 +82,17 @@ def arrivals(
 
 
 def unread_columns(source: object, names: Iterable[str]) -> Notice:
-    """The warning about columns that no option reads."""
+    """Return the warning that the columns ``names`` of the file ``source`` are not read."""
     return notice("unread_columns", "{source}: columns that are not read: {columns}", source, listed(names))
 
 
 def last_in_order(
     source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], names: Sequence[str] | None = None
 ) -> Integers:
-    """Indices (M,) of the rows to keep, in order of arrival: the last row of equal timestamps (N,), and of equal ``names`` if
-    given.
+    """Return the indices (M,) of the rows to keep, in order of arrival: of rows with equal timestamps only the last one.
+
+    ``t_ns`` (N,): timestamps, which are checked by :func:`arrivals`. ``names``: N landmarks; if given, only rows with equal
+    timestamp and landmark count as equal.
     """
     arrivals(source, rows, t_ns, warnings)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)
@@ -84,22 +100,22 @@ def last_in_order(
     if dropped := len(t_ns) - len(last):
         sentence = "{source}: {rows} rows have the timestamp of a later row and are skipped"
         if names is not None:
-            sentence = "{source}: {rows} rows see a landmark that a later row sees at the same timestamp: skipped"
+            sentence = "{source}: {rows} rows are skipped, because a later row has the same landmark and timestamp"
         warnings.append(notice("same_stamp", sentence, source, dropped))
     return np.array(sorted(last.values()), dtype=np.int64)
 
 
 def stamps(source: object, rows: Integers, t: Array) -> Integers:
-    """Timestamps (N,) [s] in nanoseconds; InputError beyond 64 bits."""
+    """Convert timestamps ``t`` (N,) [s] to nanoseconds. Raises InputError if one exceeds the range of 64-bit integers."""
     SECONDS.require(source, rows, t, "time")
     return np.asarray(np.rint(t * 1e9).astype(np.int64))
 
 
 def absolute(t: Array, t0_ns: int) -> Integers:
-    """Times (N,) in seconds after ``t0_ns`` as timestamps in nanoseconds."""
+    """Convert times (N,) [s] since ``t0_ns`` [ns] to timestamps [ns]."""
     return np.asarray(np.rint(t * 1e9).astype(np.int64) + t0_ns)
 
 
 def seconds(t_ns: Integers, t0_ns: int) -> Array:
-    """Timestamps (N,) in nanoseconds as seconds after ``t0_ns``."""
+    """Convert timestamps (N,) [ns] to times [s] since ``t0_ns`` [ns]."""
     return np.asarray((t_ns - t0_ns) / 1e9, dtype=float)

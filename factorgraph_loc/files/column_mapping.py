@@ -1,6 +1,7 @@
-"""Reading of foreign tables by a mapping from their columns and units to fields.
+"""Reading of tables of other programs: CSV with any separator, with or without a header, or JSON lines.
 
-CSV with any separator, with or without header, or JSON lines. The cells are read as text."""
+A mapping in a manifest assigns columns of the file, with their units, to fields of a sensor's table. The cells are read as text.
+"""
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -17,35 +18,35 @@ from factorgraph_loc.files.tables import Cells, csv_rows, rows_of_length
 from factorgraph_loc.text import Notice, listed, notice, quoted, well_formed
 from factors.se2 import Integers
 
-TEXT_FIELDS = ("epc_base64",)  # a number is no value of these
+TEXT_FIELDS = ("epc_base64",)  # fields whose values in JSON must be texts, not numbers
 JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
 
 EpcCase = Literal["as written", "upper", "lower", "ascii-hex"]
-Alternatives = tuple[str, ...]  # columns; one of them is required
+Alternatives = tuple[str, ...]  # names of columns, of which a file must have at least one
 Value = bool | int | str
 
 
 class ReadNames(FileModel):
-    """The names in a table or topic of RFID reads."""
+    """How names of antennas and EPCs in a table or topic of RFID reads are converted to those of the rig and the map."""
 
     antenna: str | None = None
     """name of the only antenna, if the reads do not name it"""
     antennas: dict[str, str] = Field(default_factory=dict)
-    """names in the rig of those of the reads"""
+    """name in the rig for each antenna name in the reads"""
     epc_case: EpcCase = "as written"
-    """letter case of EPCs when they are compared with the map; ascii-hex if they are hexadecimal digits of a text"""
+    """letter case of EPCs when they are compared with the map; ascii-hex decodes hexadecimal digits to a text"""
 
 
 class ColumnMapping(FileModel):
-    """A table of another program."""
+    """How a table of another program is read."""
 
     file: str
     """file of the table, relative to the path of the manifest"""
     columns: dict[str, str]
     """column of the file for each field; in JSON lines a path of keys, such as event.epc; without header the number from 1"""
     units: dict[str, str | float] = Field(default_factory=dict)
-    """unit of each field, or a factor to ours"""
+    """unit of each field, or the factor that converts its values to the unit of the native format"""
     separator: Literal[",", ";", "\t", " "] = ","
     """separator of the columns"""
     decimal: Literal[".", ","] = "."
@@ -53,10 +54,10 @@ class ColumnMapping(FileModel):
     header: bool = True
     """whether the first row has the names of the columns"""
     where: dict[str, Value | tuple[Value, ...]] = Field(default_factory=dict)
-    """value, or possible values, that columns of the file have in the rows to read"""
+    """which rows to read: by column of the file, the value or the list of possible values"""
 
     def chosen(self) -> dict[str, set[str]]:
-        """The values of ``where`` as the text of cells."""
+        """Return ``where`` as texts: for each of its columns, the set of cells that the rows to read may have."""
         return {
             column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
             for column, values in self.where.items()
@@ -64,7 +65,7 @@ class ColumnMapping(FileModel):
 
 
 class TimedMapping(ColumnMapping):
-    """A table of another program with timestamps."""
+    """How a table of another program with timestamps is read."""
 
     clock_offset: Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")] = 0.0
     """added to all timestamps"""
@@ -77,10 +78,13 @@ def read_mapped(
     optional: Collection[str] = (),
     either: Collection[str] = (),
 ) -> Cells:
-    """Read the rows of a file whose mapped fields are those of one of ``shapes``, and perhaps some of ``optional``.
+    """Read the cells of a file that a mapping assigns to fields.
 
-    The column of an optional field may be missing, but not those of all mapped fields of ``either``. InputError names file, row and
-    column of invalid values.
+    ``shapes``: sets of fields. The mapping must have all fields of one of these sets.
+    ``optional``: fields that the mapping may have too. The file may lack their columns.
+    ``either``: fields whose columns the file may lack too, but it must have at least one of those that the mapping has.
+
+    Raises InputError with file, row and column if the mapping or the file is invalid, or no row is selected.
     """
     given = set(mapping.columns)
     known = set(optional).union(*shapes)
@@ -113,7 +117,11 @@ def _mapped(
     unwanted: int,
     passed: int = 0,
 ) -> Cells:
-    """The cells by field of the ``columns`` of a file with the columns ``available``."""
+    """Return the cells of a file by field.
+
+    ``columns``: cells by column of the file. ``available``: names of all columns of the file. ``unwanted``: number of rows that
+    ``where`` excludes. ``passed``: number of JSON objects that lack needed columns.
+    """
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
     left_out = tuple(name for name in available if name not in read)
@@ -122,10 +130,10 @@ def _mapped(
 
 
 class TableFolder:
-    """A folder of tables, with notes on unread rows and columns.
+    """Reads the tables of a folder, and records which rows and columns are not read.
 
-    ``warnings``: about the content of the tables. Several mappings may read one file. A row or column counts as read if one
-    of them reads it.
+    ``warnings``: warnings about the content of the tables. Several mappings may read one file. A row or column of the file counts
+    as read if any of them reads it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -134,15 +142,15 @@ class TableFolder:
         self._read: dict[Path, list[tuple[Cells, ColumnMapping]]] = {}
 
     def file(self, name: str) -> Path:
-        """The path of a file in the folder; InputError if it lies elsewhere."""
+        """Return the path of a file in the folder. Raises InputError if the path leads out of the folder."""
         return inside(self.path, name, self.path)
 
     def read(self, mapping: ColumnMapping, shapes: Sequence[Collection[str]]) -> Cells:
-        """Read the table of a mapping as :func:`read_mapped`, with :meth:`noted`."""
+        """Read the file of a mapping by :func:`read_mapped`, and record what was read by :meth:`noted`."""
         return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping)
 
     def noted(self, cells: Cells, mapping: ColumnMapping) -> Cells:
-        """Record which content of their file the ``cells`` use, for warnings about the rest, and return the cells."""
+        """Record the rows and columns from which ``cells`` were read. Return ``cells`` unchanged."""
         if cells.passed:
             sentence = "{source}: {objects} objects that lack mapped columns are skipped"
             self.warnings.append(notice("incomplete_objects", sentence, cells.path, cells.passed))
@@ -150,7 +158,8 @@ class TableFolder:
         return cells
 
     def left_out(self) -> list[Notice]:
-        """A warning for each file with rows that no mapping chooses, and one for all files with the same unread columns."""
+        """Return warnings about data that no mapping reads: one for each file with such rows, and one for all files that have the
+        same unread columns."""
         warnings = []
         columns: dict[tuple[str, ...], list[str]] = {}
         for path, tables in self._read.items():
@@ -158,11 +167,13 @@ class TableFolder:
             count = tables[0][0].unwanted + len(tables[0][0].rows)
             unchosen = count if all(cells.unwanted for cells, _ in tables) else 0
             for rows in (cells.rows.tolist() for cells, _ in tables):
-                unchosen -= sum(row not in read for row in rows)  # a line of JSON may hold several
+                unchosen -= sum(row not in read for row in rows)  # several rows of one JSON line have the same number
                 read.update(rows)
             if unchosen > 0:
                 names = listed(dict.fromkeys(name for _, mapping in tables for name in mapping.where))
-                sentence = "{source}: {unchosen} of {rows} rows have another {columns} than where says"
+                sentence = (
+                    "{source}: {unchosen} of {rows} rows are not read, because their {columns} is not a value of where"
+                )
                 rows_of_file = count + tables[0][0].passed
                 warnings.append(notice("unchosen_rows", sentence, path.name, unchosen, rows_of_file, names))
             never = [set(cells.left_out) for cells, _ in tables]
@@ -176,7 +187,8 @@ class TableFolder:
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
-    """EPCs in the letter case of the comparison with the map, or decoded; those that cannot be decoded are unchanged."""
+    """Convert EPCs to the letter case ``case``, or decode hexadecimal digits if it is "ascii-hex". EPCs that cannot be decoded
+    stay unchanged."""
     if case == "as written":
         return list(epcs)
     if case == "ascii-hex":
@@ -185,7 +197,7 @@ def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
 
 
 def text_of_hex(digits: str) -> str:
-    """The ASCII text whose bytes are these hexadecimal digits; "" for others."""
+    """Decode hexadecimal digits to an ASCII text without trailing NULs. Return "" if they are no ASCII text."""
     try:
         return bytes.fromhex(digits).decode("ascii").rstrip("\0")
     except ValueError:
@@ -193,7 +205,8 @@ def text_of_hex(digits: str) -> str:
 
 
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """The mapped cells of the chosen rows of a table."""
+    """Read the mapped columns of a CSV file, in the rows that ``where`` selects. Raises InputError if a column of ``needed`` is
+    missing."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     if not content:
@@ -219,18 +232,22 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
 
 
 def _numbers(count: int) -> list[str]:
-    """The names of ``count`` columns without header."""
+    """Return the names "1", "2", ... of the ``count`` columns of a file without a header."""
     return [str(i) for i in range(1, count + 1)]
 
 
 def _is_chosen(parts: Sequence[str], header: Sequence[str], where: Mapping[str, set[str]]) -> bool:
-    """Whether a row has one of the values of ``where`` in each of its columns."""
+    """True if the row with cells ``parts`` has one of the allowed values in each column of ``where``."""
     cells = dict(zip(header, parts, strict=False))
     return all(cells.get(name) in values for name, values in where.items())
 
 
 def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
-    """Split off the comments before the first row, without their marks; the last one may be the header."""
+    """Separate comments from rows of data. ``lines``: line numbers and texts.
+
+    Returns the comments before the first row of data, without comment marks, and the rows of data. Both have their line numbers.
+    The last of these comments may be the header.
+    """
     content = [(row, line) for row, line in lines if not line.lstrip().startswith(COMMENT)]
     until = content[0][0] if content else 0
     comments = [(row, line.lstrip().lstrip("#/").strip()) for row, line in lines if row < until]
@@ -238,20 +255,23 @@ def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, st
 
 
 def parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
-    if separator == " ":  # any number of blanks
+    """Split numbered lines into cells. Return the line number and the cells of each row."""
+    if separator == " ":  # stands for any number of blanks
         return ((row, line.split()) for row, line in lines)
     rows = csv_rows(path, lines, delimiter=separator, skipinitialspace=True)
     return ((row, [part.strip() for part in parts]) for row, parts in rows)
 
 
 def _has(names: Collection[str], needed: Sequence[Alternatives]) -> bool:
+    """True if ``names`` has at least one column of each entry of ``needed``."""
     return all(any(column in names for column in columns) for columns in needed)
 
 
 def _require_columns(
     path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives], header: Sequence[str], row: int
 ) -> None:
-    """InputError if a needed column is missing, or a mapped one is there twice."""
+    """Raise InputError if a needed column is missing in ``header``, or a mapped column occurs twice. ``row``: line number of the
+    header."""
     counts = Counter(header)
     for columns in [*needed, *((column,) for column in mapping.where)]:
         if not _has(counts, [columns]):
@@ -262,8 +282,10 @@ def _require_columns(
 
 
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """The mapped cells of the chosen objects of JSON lines (one object or a list of them per line) that have all ``needed``
-    columns."""
+    """Read the mapped columns of JSON lines, whose lines are objects or lists of objects.
+
+    Only objects are read that ``where`` selects and that have all ``needed`` columns. Raises InputError if none has such a column.
+    """
     objects = list(_objects(path))
     where = mapping.chosen()
     chosen = [(row, o) for row, o in objects if all(_text(o.get(name)) in values for name, values in where.items())]
@@ -289,14 +311,15 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
 
 
 def _text(value: Any) -> str:
-    """A value of JSON or TOML as the text of a cell."""
+    """Convert a value of JSON or TOML to the text that a cell of CSV would have. None becomes ""."""
     if isinstance(value, bool):
         return str(value).lower()
     return "" if value is None else well_formed(str(value))
 
 
 def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-    """The line numbers and the objects of JSON lines, with the values of nested objects by paths of keys, joined by dots."""
+    """Return the line number and the content of each object of JSON lines. The key of a nested value is the path of keys to it,
+    joined by dots."""
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
@@ -309,5 +332,5 @@ def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _alone(value: Any) -> Any:
-    """The element of a list of one; any other value itself."""
+    """Return the element of a list that has one element. Return any other value unchanged."""
     return value[0] if isinstance(value, list) and len(value) == 1 else value

@@ -1,7 +1,7 @@
 """Descriptions of the tables of sensors: columns with unit, bounds and meaning, used for all input of measurements.
 
-Bounds are wide enough for any real recording and narrow enough to avoid overflow; values outside have a wrong unit or are garbage.
-Readers and :class:`~factorgraph_loc.live.localizer.Localizer` reject them.
+Bounds are wide enough for any real recording and narrow enough to avoid overflow. A value outside has a wrong unit or is damaged.
+Readers of logs and :class:`~factorgraph_loc.live.localizer.Localizer` reject such values.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ DURATION = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 STAMPS = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9}
 PIXELS = {"px": 1.0}
 PURE = {"1": 1.0}
-LEAST_UNIT = 1e-12  # minimum factor to our unit; the maximum is its reciprocal
+LEAST_UNIT = 1e-12  # minimum factor from a unit of a file to the unit of streams; the maximum is its reciprocal
 
 LATEST = 4_600_000_000_000_000_000  # ns, 145 years: differences of two timestamps fit into 64 bits
 MAX_SPAN = 30 * 86_400.0  # s between two timestamps of one log
-FASTEST = 100.0  # m/s; most speeds in mm/s exceed it
+FASTEST = 100.0  # m/s; most speeds that are in mm/s by mistake exceed this bound
 FASTEST_TURN = 100.0  # rad/s: gyros measure up to 70
-LONGEST_WAY, MOST_TURNED = 1000.0, 100.0  # m and rad from one row to the next, a pause included
+LONGEST_WAY, MOST_TURNED = 1000.0, 100.0  # m and rad from one row of odometry to the next, also across a pause
 NEAREST, LONGEST_RANGE = 1e-3, 1e5  # m
 FULL_TURN = 2.0 * math.pi
 LARGEST_PIXEL = 1e5  # px
@@ -49,7 +49,7 @@ COVARIANCES = dict(zip(("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_h
 
 
 def symmetric(upper: Sequence[Array]) -> Array:
-    """The matrices (N, 3, 3) with these entries (N,) at :data:`UPPER`."""
+    """Return symmetric matrices (N, 3, 3). ``upper``: six arrays (N,), the entries at the indices :data:`UPPER`."""
     full = np.empty((len(upper[0]), 3, 3))
     for values, (i, j) in zip(upper, UPPER, strict=True):
         full[:, i, j] = full[:, j, i] = values
@@ -58,11 +58,12 @@ def symmetric(upper: Sequence[Array]) -> Array:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """Description of a column of a table.
 
-    ``units``: factors by name; the first unit is that of streams, and of the inclusive bounds ``low`` and ``high``.
-    ``may_lack``: whether a cell may be empty. ``doc``: its meaning. ``field``: name in the stream, if it is not ``name``.
-    ``left_out_below``: smaller values are treated as empty cells, with a warning; streams and measurements have none.
+    ``units``: names of the units that a file may use, with the factors to the first one, which is the unit of streams.
+    ``low``, ``high``: inclusive bounds in the unit of streams. ``may_lack``: whether a cell may be empty.
+    ``doc``: meaning of the column. ``field``: name of the values in the stream, if it differs from ``name``.
+    ``left_out_below``: smaller values are treated as empty cells, with a warning.
     """
 
     name: str
@@ -77,23 +78,23 @@ class Column:
 
     @cached_property
     def measured(self) -> Column:
-        """The column as in a stream or a measurement."""
+        """The description of the values in a stream, under the name that they have there. ``left_out_below`` is a lower bound."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property
     def unit(self) -> str:
-        """Our unit of its values, empty for pure numbers and names."""
+        """The unit of the values in streams. Empty for dimensionless numbers and names."""
         return "" if self.units is PURE else next(iter(self.units), "")
 
     @property
     def values(self) -> str:
-        """Valid values in short: ``-200 to 200 dBm, or empty``."""
+        """The valid values as a short text, such as ``-200 to 200 dBm, or empty``."""
         between = f"{bound_text(self.low)} to {bound_text(self.high)} {self.unit}".strip() if self.units else "text"
         return between + (", or empty" if self.may_lack else "")
 
     @property
     def expected(self) -> str:
-        """A description of valid values, for errors."""
+        """The valid values as a text for error messages."""
         if self.kind in ("name", "file"):
             return self.doc
         what = "a whole number" if self.kind in ("whole", "stamp") else "a finite number"
@@ -104,9 +105,9 @@ class Column:
         return f"{what}{of} in {self.low:.6g} to {self.high:.6g}"
 
     def in_unit(self, unit: str | float, source: object = "") -> tuple[Column, float]:
-        """The column in one of its units, or in a unit given by its factor; and the factor.
+        """Return the column with bounds in another unit, and the factor from that unit to the unit of streams.
 
-        An unknown unit raises InputError, which names ``source``.
+        ``unit``: a name in ``units``, or the factor. Raises InputError with the file ``source`` for an unknown unit.
         """
         factor = self.units.get(unit, 0.0) if isinstance(unit, str) else float(unit)
         if not LEAST_UNIT <= abs(factor) <= 1.0 / LEAST_UNIT:
@@ -117,7 +118,7 @@ class Column:
         return (self if factor == 1.0 else replace(self, units={name: 1.0}, low=low, high=high)), factor
 
     def outside(self, values: Array | Integers) -> NDArray[np.bool_]:
-        """Which of ``values``, in our unit, are invalid, including NaN if no value may be missing."""
+        """Return a mask of the invalid ``values``, given in the unit of streams. NaN is invalid unless ``may_lack`` is set."""
         bad = ~((values >= self.low) & (values <= self.high))
         if self.kind == "whole":
             bad |= values != np.floor(values)
@@ -126,18 +127,22 @@ class Column:
     def require(
         self, source: object, rows: Sequence[int] | Integers, values: Array | Integers, name: str | None = None
     ) -> None:
-        """InputError at the first invalid one of ``values`` (N,), in our unit; ``rows`` (N,): row numbers in ``source``; ``name``:
-        the column's name there."""
+        """Raise InputError at the first invalid one of ``values`` (N,), given in the unit of streams.
+
+        ``rows`` (N,): row numbers in the file ``source``. ``name``: name of the column in the file, None for ``self.name``.
+        """
         expected = self.expected + (", or nothing" if self.may_lack else "")
         require(~self.outside(values), source, rows, name or self.name, values, expected)
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a sensor. ``stream``: class of the stream that it describes, "" for none.
+    """Description of a table of a sensor.
 
-    ``is_scan``: whether rows of one timestamp form one measurement. ``optional``: groups of columns that a file may lack, each
-    group as a whole. ``messages``: the path of each column in ROS messages, by their type.
+    ``stream``: import path of the class of the stream that the table describes, "" for none.
+    ``is_scan``: whether all rows with the same timestamp form one measurement.
+    ``optional``: groups of columns. A file has all columns of such a group or none.
+    ``messages``: by type of ROS message, the path of each column's value in the message.
     """
 
     name: str
@@ -152,19 +157,23 @@ class Table:
 
     @property
     def header(self) -> str:
-        """The columns of a file, with optional groups in brackets: ``epc,x,y[,sigma]``."""
+        """The names of the columns of a file, with optional groups in brackets: ``epc,x,y[,sigma]``."""
         optional = [f"[,{','.join(group)}]" for group in self.optional]
         return ",".join(column.name for column in self.in_file(())) + "".join(optional)
 
     def in_file(self, header: Collection[str]) -> tuple[Column, ...]:
-        """The columns that a file with this ``header`` must have: all except optional groups that it wholly lacks."""
+        """Return the columns that a file must have. ``header``: the columns that the file has. An optional group is required if
+        ``header`` has any of its columns."""
         omitted = {name for group in self.optional if not set(group) & set(header) for name in group}
         return tuple(column for column in self.columns if column.name not in omitted)
 
 
 def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
-    """The table and the row of the timestamp that is farthest from the median of ``tables``, and the median; None if no two are
-    more than ``most`` apart."""
+    """Find an outlier among timestamps. ``tables``: arrays of timestamps.
+
+    Returns the index of the table and the row of the timestamp that is farthest from the median, and the median. Returns None if no
+    two timestamps differ by more than ``most``.
+    """
     stamps = np.sort(np.concatenate(tables))
     if not len(stamps) or stamps[-1] - stamps[0] <= most:
         return None
@@ -174,8 +183,10 @@ def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int,
 
 
 def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Integers]]) -> None:
-    """InputError if timestamps of tables, (source, rows (N,), timestamps (N,) [ns]), are more than :data:`MAX_SPAN` apart; it names
-    the one that is farthest from the median."""
+    """Raise InputError if timestamps of a log are more than :data:`MAX_SPAN` apart. It names the one farthest from the median.
+
+    ``tables``: for each table the file, the row numbers (N,) in the file, and the timestamps (N,) [ns].
+    """
     if outlier := farthest([t_ns for _, _, t_ns in tables], MAX_SPAN * 1e9):
         table, i, middle = outlier
         source, rows, t_ns = tables[table]
@@ -183,12 +194,12 @@ def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Intege
         raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
-# stamps since 1970 [the unit] that are larger have that unit; none of this century is below the last
+# a timestamp since 1970 above one of these bounds has the unit of that bound; times after 1973 exceed the bound of their unit
 SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
 
 
 def unit_since_1970(stamp: float) -> str | None:
-    """The unit of a timestamp since 1970, by its size; None if it is too small."""
+    """Guess the unit of a timestamp since 1970 from its magnitude. Return None if it is too small for any unit."""
     return next((unit for unit, least in SINCE_1970.items() if abs(stamp) > least), None)
 
 
@@ -202,17 +213,17 @@ def number(
     may_lack: bool = False,
     left_out_below: float = -math.inf,
 ) -> Column:
-    """A column of numbers; see :class:`Column`."""
+    """Return the description of a column of numbers; see :class:`Column` for the arguments."""
     return Column(name, "number", units, low, high, may_lack, doc, left_out_below=left_out_below)
 
 
 def within(name: str, units: Mapping[str, float], most: float, doc: str) -> Column:
-    """A column of numbers from ``-most`` to ``most``."""
+    """Return the description of a column of numbers from ``-most`` to ``most``."""
     return number(name, units, -most, most, doc)
 
 
 def named(name: str, doc: str, kind: Literal["name", "file"] = "name", *, field: str = "") -> Column:
-    """A column of names; see :class:`Column`."""
+    """Return the description of a column of names or of paths of files; see :class:`Column` for the arguments."""
     return Column(name, kind, {}, 0.0, math.inf, False, doc, field)
 
 
@@ -222,8 +233,11 @@ POSES = Table(
     "poses",
     (
         STAMP,
-        *(within(name, LENGTH, FARTHEST, "position; of odometry in a frame of its own") for name in "xyz"),
-        *(within(name, PURE, 1e3, "of a quaternion, whose length must be 1") for name in ("qx", "qy", "qz", "qw")),
+        *(
+            within(name, LENGTH, FARTHEST, "position; that of odometry is in the frame of the odometry")
+            for name in "xyz"
+        ),
+        *(within(name, PURE, 1e3, "component of a quaternion of length 1") for name in ("qx", "qy", "qz", "qw")),
         within("heading", ANGLE, 1e5, "direction of the robot's x axis, or accumulated rotation"),
     ),
 )
@@ -232,10 +246,18 @@ POINTS = Table(
     (
         named("point", "the name of a point"),
         *(within(name, LENGTH, FARTHEST, "position in the world") for name in "xyz"),
-        *(within(name, {"m^2": 1.0}, 1e8, "of its covariance") for name in ("xx", "xy", "xz", "yy", "yz", "zz")),
+        *(
+            within(name, {"m^2": 1.0}, 1e8, "entry of the covariance of the position")
+            for name in ("xx", "xy", "xz", "yy", "yz", "zz")
+        ),
         *(within(f"from_{name}", LENGTH, FARTHEST, "position of the camera of a view") for name in "xyz"),
         *(
-            within(f"cov_{name}", {unit: 1.0}, 1e8, "of the frame of the map there, if it was made without a reference")
+            within(
+                f"cov_{name}",
+                {unit: 1.0},
+                1e8,
+                "entry of the covariance of an error that all points of a view share",
+            )
             for name, unit in zip(
                 ("xx", "xy", "yy", "xh", "yh", "hh"), 3 * ["m^2"] + 2 * ["m rad"] + ["rad^2"], strict=True
             )

@@ -1,4 +1,4 @@
-"""The data folder, and paths in manifests and experiment files, which may lead there."""
+"""The data folder, and the resolution of paths in manifests and experiment files, which may lead to it."""
 
 import os
 from pathlib import Path
@@ -7,12 +7,15 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import inside
 
 DATA_ROOT = "FGLOC_DATA"
-RUN_FILE = "run.toml"  # of a log in the native format; a manifest may have this name too
-EXPECTED = f"one below it, or below the data folder (--data-root, {DATA_ROOT})"
+RUN_FILE = "run.toml"  # main file of a log in the native format; a manifest may have this name too
+EXPECTED = f"a path below it, or below the data folder (--data-root, {DATA_ROOT})"
 
 
 def find_data_root(data_root: str | Path | None, source: object) -> Path:
-    """The data folder: the argument, else that of the environment; InputError if there is none."""
+    """Return the data folder: ``data_root``, or if it is None the folder in the environment variable FGLOC_DATA.
+
+    ``source``: the file that needs the folder, for messages. Raises InputError if neither is set or the folder does not exist.
+    """
     if data_root is None:
         data_root = os.environ.get(DATA_ROOT)
         if not data_root:
@@ -24,10 +27,11 @@ def find_data_root(data_root: str | Path | None, source: object) -> Path:
 
 
 def named_path(folder: Path, name: str, source: object, data_root: str | Path | None, expected: str = EXPECTED) -> Path:
-    """The path ``name`` in a manifest or an experiment file ``source`` of ``folder``: below that folder or the data folder.
+    """Resolve the path ``name`` that a manifest or an experiment file contains.
 
-    It need not exist. Other files lead below their own folder only, see :func:`~factorgraph_loc.files.models.inside`, which raises
-    the same errors.
+    ``source``: that file. ``folder``: its folder. The path must lead below ``folder`` or below the data folder ``data_root``; None
+    stands for the environment variable FGLOC_DATA. The path need not exist. ``expected``: end of the message if the path leads
+    elsewhere. Raises InputError as :func:`~factorgraph_loc.files.models.inside`.
     """
     data = os.environ.get(DATA_ROOT) if data_root is None else data_root
     folders = [Path(data)] if data and Path(data).is_dir() else []

@@ -1,4 +1,4 @@
-"""Image headers, read without decoding the image."""
+"""Reading of image headers, such as the size, without decoding the image."""
 
 import io
 import warnings
@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.bounded import PIXELS, foreign
 
-# without the formats for which Pillow starts other programs
+# further formats are not read, because Pillow would start other programs for some of them
 FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP", "GIF", "TGA", "SUN", "JPEG2000")
 PNG = b"\x89PNG\r\n\x1a\n"
 NO_IMAGE = "is not an image that can be decoded"
@@ -20,15 +20,17 @@ TOO_LARGE = f"has too many pixels, expected at most {PIXELS:,}"
 
 @contextmanager
 def pillow_image(file: BinaryIO, source: object) -> Iterator[Image.Image]:
-    """Open an image with Pillow without decoding it; InputError if it is invalid, has more than :data:`~bounded.PIXELS` pixels or
-    cannot be decoded when it is used."""
+    """Open an image with Pillow in this block. The pixels are decoded when they are first used.
+
+    Raises InputError with ``source`` if the image is invalid, has more than :data:`~bounded.PIXELS` pixels, or cannot be decoded.
+    """
     with foreign(source, NO_IMAGE), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's warnings about large sizes and damaged metadata
         try:
             image = Image.open(file, formats=FORMATS)
-        except UnidentifiedImageError as error:  # whose text describes an object in memory
+        except UnidentifiedImageError as error:  # its text is useless: it describes a Python object
             raise InputError(f"{source}: {NO_IMAGE}, expected PNG, JPEG, PPM or the like") from error
-        except Image.DecompressionBombError as error:  # Pillow's own limit, which is higher
+        except Image.DecompressionBombError as error:  # the image exceeds Pillow's own limit, which is higher
             raise InputError(f"{source}: {TOO_LARGE}") from error
         with image:
             if image.width * image.height > PIXELS:
@@ -37,9 +39,10 @@ def pillow_image(file: BinaryIO, source: object) -> Iterator[Image.Image]:
 
 
 def image_size(content: bytes, source: object) -> tuple[int, int]:
-    """Width and height [px] from the header; InputError as in :func:`pillow_image`.
+    """Return the width and height [px] of an image from its header. ``content``: bytes of the file ``source``.
 
-    A PNG with a chunk longer than the file raises InputError too: OpenCV would allocate memory for the declared length.
+    Raises InputError as :func:`pillow_image`. It also raises InputError if a chunk of a PNG is longer than the file, because OpenCV
+    would allocate memory for the declared length.
     """
     at = len(PNG) if content.startswith(PNG) else len(content)
     while at + 8 <= len(content):

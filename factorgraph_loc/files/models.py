@@ -1,4 +1,4 @@
-"""Base class of settings models, parsing of TOML and JSON, and atomic writing of files."""
+"""Base class of settings (pydantic models), parsing of TOML and JSON, and atomic writing of files."""
 
 import difflib
 import hashlib
@@ -26,41 +26,44 @@ from factorgraph_loc.text import LISTED, NAME, error_text, listed, plain, quoted
 
 LONGEST_FILE = 100  # bytes of a generated file name
 DEEPEST = 64  # nesting levels of tables or lists, and parts of a key
-MOST_NAMES = 1000  # maximum number of names to search for a similar one
-MOST_ENTRIES = 1_000_000  # values of a file
-MOST_DIGITS = 40  # of an integer in JSON: an EPC of 96 bits has 29
+MOST_NAMES = 1000  # maximum number of names that are compared with a misspelt name
+MOST_ENTRIES = 1_000_000  # maximum number of values in a TOML or JSON file
+MOST_DIGITS = 40  # maximum number of digits of an integer in JSON; an EPC of 96 bits has 29
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{DEEPEST}}}")
 
 
 class FileModel(BaseModel):
-    """Base class of everything that people write in TOML: frozen, without unknown keys.
+    """Base class of the models of TOML files and settings. Instances are immutable, and unknown keys are errors.
 
-    A docstring below a field is its meaning; see :mod:`factorgraph_loc.files.settings`.
+    The docstring below a field is its description in the documentation; see :mod:`factorgraph_loc.files.settings`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with updated values. Numbers are clipped to the bounds of their fields, so that computed settings remain
-        readable."""
+        """Return a copy with the values of ``update``. Numbers are clipped to the bounds of their fields, so that a file with the
+        copy can be read again."""
         return super().model_copy(update={k: _within(type(self), k, v) for k, v in (update or {}).items()}, deep=deep)
 
     @classmethod
     def bounded(cls, **values: Any) -> Self:
-        """A model of computed values, with numbers clipped to the bounds of their fields."""
+        """Return a model of computed values. Numbers are clipped to the bounds of their fields."""
         return cls(**{key: _within(cls, key, value) for key, value in values.items()})
 
 
 @dataclass(frozen=True)
 class InUnit:
-    """The unit of a number, given in the annotation of a field: ``Annotated[float, InUnit("m")]``."""
+    """The unit of a numeric field. It is part of the field's annotation: ``Annotated[float, InUnit("m")]``."""
 
     name: str
 
 
 def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *, after: str) -> None:
-    """Add fields to a model after another one, each with its type and default."""
+    """Add fields to a model class, for fields that depend on the installed sensors.
+
+    ``fields``: type and default of each new field by name. ``after``: name of the field that they follow.
+    """
     old = dict(model.model_fields)
     later = list(old)[list(old).index(after) + 1 :]
     added = {name: FieldInfo.from_annotated_attribute(kind, default) for name, (kind, default) in fields.items()}
@@ -76,7 +79,10 @@ Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST), InUnit("m")]
 
 
 def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
-    """The bounds of a number in pydantic's ``metadata`` of a field; infinite if there are none."""
+    """Return the inclusive lower and upper bound of a numeric field. A missing bound is infinite.
+
+    ``metadata``: the field's metadata of pydantic.
+    """
     low, high = -math.inf, math.inf
     for entry in metadata:
         for part in getattr(entry, "metadata", (entry,)):
@@ -86,7 +92,8 @@ def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
 
 
 def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
-    """``value`` clipped to the bounds of a field; NaN is kept."""
+    """Return ``value`` clipped to the bounds of the field ``name`` of the model ``kind``. NaN and values that are not numbers are
+    returned unchanged."""
     field = kind.model_fields.get(name)
     if field is None or isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
@@ -95,8 +102,10 @@ def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
 
 
 def read_text(path: Path, limit: int = bounded.DATA) -> str:
-    """The content of a text file of at most ``limit`` bytes, with its line ends; InputError if it is missing, too large, not a
-    regular file or not UTF-8."""
+    """Return the content of a text file of at most ``limit`` bytes. Line ends are not converted.
+
+    Raises InputError if the file is missing, too large, not a regular file, or not in UTF-8.
+    """
     try:
         return bounded.read_bytes(path, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -104,16 +113,16 @@ def read_text(path: Path, limit: int = bounded.DATA) -> str:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file.
+    """Return the content of a TOML file.
 
-    InputError if it cannot be read, is not TOML, is nested deeper than :data:`DEEPEST`, or has more than :data:`MOST_ENTRIES`
-    values, a date, or an integer of more than 64 bits.
+    Raises InputError if the file cannot be read or is not TOML. Also if it is nested deeper than :data:`DEEPEST`, or contains more
+    than :data:`MOST_ENTRIES` values, a date, or an integer of more than 64 bits.
     """
     return parse_toml(read_text(path, bounded.SETTINGS), path)
 
 
 def parse_toml(text: str, source: object) -> dict[str, Any]:
-    """Parse a TOML text; InputError as in :func:`read_toml`."""
+    """Parse a text in TOML. ``source``: the file or option, for messages. Raises InputError as :func:`read_toml`."""
     for row, line in enumerate(text.split("\n"), start=1):
         # the time that tomllib needs grows with the square of the number of parts
         if line.count(".") >= DEEPEST and _LONG_KEY.search(line):
@@ -125,9 +134,9 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
 
 
 def check_content(content: dict[str, Any], source: object) -> None:
-    """Raise InputError if content is nested too deeply or has too many values or invalid ones.
+    """Raise InputError if the content of a TOML file is nested too deeply, has too many values, or an invalid value.
 
-    Invalid are dates, integers of more than 64 bits, text that is not UTF-8, and values that are not from TOML.
+    Invalid values are dates, integers of more than 64 bits, text that is not UTF-8, and types that TOML does not have.
     """
     for key, value in _leaves(content, source):
         if isinstance(value, int) and abs(value) >= 2**63:
@@ -143,13 +152,17 @@ def check_content(content: dict[str, Any], source: object) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file; InputError as in :func:`read_toml`, and for NaN, infinity and duplicate keys."""
+    """Return the content of a JSON file.
+
+    Raises InputError if the file cannot be read or is not JSON. Also if it is nested deeper than :data:`DEEPEST`, or contains more
+    than :data:`MOST_ENTRIES` values, NaN, infinity, a duplicate key, or an integer of more than :data:`MOST_DIGITS` digits.
+    """
     return parse_json(read_text(path, bounded.SETTINGS), path)
 
 
 def parse_json(text: str, source: object) -> Any:
-    """Parse a JSON text; InputError as in :func:`read_json`. Integers have at most :data:`MOST_DIGITS` digits."""
-    try:  # faster than bounded.foreign, as there may be a million lines
+    """Parse a text in JSON. ``source``: the file, for messages. Raises InputError as :func:`read_json`."""
+    try:  # faster than bounded.foreign, which matters for a million lines
         content = _JSON.decode(text)
     except RecursionError as error:
         raise InputError(f"{source}: is not JSON: it is nested too deeply") from error
@@ -161,7 +174,10 @@ def parse_json(text: str, source: object) -> Any:
 
 
 def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -> Model:
-    """``content`` as a model of ``kind``; InputError names ``source``, the key, the value and the expected value."""
+    """Validate ``content`` as a model of class ``kind``. ``source``: the file, for messages.
+
+    Raises InputError at the first invalid value, with its key, the value, and what is expected.
+    """
     try:
         return kind.model_validate(content)
     except ValidationError as error:
@@ -182,17 +198,20 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
 
 
 def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """The keys of the model at ``path``; empty if there is no model."""
+    """Return the field names of a nested model, for hints on misspelt keys. Return an empty list if there is no model.
+
+    ``kind``: the outermost model. ``path``: the keys and list indices that lead from it to the nested model.
+    """
     parts = iter(path)
     for part in parts:
         if isinstance(part, int):  # index in a list of models
             continue
         field = kind.model_fields.get(str(part))
-        if field is None:  # name of one of several
+        if field is None:  # the part is the user's name of one of several sensors
             continue
         nested = field.annotation
         if get_origin(nested) is dict:
-            next(parts, None)  # key in a dict
+            next(parts, None)  # the next part is a key of the dict
         options = [nested, *get_args(nested)]
         models = [o for o in options if isinstance(o, type) and issubclass(o, BaseModel)]
         if not models:
@@ -202,33 +221,36 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """A hint for a misspelt word: the most similar known one, else all of them."""
+    """Return the end of a message about an unknown ``word``: the most similar known word, or else a list of all known words."""
     if matches := similar(word, known):
         return f": did you mean {plain(matches[0])}?"
     return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
 
 
 def similar(word: str, known: list[str]) -> list[str]:
-    """The most similar known word, if there is one."""
+    """Return a list with the known word that is most similar to ``word``, or an empty list if none is similar."""
     short = [name for name in known if len(name) <= NAME][:MOST_NAMES]
     return difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
 
 
 def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> None:
-    """Set the value of a key with dots in nested tables, which are made where they are missing. InputError if a part of the key is
-    set to something else, or the key has more than :data:`DEEPEST` parts."""
+    """Set a value in nested tables. ``key``: the path to it, such as ``a.b.c``. Missing tables are created.
+
+    Raises InputError if a part of the path is not a table, or the key has more than :data:`DEEPEST` parts.
+    """
     *tables, last = key.split(".")
     if len(tables) >= DEEPEST:
         raise InputError(f"{source}: {plain(key)} has {len(tables) + 1} parts, expected at most {DEEPEST}")
     for i, name in enumerate(tables, start=1):
         content = content.setdefault(name, {})
         if not isinstance(content, dict):
-            raise InputError(f"{source}: no key {plain(key)}, as {plain('.'.join(tables[:i]))} is {quoted(content)}")
+            table = plain(".".join(tables[:i]))
+            raise InputError(f"{source}: no key {plain(key)}, because {table} is {quoted(content)}, not a table")
     content[last] = value
 
 
 def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The values of nested tables, with the keys on the path to each joined by dots."""
+    """Return the values in nested tables with their keys. The key of a nested value is the path to it, such as ``a.b.c``."""
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{key}.")
@@ -236,19 +258,20 @@ def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
             yield prefix + key, value
 
 
-def inside(root: Path, name: str, source: object, *others: Path, expected: str = "one below it") -> Path:
-    """The path ``name`` below ``root``, or below one of the folders ``others``, with links resolved; it need not exist.
+def inside(root: Path, name: str, source: object, *others: Path, expected: str = "a path below it") -> Path:
+    """Resolve a path that a file contains, and check that it does not leave the permitted folders.
 
-    All paths in files are resolved by this function.
+    ``name``: the path. ``source``: the file that contains it, for messages. ``root`` and ``others``: the permitted folders.
+    ``expected``: end of the message if the path leaves them.
 
-    A relative path belongs to the first folder where it exists. InputError, with what is ``expected``, if it leaves all folders (by
-    dots, as an absolute path or by a link). InputError also if it is neither a regular file nor a folder. NoFileNameError if no
-    file can have that name.
+    A relative path is taken from the first of the folders in which it exists, or else from ``root``. Links are resolved. The path
+    need not exist. Raises InputError if the path leaves all folders (by dots, as an absolute path or by a link), or is neither a
+    regular file nor a folder. Raises NoFileNameError if no file can have that name.
     """
     try:
         folders = [os.path.realpath(folder) for folder in (root, *others)]
         paths = [Path(os.path.realpath(folder / name)) for folder in (root, *others)]
-    except (OSError, ValueError) as error:  # NUL, or a lone UTF-16 surrogate
+    except (OSError, ValueError) as error:  # a NUL character, or half of a UTF-16 surrogate pair
         raise bounded.NoFileNameError(f"{source}: path {quoted(name)} cannot be the name of a file") from error
     path = next((path for path in paths if len(paths) == 1 or bounded.kind(path, source)), paths[0])
     if not any(path.is_relative_to(folder) for folder in folders):
@@ -262,8 +285,10 @@ def inside(root: Path, name: str, source: object, *others: Path, expected: str =
 
 
 def file_name(name: str) -> str:
-    """A name as a file name: characters other than letters, digits, dots, dashes and underscores become underscores. Names above
-    100 bytes are truncated, with a digest of the whole name."""
+    """Convert a name to a file name. Characters other than letters, digits, dots, dashes and underscores become underscores.
+
+    Names above :data:`LONGEST_FILE` bytes are truncated and end with a hash of the whole name.
+    """
     safe = re.sub(r"[^\w.-]", "_", name).lstrip(".") or "_"
     if len(safe.encode()) <= LONGEST_FILE:
         return safe
@@ -273,9 +298,9 @@ def file_name(name: str) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path next to ``path``, which is moved to ``path`` when the block ends without an error.
+    """Yield a temporary file next to ``path``. It is moved to ``path`` when the block ends without an error.
 
-    An OSError in the block names ``path``; those for a full disk name no file otherwise.
+    An OSError in the block is raised with ``path`` as its file name, which the error for a full disk would lack.
     """
     try:
         with temporary_file(path) as temporary:
@@ -289,8 +314,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically. Libraries should write to memory and this function to the disk: they report a full disk as
-    errors of their own kinds."""
+    """Write a file atomically. Use it for content that a library has written to memory, because libraries report a full disk by
+    exceptions of their own."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
@@ -306,8 +331,10 @@ def write_toml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
-    """All values with their keys except tables, lists and floats; InputError if there are too many or they are nested too
-    deeply."""
+    """Return the values in nested tables and lists with their keys, except floats.
+
+    Raises InputError if there are more than :data:`MOST_ENTRIES` values, or they are nested deeper than :data:`DEEPEST`.
+    """
     waiting = [("", content, 0)]
     count = 0
     while waiting:

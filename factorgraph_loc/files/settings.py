@@ -1,7 +1,7 @@
-"""Descriptions of models of settings: keys, defaults, bounds, units and meanings.
+"""Descriptions of settings: keys, defaults, bounds, units and meanings, read from the models that define them.
 
-A field of a :class:`~factorgraph_loc.files.models.FileModel` has its bounds from ``Field``, its unit from a
-:class:`~factorgraph_loc.files.models.InUnit` in its annotation, and its meaning from the docstring below it.
+The bounds of a field of a :class:`~factorgraph_loc.files.models.FileModel` come from ``Field`` in its annotation, the unit from
+:class:`~factorgraph_loc.files.models.InUnit` there, and the meaning from the docstring below the field.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ _KINDS = {float: "number", int: "whole number", bool: "true or false", str: "tex
 
 @dataclass(frozen=True)
 class Setting:
-    """A key of a model, with dots; ``*`` stands for a name of the user's own.
+    """Description of one setting.
 
-    ``kind``: "number", "whole number", "true or false", "text", "choice", "table", or several of them; ``count``: how many values a
-    list has, 1 for no list, 0 for any number. ``default``: None for nothing. ``low``, ``high``: inclusive bounds, infinite without.
+    ``key``: path of keys, such as ``a.b``. A part ``*`` stands for a name that the user chooses.
+    ``kind``: "number", "whole number", "true or false", "text", "choice" or "table", or several of them joined by "or".
+    ``count``: number of values of a list; 0 if any number is valid, 1 if the setting is no list.
+    ``default``: None if the setting is not set. ``low``, ``high``: inclusive bounds, infinite if there is none.
+    ``choices``: the valid texts of a choice.
     """
 
     key: str
@@ -44,7 +47,10 @@ class Setting:
 
 @dataclass(frozen=True)
 class _Part:
-    """An alternative of an annotation that is no union."""
+    """One alternative of the type annotation of a field, such as ``float`` in ``list[float] | None``.
+
+    ``metadata``: pydantic's bounds and units. ``path``: ".*" for each dict around the type. ``count``: as in :class:`Setting`.
+    """
 
     type: Any
     metadata: tuple[Any, ...]
@@ -53,8 +59,10 @@ class _Part:
 
 
 def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | None = None) -> list[Setting]:
-    """All settings of a model, in its order; those of models in it have their keys after a dot. ``default``: a model whose values
-    are the defaults."""
+    """Return the settings of a model and of the models nested in it, in the order of their definition.
+
+    ``prefix``: start of all keys. ``default``: a model whose values are the defaults, None for the defaults of the fields.
+    """
     settings: dict[str, Setting] = {}
     for name, field in model.model_fields.items():
         key = f"{prefix}{name}"
@@ -77,7 +85,7 @@ def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | N
 
 
 def bound_text(value: float) -> str:
-    """A bound in readable form: as a multiple of pi, or rounded; infinity is empty."""
+    """Return a bound as a text: a multiple of pi such as "2 pi", or a number with 6 digits. Infinity is ""."""
     if not math.isfinite(value):
         return ""
     for times, name in ((2.0, "2 pi"), (1.0, "pi"), (0.5, "pi / 2")):
@@ -89,12 +97,12 @@ def bound_text(value: float) -> str:
 
 
 def default_text(setting: Setting) -> str:
-    """The default of a setting as in TOML; ``required``, or a dash for None."""
+    """Return the default of a setting in TOML, "required" if there is none, or "-" if the setting is not set by default."""
     return "required" if setting.required else _toml(setting.default)
 
 
 def values_text(setting: Setting) -> str:
-    """The valid values of a setting: ``0 to 5 s``, ``known, extended, unknown``, ``text``."""
+    """Return the valid values of a setting as a text, such as ``0 to 5 s``, ``known, extended, unknown`` or ``text``."""
     low, high = bound_text(setting.low), bound_text(setting.high)
     between = f"{low} to {high}" if low and high else f"{low} or more" if low else f"at most {high}" if high else ""
     bounded = f"{between} {setting.unit}".strip() or setting.kind
@@ -105,12 +113,13 @@ def values_text(setting: Setting) -> str:
 
 
 def first_sentence(documented: Any) -> str:
-    """The first sentence of a docstring, on one line; empty without one."""
+    """Return the first sentence of the docstring of an object, on one line. Return "" if it has no docstring."""
     text = " ".join((inspect.getdoc(documented) or "").split()).replace("``", "")
     return text.partition(". ")[0].rstrip(".") + "." if text else ""
 
 
 def _parts(part: _Part) -> Iterator[_Part]:
+    """Split the annotation of a field into its alternatives. None is omitted."""
     origin, arguments = get_origin(part.type), get_args(part.type)
     if origin is Annotated:
         yield from _parts(replace(part, type=arguments[0], metadata=(*part.metadata, *arguments[1:])))
@@ -135,7 +144,10 @@ def _is_model(kind: Any) -> bool:
 
 
 def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
-    """The setting of a key itself; for a table only if it has a description."""
+    """Return the description of the setting ``key`` itself, without nested settings. Return nothing for an undocumented table.
+
+    ``parts``: the alternatives of its type. ``setting``: the description so far: key, default and meaning.
+    """
     own = [part for part in parts if not _is_model(part.type)]
     if not own:
         if setting.meaning:
@@ -163,6 +175,7 @@ def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
 
 
 def _nested(key: str, parts: list[_Part], value: Any) -> Iterator[Setting]:
+    """Return the settings of the models that a field may contain. ``value``: the default of the field."""
     for part in parts:
         if _is_model(part.type):
             yield from settings_in(part.type, f"{key}{part.path}.", value if isinstance(value, part.type) else None)

@@ -1,4 +1,4 @@
-"""Fields of models that have one model, or several by name."""
+"""Fields of settings that contain the settings of one sensor, or the named settings of several sensors of the same kind."""
 
 import re
 from collections.abc import Mapping
@@ -13,7 +13,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def one_or_several(kind: type[BaseModel]) -> Any:
-    """The type of a field with one model, several models by name, or None: a table of settings, or a table of named tables."""
+    """Return the type annotation of a field whose value is one model of class ``kind``, a dict of such models by name, or None.
+
+    In TOML the field is a table with the keys of the model, or a table of named tables with these keys.
+    """
     several = TypeAdapter(dict[str, kind])  # type: ignore[valid-type]
 
     def parse(value: Any, parse_one: ValidatorFunctionWrapHandler) -> Any:
@@ -37,12 +40,15 @@ def one_or_several(kind: type[BaseModel]) -> Any:
 
 
 def is_name(name: str) -> bool:
-    """Whether a word can be the name of one of several sensors."""
+    """True if a text can be the name of one of several sensors: letters, digits, ``_`` and ``-``."""
     return re.fullmatch(r"[\w-]+", name) is not None
 
 
 def by_name(section: str, value: Model | Mapping[str, Model] | None) -> dict[str, Model]:
-    """The models in a field that may have several (:func:`one_or_several`), by the names of their tables."""
+    """Return the models in a field of the type :func:`one_or_several`, by table name.
+
+    ``section``: name of the field. The table of a single model has this name, that of several models is ``section.NAME``.
+    """
     if isinstance(value, Mapping):
         return {f"{section}.{name}": model for name, model in value.items()}
     return {} if value is None else {section: value}

@@ -1,28 +1,32 @@
-"""The shipped manifests, rigs and descriptions of readers. Importable without numerical libraries, for shell completion."""
+"""The manifests, rigs and reader descriptions that are installed with the package. For fast shell completion, this module imports
+no numerical library."""
 
 from importlib import resources
 from pathlib import Path
 
-OTHERS = (".rig.toml", ".world.toml", ".reader.toml")  # endings of TOML files that are no data sets
+OTHERS = (".rig.toml", ".world.toml", ".reader.toml")  # suffixes of TOML files that are not manifests
 
 
 def manifests() -> dict[str, Path]:
-    """The shipped manifests: name -> file, sorted by name."""
+    """Return the installed manifests: the file by name, sorted by name."""
     return {file.stem: file for file in sorted(folder().glob("*.toml")) if not file.name.endswith(OTHERS)}
 
 
 def rigs() -> dict[str, Path]:
-    """The shipped rigs: name -> file, sorted by name."""
+    """Return the installed rigs: the file by name, sorted by name."""
     return {file.name.removesuffix(".rig.toml"): file for file in sorted(folder().glob("*.rig.toml"))}
 
 
 def readers() -> dict[str, Path]:
-    """The shipped descriptions of readers, manifests of the reader ``mapped`` without data: name -> file, sorted by name."""
+    """Return the installed descriptions of readers: the file by name, sorted by name.
+
+    Such a description is a manifest of the reader ``mapped`` that names no data.
+    """
     return {file.name.removesuffix(".reader.toml"): file for file in sorted(folder().glob("*.reader.toml"))}
 
 
 def folder() -> Path:
-    """The folder of shipped files: inside the installed package, or next to the package in a source checkout."""
+    """Return the folder of these files. It is inside the installed package, or next to the package in a source checkout."""
     package = Path(str(resources.files(__name__.partition(".")[0])))
     installed = package / "datasets"
     return installed if installed.is_dir() else package.parent / "datasets"

@@ -1,4 +1,7 @@
-"""Tables: their cells and typed rows, and the tables of the native format, CSV with a header or Parquet with the same columns."""
+"""Conversion of cells of tables to numbers, names and timestamps, and reading and writing of tables of the native format.
+
+A table of the native format is a CSV file with a header, or a Parquet file with the same columns.
+"""
 
 import csv
 import io
@@ -23,7 +26,7 @@ from factorgraph_loc.files.models import Model, nearest, parse_model, read_text,
 from factorgraph_loc.text import error_text, quoted
 from factors.se2 import Array, Integers
 
-SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten of a nanosecond
+SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # units of time, as powers of ten of a nanosecond
 ISO = "iso"
 MOST_DIGITS = 20  # of a timestamp before its decimal point
 NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
@@ -33,11 +36,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Cells:
-    """N rows of a file: the cells of each field, as N texts or as numbers (N,), NaN if empty.
+    """The unparsed cells of N rows of a file.
 
-    ``rows`` (N,): line numbers in ``path`` (Parquet: rows from 1). ``labels``: names of the columns in the file, if they differ
-    from the fields; ``units``: unit or factor of fields; ``decimal``: decimal mark. ``left_out``: columns of the file that are not
-    read. ``passed``: number of JSON objects without any field; ``unwanted``: number of rows that the mapping does not choose.
+    ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file.
+    ``columns``: for each field N texts, or numbers (N,) with NaN for empty cells.
+    ``labels``: by field, the name of the column in the file, if it differs from the field.
+    ``units``: by field, the name of the unit in the file, or the factor to the unit of streams. ``decimal``: the decimal mark.
+    ``left_out``: columns of the file that are not read. ``passed``: number of JSON objects that lack needed columns.
+    ``unwanted``: number of rows that the mapping excludes.
     """
 
     path: Path
@@ -51,20 +57,20 @@ class Cells:
     unwanted: int = 0
 
     def texts(self, name: str) -> list[str]:
-        """The cells (N) of a field as text."""
+        """Return the N cells of a field as texts."""
         return [str(cell) for cell in self.columns[name]]
 
     def names(self, name: str, column: Column) -> list[str]:
-        """The texts (N) of a field; InputError at the first that is empty."""
+        """Return the N names in a field. Raises InputError at the first empty cell, with the description of ``column``."""
         texts = self.texts(name)
         if "" in texts:
             raise self.invalid(name, texts.index(""), column.doc)
         return texts
 
     def numbers(self, name: str, column: Column) -> Array:
-        """The numbers (N,) of a field in the unit of ``column``, NaN if empty.
+        """Return the numbers (N,) in a field, converted to the unit of streams of ``column``. Empty cells become NaN.
 
-        InputError at the first cell that is no number, not finite, or outside of the column's bounds.
+        Raises InputError at the first cell that is no finite number, is out of bounds, or is empty although ``column`` forbids it.
         """
         cells = self.columns[name]
         if isinstance(cells, np.ndarray):
@@ -80,12 +86,16 @@ class Cells:
         return values if factor == 1.0 else values * factor
 
     def nanoseconds(self) -> Integers:
-        """The timestamps (N,) of the native format, which are whole numbers of nanoseconds."""
+        """Return the timestamps (N,) [ns] of a table of the native format. Raises InputError if one is no whole number."""
         stamps = self._converted(STAMP.name, lambda cell: _limited(int(cell)), STAMP.expected)
         return np.array(stamps, dtype=np.int64)
 
     def stamps(self, name: str, offset: float = 0.0) -> Integers:
-        """The timestamps (N,) of a field in nanoseconds, plus ``offset`` [s]. Times without a zone are UTC."""
+        """Return the timestamps (N,) [ns] in a field, plus ``offset`` [s].
+
+        The unit of the field is s, ms, us, ns or iso: a date and time, which is UTC if it has no time zone. Raises InputError for
+        other units, invalid cells, and timestamps that are too far apart.
+        """
         unit = self.units.get(name)
         if unit not in {*SECONDS, ISO}:
             expected = f"one of {', '.join(SECONDS)} or {ISO}"
@@ -103,11 +113,11 @@ class Cells:
         return out
 
     def invalid(self, name: str, i: int, expected: str) -> InputError:
-        """The error for cell ``i`` of a field."""
+        """Return the error for the invalid cell ``i`` of a field. ``expected``: a description of valid cells."""
         return bad_field(self.path, self.labels.get(name, name), self.columns[name][i], expected, row=int(self.rows[i]))
 
     def _converted(self, name: str, convert: Callable[[Any], T], expected: str) -> list[T]:
-        """The converted cells of a field; InputError at the first that ``convert`` refuses."""
+        """Convert the cells of a field by the function ``convert``. Raises InputError at the first cell for which it fails."""
         out: list[T] = []
         try:
             for cell in self.columns[name]:
@@ -117,9 +127,9 @@ class Cells:
         return out
 
     def _floats(self, name: str, texts: Sequence[str]) -> tuple[Array, NDArray[np.bool_]]:
-        """The numbers (N,) in ``texts`` of a field, NaN if empty; and whether each is empty (N,)."""
+        """Convert N texts of a field to numbers (N,), with NaN for empty texts. Also return a mask (N,) of the empty texts."""
         if self.decimal == ".":
-            with suppress(ValueError):  # all are numbers: several times as fast
+            with suppress(ValueError):  # several times as fast, if no text is empty or invalid
                 return np.array(list(map(float, texts)), dtype=float), np.zeros(len(texts), dtype=bool)
 
         def number(text: str) -> float:
@@ -129,11 +139,14 @@ class Cells:
         return values, np.array([not text for text in texts], dtype=bool)
 
     def _scaled(self, text: str, power: int) -> int:
-        """A decimal number times ten to the ``power``, rounded, without floating-point errors."""
+        """Return a decimal number times 10**power, rounded to an integer without floating-point errors.
+
+        Raises ArithmeticError if the text is no finite number or has more than :data:`MOST_DIGITS` digits before the decimal mark.
+        """
         text = text.replace(self.decimal, ".")
         whole, _, fraction = text.partition(".")
         if len(whole) <= MOST_DIGITS and len(fraction) <= power and (whole + fraction).isdecimal():
-            return int(whole + fraction + "0" * (power - len(fraction)))  # several times as fast
+            return int(whole + fraction + "0" * (power - len(fraction)))  # several times as fast as Decimal
         number = Decimal(text)
         if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # checked before the digits are expanded
             raise OverflowError
@@ -141,14 +154,18 @@ class Cells:
 
 
 def _limited(stamp: int) -> int:
+    """Return a timestamp [ns]. Raises OverflowError if it exceeds :data:`LATEST`."""
     if abs(stamp) > LATEST:
         raise OverflowError
     return stamp
 
 
 def iso_nanoseconds(text: str) -> int:
-    """An ISO 8601 date and time as nanoseconds since 1970; without a zone it is UTC. ValueError if the text is invalid."""
-    # datetime has microseconds only
+    """Convert an ISO 8601 date and time to nanoseconds since 1970. A time without a time zone is UTC.
+
+    Raises ValueError if the text is invalid.
+    """
+    # the fraction of a second is parsed separately, because datetime has microseconds only
     fraction = re.search(r"[.,](\d+)", text)
     whole = text.replace(fraction.group(0), "", 1) if fraction else text
     moment = datetime.fromisoformat(whole.strip())
@@ -159,7 +176,10 @@ def iso_nanoseconds(text: str) -> int:
 
 
 def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Iterator[tuple[int, list[str]]]:
-    """The line number and the cells of each row of CSV; ``form``: arguments of :func:`csv.reader`."""
+    """Parse CSV and return the line number and the cells of each row.
+
+    ``lines``: the lines with their numbers. ``form``: arguments of :func:`csv.reader`. Raises InputError if a line is not CSV.
+    """
     reader = csv.reader((line for _, line in lines), strict=True, **form)
     try:
         for parts in reader:
@@ -171,7 +191,11 @@ def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Itera
 def rows_of_length(
     path: Path, header: Sequence[str], rows: Iterable[tuple[int, list[str]]]
 ) -> tuple[Integers, dict[str, list[str]]]:
-    """The line numbers (N,) of rows of CSV, and N cells by column. InputError at a row that is not as long as the header."""
+    """Collect the rows of a CSV file by column. ``rows``: line number and cells of each row.
+
+    Returns the line numbers (N,), and by name in ``header`` the N cells of a column. Raises InputError at a row that has not as
+    many cells as the header.
+    """
     numbers: list[int] = []
     table: list[list[str]] = []
     for row, parts in rows:
@@ -184,8 +208,11 @@ def rows_of_length(
 
 
 def read_cells(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column, ...]]:
-    """The cells of a CSV, and the columns of the one of ``tables`` that it has. InputError names file and row of invalid
-    content."""
+    """Read a CSV file that contains one of several possible ``tables``.
+
+    Returns the cells and the columns of the table that the header of the file fits best. Raises InputError with file and row if the
+    content is invalid.
+    """
     lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
     parsed = csv_rows(path, lines)
     header = [name.strip() for name in next(parsed, (1, []))[1]]
@@ -198,7 +225,10 @@ def read_cells(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column
 
 
 def columns_in(path: Path, header: Sequence[str], tables: Sequence[Table]) -> tuple[Column, ...]:
-    """The columns in ``header`` of the one of ``tables`` with most of them. InputError if one is missing."""
+    """Choose the table that has most columns in common with the ``header`` of a file, and return its columns in the file.
+
+    Raises InputError if a required column of that table is missing, or ``header`` has a name twice.
+    """
     if len(set(header)) < len(header):
         raise bad_field(path, "header", ",".join(header), "each column once", row=1)
     columns = max(
@@ -213,16 +243,16 @@ def columns_in(path: Path, header: Sequence[str], tables: Sequence[Table]) -> tu
 
 
 def _unread(header: Sequence[str], columns: Sequence[Column]) -> tuple[str, ...]:
-    """The names in ``header`` of none of the ``columns``."""
+    """Return the names in ``header`` that none of the ``columns`` has."""
     known = {column.name for column in columns}
     return tuple(name for name in header if name not in known)
 
 
 def rows_by_name(kind: type[Model], cells: Cells, table: Table, names: Sequence[str]) -> dict[str, Model]:
-    """The N rows of a ``table`` as models of ``kind`` by their ``names``, the first column. An empty cell is the default of its
-    field.
+    """Convert the N rows of a table to models of class ``kind``, such as the tags of a map. Return them by name.
 
-    InputError names file and row of an empty or repeated name, and of an invalid value.
+    ``names``: N names, the first column of ``table``. The fields of ``kind`` are the other columns. For an empty cell the field
+    has its default. Raises InputError with file and row for an empty or repeated name, or an invalid value.
     """
     column, *fields = table.columns
     numbers = {known.name: cells.numbers(known.name, known) for known in fields if known.name in cells.columns}
@@ -239,12 +269,15 @@ def rows_by_name(kind: type[Model], cells: Cells, table: Table, names: Sequence[
 
 
 def read_parquet(path: Path) -> pl.DataFrame:
-    """The table in a Parquet file; InputError if it is invalid or too large."""
+    """Return the table in a Parquet file. Raises InputError if the file is invalid or too large."""
     return parse_parquet(read_bytes(path, DATA), path)
 
 
 def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None = None) -> pl.DataFrame:
-    """The table, or some ``columns`` of it, in the bytes of a Parquet file; InputError as in :func:`read_parquet`."""
+    """Return the table in the bytes of a Parquet file. ``columns``: columns to read, None for all. ``source``: name for messages.
+
+    Raises InputError as :func:`read_parquet`.
+    """
     with foreign(source, "is not a Parquet file that can be read"), limited_memory(source, len(content)), quiet():
         declared = pl.scan_parquet(io.BytesIO(content))
         rows = declared.select(pl.len()).collect().item()
@@ -253,14 +286,17 @@ def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None 
 
 
 def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
-    """A column of texts or integers as texts, "" for null; InputError if it has another type."""
+    """Return the column ``name`` of a table as texts. Integers are converted, and null becomes "".
+
+    Raises InputError if the column has another type, or its texts are too long in total.
+    """
     column = table[name]
     kind = column.dtype
     if not (kind in (pl.String, pl.Null, pl.Categorical) or kind.is_integer() or isinstance(kind, pl.Enum)):
         raise InputError(f"{source}: {name} is of type {kind}, expected texts")
     with foreign(source, f"{name} is no column of texts"):
         texts = column.cast(pl.String)
-        if len(texts) * texts.estimated_size() > DATA:  # one long text may be referenced many times
+        if len(texts) * texts.estimated_size() > DATA:  # the estimate counts a text once that many rows share
             length = int(texts.str.len_bytes().sum())
             require_size(source, f"the length of all texts of {name}", length, DATA)
         return [text or "" for text in texts.to_list()]
@@ -268,9 +304,11 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
 
 @dataclass(frozen=True)
 class TableRows:
-    """N rows of a table: ``t_ns`` (N,) integers; ``numbers`` by column (N,), NaN if empty; ``names`` by column, N texts.
+    """The parsed values of N rows of a table.
 
-    ``rows`` (N,): line numbers in ``path`` (Parquet: rows from 1). ``left_out``: other columns of the file.
+    ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps [ns].
+    ``numbers``: by column, numbers (N,) in the unit of streams, NaN for empty cells. ``names``: by column, N texts.
+    ``left_out``: columns of the file that are not read.
     """
 
     path: Path
@@ -282,14 +320,14 @@ class TableRows:
 
     @classmethod
     def of(cls, cells: Cells, columns: Iterable[Column], t_ns: Integers) -> Self:
-        """The rows with these timestamps and the cells of ``columns``. InputError at an invalid cell."""
+        """Parse the cells of the given columns. ``t_ns`` (N,): timestamps of the rows. Raises InputError at an invalid cell."""
         described = list(columns)
         numbers = {column.name: cells.numbers(column.name, column) for column in described if column.kind in NUMBERS}
         names = {column.name: cells.names(column.name, column) for column in described if column.kind in NAMES}
         return cls(cells.path, cells.rows, t_ns, numbers, names, cells.left_out)
 
     def rows_at(self, which: Integers) -> Self:
-        """The rows with indices ``which`` (M,), in that order."""
+        """Return the rows with the indices ``which`` (M,), in the order of ``which``."""
         return type(self)(
             self.path,
             self.rows[which],
@@ -300,9 +338,9 @@ class TableRows:
 
 
 def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
-    """Read CSV or Parquet with the columns of one of ``tables``; other columns are ignored.
+    """Read a CSV or Parquet file that contains one of several possible ``tables``. Other columns of the file are ignored.
 
-    InputError names file, row and field of a value that is missing, is not a number, or is out of bounds.
+    Raises InputError with file, row and column if a value is missing, is not a number, or is out of bounds.
     """
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
         cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables)
@@ -310,7 +348,7 @@ def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
 
 
 def _cells_of_parquet(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column, ...]]:
-    """The cells of a Parquet file, and the columns of the one of ``tables`` that it has."""
+    """Read a Parquet file that contains one of ``tables``. Return its cells and the columns of that table."""
     frame = read_parquet(path)
     columns = columns_in(path, frame.columns, tables)
     cells: dict[str, Any] = {}
@@ -338,8 +376,10 @@ def write_parquet(frame: pl.DataFrame, path: Path) -> None:
 
 
 def write_table(path: Path, tables: Sequence[Table], columns: Mapping[str, Array | Integers | Sequence[str]]) -> None:
-    """Write columns of equal length of one of ``tables`` to CSV or Parquet, by suffix, with all digits; NaN becomes an empty
-    field."""
+    """Write columns to a Parquet file if ``path`` ends with .parquet, and otherwise to a CSV file with all digits.
+
+    ``columns``: columns of equal length by name. ``tables``: the tables that define their types. NaN becomes an empty cell.
+    """
     kinds = {column.name: KINDS[column.kind] for table in tables for column in table.columns}
     series = [pl.Series(name, column, dtype=kinds[name]) for name, column in columns.items()]
     frame = pl.DataFrame([s.fill_nan(None) if s.dtype.is_float() else s for s in series])

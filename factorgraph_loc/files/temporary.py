@@ -1,7 +1,7 @@
-"""Temporary files and folders next to their targets; checks and errors of commands that write results.
+"""Temporary files and folders next to the files that they will replace, and checks before a command writes results.
 
-Their names consist of a dot, the target's name, :data:`MARK`, the machine, the number of the process and eight digits. Those of
-processes that have ended are removed when a command that writes to the same folder starts.
+The name of a temporary file consists of a dot, the name of the target, :data:`MARK`, a hash of the host name, the process id and
+eight random digits. A temporary file whose process has ended is removed when a later process writes to the same folder.
 """
 
 import fcntl
@@ -24,39 +24,39 @@ from factorgraph_loc.text import error_text
 
 MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}([0-9a-f]{{8}})-([1-9][0-9]*)-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
-_NAMED, _SUFFIX = 150, 60  # bytes used of a name and of a suffix; file systems allow 255 in total
+_NAMED, _SUFFIX = 150, 60  # maximum bytes kept of a target's name and of its suffix; file systems allow 255 in total
 _MACHINE = f"{zlib.crc32(socket.gethostname().encode()):08x}"
-MAX_AGE = 7 * 86_400.0  # s after which a file of another machine, whose processes are unknown, is removed
-_swept: set[Path] = set()  # folders that this process has cleaned up
+MAX_AGE = 7 * 86_400.0  # s after which a file of another machine is removed; whether its process runs is unknown
+_swept: set[Path] = set()  # folders from which this process has removed old temporary files
 _own: set[Path] = set()  # paths created by this process and not yet removed
 
 
 def temporary_file(path: Path) -> AbstractContextManager[Path]:
-    """An empty file next to ``path``, with its suffix; removed at the end of the block unless it was renamed."""
+    """Create an empty file next to ``path``, with the same suffix. It is removed at the end of the block unless it was renamed."""
     return _created(path, path.stem, path.suffix, folder=False)
 
 
 def temporary_folder(path: Path) -> AbstractContextManager[Path]:
-    """A new private folder next to ``path``; removed with its content at the end of the block."""
+    """Create a folder next to ``path`` that only the user can access. It is removed with its content at the end of the block."""
     return _created(path, path.name, "", folder=True)
 
 
 def of_system(name: str) -> Path:
-    """A path with this name in the system's temporary folder."""
+    """Return the path of ``name`` in the temporary folder of the system."""
     return Path(tempfile.gettempdir()) / name
 
 
 def sweep(folder: Path) -> None:
-    """Remove this user's temporary files in ``folder`` that belong to no running process."""
-    with suppress(OSError):  # the folder does not exist
+    """Remove the temporary files of this user in ``folder`` whose process has ended."""
+    with suppress(OSError):  # if the folder does not exist
         for entry in os.scandir(folder):
-            with suppress(OSError):  # removed by another process
+            with suppress(OSError):  # if another process has removed the file
                 if _is_left(entry):
                     _remove(folder / entry.name)
 
 
 def _is_left(entry: os.DirEntry[str]) -> bool:
-    """Whether an entry of a folder is a temporary file or folder of a process that has ended."""
+    """True if an entry of a folder is a temporary file or folder of this user, and its process has ended."""
     name = _NAME.fullmatch(entry.name)
     regular = entry.is_file(follow_symlinks=False) or entry.is_dir(follow_symlinks=False)
     if name is None or not regular or entry.stat(follow_symlinks=False).st_uid != os.geteuid():
@@ -70,19 +70,21 @@ def _is_left(entry: os.DirEntry[str]) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return True
-    except PermissionError:  # of another user
+    except PermissionError:  # the process runs, but belongs to another user
         pass
     return False
 
 
 def remove_own() -> None:
-    """Remove everything that this process has created and not removed, after a signal."""
+    """Remove all temporary files and folders of this process. Call this after a signal, before the process ends."""
     for path in list(_own):
         _remove(path)
 
 
 @contextmanager
 def _created(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]:
+    """Create a temporary file or ``folder`` next to ``path``, with parts of ``name`` and ``suffix`` in its name. Remove it at the
+    end of the block."""
     if path.parent not in _swept:
         _swept.add(path.parent)
         sweep(path.parent)
@@ -98,7 +100,7 @@ def _created(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Pa
         yield made
     except OSError as error:
         if error.errno is not None and str(error.filename) in ("None", str(made)):
-            error.filename = str(path)  # the user knows the target only
+            error.filename = str(path)  # the user does not know the name of the temporary file
         raise
     finally:
         _remove(made)
@@ -106,7 +108,10 @@ def _created(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Pa
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on the file ``path``, which is not removed; no effect if the file system does not support locks."""
+    """Hold an exclusive lock on the file ``path`` in this block. No effect if the file system does not support locks.
+
+    The file is created if it is missing, and is not removed.
+    """
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         with suppress(OSError):
@@ -127,7 +132,7 @@ def _remove(path: Path) -> None:
 
 @contextmanager
 def writing(path: object) -> Iterator[None]:
-    """Context that turns an OSError, or a name that cannot be encoded, into an InputError with ``path``."""
+    """Convert an OSError or UnicodeEncodeError in this block to an InputError: "PATH: cannot be written: ..."."""
     try:
         yield
     except OSError as error:
@@ -137,15 +142,15 @@ def writing(path: object) -> Iterator[None]:
 
 
 def new_below(folder: Path, name: str) -> Path:
-    """The first of ``name``, ``name-2``, ``name-3``, ... that does not exist in a folder."""
+    """Return a path in ``folder`` that does not exist: the first of ``name``, ``name-2``, ``name-3``, and so on."""
     numbered = (name if i == 1 else f"{name}-{i}" for i in itertools.count(1))
     return next(path for text in numbered if not (path := folder / text).exists())
 
 
 def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Raise InputError if ``out`` is not a folder, or contains one of the files ``names`` that must not be replaced.
+    """Raise InputError if ``out`` is a file, or contains one of the files ``names`` and ``overwrite`` is not set.
 
-    Temporary files of previous calls are removed from ``out``, its ``plots`` and its parent.
+    Temporary files of ended processes are removed from ``out``, ``out/plots`` and the parent of ``out``.
     """
     for folder in (out.parent, out, out / "plots"):
         sweep(folder)

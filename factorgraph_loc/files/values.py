@@ -1,4 +1,7 @@
-"""Validation of numbers, names and times passed by a program; arrays are copied, so that the caller may reuse them."""
+"""Validation of numbers, names and times that a program passes to the package.
+
+Arrays are copied, so that the caller may reuse them. In all functions ``where`` and ``field`` name the value in messages.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,11 @@ from factorgraph_loc.files.columns import SECONDS, Column
 from factors.se2 import Array
 
 NUMBER = (int, float, np.integer, np.floating)
-FEW = 30  # numbers: a loop over at most so many is faster than NumPy
+FEW = 30  # maximum number of values that a Python loop checks faster than NumPy
 
 
 def seconds_of(where: str, value: object, name: str = "t") -> float:
-    """A time [s]; InputError if it is not a number or out of range."""
+    """Return a time [s] as a float. Raises InputError if it is not a number or out of range."""
     if type(value) is float and SECONDS.low <= value <= SECONDS.high:
         return value
     seconds = math.nan
@@ -32,7 +35,7 @@ def seconds_of(where: str, value: object, name: str = "t") -> float:
 
 
 def numbers(where: str, field: str, value: object) -> Array:
-    """A new array of ``value``; InputError if it does not consist of real numbers."""
+    """Return ``value`` as a new array of floats. Raises InputError if it does not consist of real numbers."""
     try:
         array = np.array(value)
         if array.dtype.kind == "O" and all(
@@ -47,7 +50,10 @@ def numbers(where: str, field: str, value: object) -> Array:
 
 
 def within(where: str, column: Column, value: object, shape: tuple[int, ...]) -> Any:
-    """Numbers of a given shape within the bounds of their column; a float for the shape ()."""
+    """Return numbers of a given shape, or a float if ``shape`` is ().
+
+    Raises InputError if ``value`` has another shape or exceeds the bounds of ``column``.
+    """
     column, field = column.measured, column.field or column.name
     array = numbers(where, field, value)
     if array.shape != shape:
@@ -62,25 +68,26 @@ def within(where: str, column: Column, value: object, shape: tuple[int, ...]) ->
 
 
 def names(where: str, field: str, value: object) -> tuple[str, ...]:
-    """A tuple of names; InputError if ``value`` is not a list of names."""
+    """Return names as a tuple. Raises InputError if ``value`` is not a list of texts."""
     if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(name, str) for name in value):
         raise bad_field(where, field, value, "names")
     return tuple(value)
 
 
 def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
-    """The items of a list; InputError if ``values`` is not a list."""
+    """Return the items of a list as a tuple. Raises InputError if ``values`` cannot be iterated or is a text."""
     items = None
     if isinstance(values, Iterable) and not isinstance(values, str):
         with contextlib.suppress(TypeError):  # a zero-dimensional array
             items = tuple(values)
     if items is None:
-        raise bad_field(where, field, values, "a list of them")
+        raise bad_field(where, field, values, f"a list of {field}")
     return items
 
 
 def integers(where: str, column: Column, value: object, count: int) -> NDArray[np.int64]:
-    """Integers (K,) within the bounds of their column; InputError if they are invalid."""
+    """Return ``count`` integers as an array (count,). Raises InputError if there are more or fewer, or one is not whole or exceeds
+    the bounds of ``column``."""
     array = numbers(where, column.name, value)
     if array.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
         raise bad_field(where, column.name, value, f"{count} whole numbers")

@@ -1,4 +1,4 @@
-"""Reading of YAML files that other programs wrote, such as occupancy maps."""
+"""Reading of YAML files that other programs wrote, such as the descriptions of occupancy maps in ROS."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from factorgraph_loc.files.models import read_text
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader without aliases, which can expand to gigabytes."""
+    """PyYAML's safe loader, except that aliases are errors, because they can expand to gigabytes."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -22,9 +22,9 @@ class _Loader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The content of a YAML file with a mapping at its top; keys without a value are omitted.
+    """Return the content of a YAML file that consists of keys and values. Keys without a value are omitted.
 
-    InputError names file and row of invalid content.
+    Raises InputError with file and row if the content is invalid.
     """
     what = "is not YAML that can be read"
     with foreign(path, what):

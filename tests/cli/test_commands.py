@@ -185,7 +185,7 @@ def test_texts_of_options():
         "smoother": {"lag": 10, "loss": "cauchy", "gate": {"scale": 1e-3}},
         "ekf": {"smooth": False},
     }
-    with pytest.raises(InputError, match=r"no key smoother.lag.x, as smoother.lag is 10"):
+    with pytest.raises(InputError, match=r"no key smoother.lag.x, because smoother.lag is 10, not a table"):
         parse_settings(["smoother.lag=10", "smoother.lag.x=1"], ["smoother"])
 
 

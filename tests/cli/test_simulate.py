@@ -47,7 +47,7 @@ def test_images_are_written_with_the_log(fgloc, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("office", "--set", "images.rate=5"), "expected --images with it"),
+        (("office", "--set", "images.rate=5"), "has no effect without --images"),
         (("office", "--set", "world.tgas=3"), "unknown key world.tgas: did you mean tags?"),
     ],
 )

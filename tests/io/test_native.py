@@ -150,7 +150,7 @@ def test_duplicate_sightings_the_last_wins(native, one):
         file.write("1600000000,A,3,\n1600000000,B,4,\n")
     log = one(native)
     np.testing.assert_array_equal(log.streams["bearing_range"].range, (2.5, np.nan, 3.0, 4.0))
-    assert "bearing_range.csv: 1 rows see a landmark that a later row sees" in str(log.warnings[0])
+    assert "bearing_range.csv: 1 rows are skipped, because a later row has the same landmark" in str(log.warnings[0])
 
 
 def test_late_sightings_keep_their_place(native, one):
