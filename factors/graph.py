@@ -24,9 +24,8 @@ from factors.compiled import compiled
 from factors.gaussian import cholesky
 from factors.se2 import Array, Integers
 
-MOST_TERMS = (
-    3  # most variables of a `gtsam.JacobianFactor` in Python; a `gtsam.GaussianConditional` may have any number
-)
+# The largest number of variables of a `gtsam.JacobianFactor` in Python. A `gtsam.GaussianConditional` may have any number.
+MOST_TERMS = 3
 # Added to the diagonal of an information matrix before its decomposition, so that it is invertible: a fraction of the mean diagonal
 # element, and a constant.
 RELATIVE_RIDGE, RIDGE = 1e-9, 1e-10

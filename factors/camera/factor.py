@@ -1,4 +1,5 @@
-"""The reprojection factor: points seen by a camera, on a pose and optionally on camera constants and a point."""
+"""The reprojection factor of known points in an image. It depends on a robot pose, and optionally on camera constants and on
+displacements of points."""
 
 from __future__ import annotations
 
@@ -23,21 +24,28 @@ from factors.se2 import Array, moved
 from factors.sighting import delayed
 from factors.update import CONVERGED, Correction, update_state
 
-TILTS = 2  # roll and pitch, which all points of an image have in common
+TILTS = 2  # the number of errors that all points of an image have in common: roll and pitch of the robot
+# Arguments of compiled code without an offset, without a covariance of the offset, and with exact points.
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 
 @dataclass(frozen=True, slots=True)
 class ReprojectionFactor:
-    """K points seen in one image, as a factor on the robot's pose at that time or shortly before.
+    """A factor on the robot's pose from K known points in one image. The pose may be that of a slightly earlier time.
 
-    ``points`` (K, 3): in the world; ``pixels`` (K, 2): measured; ``point_covariances`` (K, 3, 3) of an inexact map are added to the
-    noise. ``offset`` (3,): the pose at the image's time in the frame of the variable's pose, from odometry; its body-frame
-    covariance ``offset_covariance`` (3, 3) is added to the noise. ``twist`` (3,): the robot's velocity at that time.
+    ``points`` (K, 3): world positions. ``pixels`` (K, 2): their measured pixels.
+    ``offset`` (3,): the robot's pose at the image's time, in the frame of the pose variable. Odometry measures it. None if both
+    poses are the same.
+    ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
+    ``point_covariances`` (K, 3, 3): covariances of the points of an inexact map. They are added to the noise.
+    ``estimated``: indices in :data:`PARAMETERS` of the P camera constants that are estimated.
+    ``moved_by`` (K,): for each point, the number of the displacement variable that is added to the point, or -1. Empty if there are
+    no such variables.
+    ``twist`` (3,): the robot's body-frame velocity at the image's time. The Jacobian by the time offset needs it.
 
-    The values of the factor are the pose (3,); corrections (P,) of the constants with indices ``estimated`` in :data:`PARAMETERS`,
-    if any; and displacements (3,) from ``points``. ``moved_by`` (K,): the number of the one that moves a point, or -1; by default
-    there are none. The tilt of the robot is an error that all points have in common, in standard deviations.
+    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P > 0, and
+    the displacements (3,) of points in the world. The robot's tilt (roll and pitch) is an unknown error that all points have in
+    common.
     """
 
     model: CameraModel
@@ -52,11 +60,11 @@ class ReprojectionFactor:
 
     @property
     def of_pose_alone(self) -> bool:
-        """Whether the pose is its only variable."""
+        """True if the factor depends on the pose only."""
         return not self.estimated and not self.moved_by
 
     def packed(self) -> pixel_kernels.PackedImage:
-        """The arguments of the compiled code. The factor must be :attr:`of_pose_alone`."""
+        """The factor as an argument of compiled code. The factor must depend on the pose only."""
         model, offset, noise, covariances = self.model, self.offset, self.offset_covariance, self.point_covariances
         return pixel_kernels.PackedImage(
             lens_of(model),
@@ -74,9 +82,9 @@ class ReprojectionFactor:
         )
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (2K,) and its Jacobian (2K, d) with respect to each value, with robust weights and tempering.
+        """The whitened residual (2K,) and its Jacobian (2K, d) by each value, with robust weights and tempering.
 
-        The unknown tilt is marginalised: its variance is part of the noise of the points.
+        The unknown tilt is marginalised: its variance is part of the noise.
         """
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
@@ -88,25 +96,28 @@ class ReprojectionFactor:
         return residual, np.split(jacobian, ends[:-1], axis=1)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss, with the tilt that fits best."""
+        """The robust loss for the tilt that fits best, multiplied by the tempering exponent."""
         error, tilt = self.levelled(values)
         loss = np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)) + 0.5 * tilt @ tilt
         return self.model.tempering * float(loss)
 
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Whitened residual (K, 2) with the tilt that fits best, and that tilt (2,)."""
+        """Fit the robot's tilt to the image. Returns the whitened residual (K, 2) with this tilt, and the tilt (2,): roll and pitch
+        in standard deviations."""
         error, (*_, by_tilt) = self.whitened(values)
         roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
         tilt = np.array((roll, pitch))
         return error + by_tilt @ tilt, tilt
 
     def weight(self, squared: Array) -> Array:
-        """The robust weight of squared whitened residuals."""
+        """The robust weights of ``squared`` norms of whitened residuals, multiplied by the tempering exponent."""
         return self.model.tempering * huber_weight(squared, self.model.robust)
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, 2), predicted minus measured, of a robot that does not tilt, and its Jacobian (K, 2, d) by each
-        value and by the tilt, without robust weights."""
+        """The whitened residual (K, 2) of a level robot, predicted minus measured, and its Jacobians, without robust weights.
+
+        The Jacobians (K, 2, d) are by each value and, as last element, by the tilt in standard deviations (K, 2, 2).
+        """
         moved_by, displacements = np.array(self.moved_by, dtype=np.int64), values[1 + bool(self.estimated) :]
         moves = None if not self.moved_by else np.array((*displacements, np.zeros(3)))[moved_by]
         on_pose = self.fixed(values[1 : 1 + bool(self.estimated)], moves)
@@ -125,7 +136,11 @@ class ReprojectionFactor:
         return residual, [*blocks, jacobian[..., TILT:POINT]]
 
     def fixed(self, parameters: Sequence[Array], displacement: Array | None) -> ReprojectionFactor:
-        """The factor on the pose only, at given constants (one array (P,), or none) and a ``displacement`` (K, 3) of the points."""
+        """A factor on the pose only, with all other values fixed.
+
+        ``parameters``: a sequence of one array (P,), the corrections of the estimated constants, or an empty sequence.
+        ``displacement`` (K, 3): is added to the points; None for zero.
+        """
         if not parameters and displacement is None:
             return self
         model, offset = self.model, self.offset
@@ -151,11 +166,16 @@ def image_update(
     values: Sequence[Array] = (),
     columns: Sequence[slice] = (),
 ) -> Correction:
-    """Kalman update of ``pose`` (3,) and correlated states by points in an image; see :func:`~factors.update.update_state`.
+    """Correct a Gaussian by known points in an image, with a Kalman update. See :func:`~factors.update.update_state`.
 
-    ``covariance`` (S, S): of the error state, whose first three components are the pose's body-frame perturbation. ``values``: the
-    other values of the factor, whose ``columns`` in the error state are given. With these the covariance is that of perturbations
-    of the updated pose, because pixels are so much more accurate than a survey that it matters.
+    ``pose`` (3,): the predicted pose.
+    ``covariance`` (S, S): covariance of the error state. Its first three components are the pose's body-frame perturbation.
+    ``iterations``, ``converged``: limits of the iterations.
+    ``values``: the values of the factor besides the pose, at the prediction. ``columns``: the components of each in the error
+    state.
+
+    With ``values``, the resulting covariance is converted to perturbations of the updated pose instead of the predicted pose. The
+    difference matters because pixels are much more accurate than a surveyed map.
     """
     size = len(covariance)
     packed = factor.packed() if factor.of_pose_alone else None
@@ -182,8 +202,11 @@ def image_update(
 
 
 def turns(estimated: tuple[int, ...], changes: Array) -> Array:
-    """Jacobian (3, 3) of a small rotation by the corrections of the camera's rotation: the left Jacobian of SO(3), which is the
-    right one of the opposite rotation."""
+    """The Jacobian (3, 3) of the camera's rotation, as a perturbation about the robot's axes, by the corrections of roll, pitch and
+    yaw. It is the left Jacobian of SO(3), which equals the right Jacobian of the opposite rotation.
+
+    ``changes`` (P,): corrections of the constants with indices ``estimated`` in :data:`PARAMETERS`.
+    """
     full = np.zeros(len(PARAMETERS))
     full[list(estimated)] = changes
     return np.asarray(gtsam.Rot3.ExpmapDerivative(-full[3:6]))

@@ -1,12 +1,14 @@
 """Inverse-depth parametrization of points.
 
-Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Transactions on Robotics 24(5), 2008, sections
-III (parametrization and measurement), IV (initialization) and VI (conversion to x, y, z). Six values: the camera's position
-(x, y, z) [m] at the first sighting, azimuth and elevation [rad] of the ray in the world, and the inverse depth [1/m]. The world's
-z axis is up here, so the direction is singular only for points straight above or below.
+Source: Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Transactions on Robotics 24(5), 2008,
+sections III (parametrization and measurement), IV (initialization) and VI (conversion to x, y, z).
 
-A Gaussian of the inverse depth represents all depths from a minimum to infinity, so the first sighting of a point already informs
-the camera's rotation. It informs the translation as soon as there is parallax.
+A ray (6,) represents a point by six values: the camera's position (x, y, z) [m] at the first sighting, azimuth and elevation [rad]
+of the direction in the world, and the inverse depth [1/m]. The world's z axis is up, so azimuth and elevation are singular only for
+points straight above or below.
+
+A Gaussian of the inverse depth represents all depths from a minimum to infinity. A point is therefore a useful landmark from its
+first sighting on: it informs the camera's rotation at once, and the translation as soon as there is parallax.
 """
 
 import numpy as np
@@ -14,13 +16,14 @@ import numpy as np
 from factors.camera.model import CameraModel, linearize_in_space, rays
 from factors.se2 import Array
 
-SIZE = 6  # values of a point
-LEAST_FLAT = 1e-6  # minimum horizontal part of a direction; vertical directions have no azimuth
-LINEAR = 0.1  # linearity index below which x, y, z are nearly Gaussian (section VI)
+SIZE = 6  # number of values of a ray
+LEAST_FLAT = 1e-6  # minimum horizontal part of a direction, because a vertical direction has no azimuth
+LINEAR = 0.1  # below this linearity index, x, y, z of a point are nearly Gaussian (section VI)
 
 
 def directions(rays: Array) -> tuple[Array, Array]:
-    """Unit vectors (K, 3) of ``rays`` (K, 6) in the world, and their Jacobian (K, 3, 2) by azimuth and elevation."""
+    """The directions of ``rays`` (K, 6) as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and
+    elevation."""
     azimuth, elevation = rays[:, 3], rays[:, 4]
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     by_angles = np.zeros((len(rays), 3, 2))
@@ -30,7 +33,8 @@ def directions(rays: Array) -> tuple[Array, Array]:
 
 
 def turned(angles: Array) -> Array:
-    """The derivative (2, 3) of azimuth and elevation, ``angles`` (2,), by a rotation of the world."""
+    """The derivative (2, 3) of azimuth and elevation by a small rotation vector about the world's axes. ``angles`` (2,): azimuth
+    and elevation [rad]."""
     azimuth, elevation = angles.tolist()
     c, s = np.cos(azimuth), np.sin(azimuth)
     slope = np.tan(elevation)
@@ -38,7 +42,8 @@ def turned(angles: Array) -> Array:
 
 
 def positions(rays: Array) -> tuple[Array, Array]:
-    """Positions (K, 3) of ``rays`` (K, 6) with positive inverse depths, and their Jacobian (K, 3, 6)."""
+    """The positions (K, 3) in the world of points given as ``rays`` (K, 6), and their Jacobian (K, 3, 6) by the rays. The inverse
+    depths must be positive."""
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5]
     jacobian = np.zeros((len(rays), 3, SIZE))
@@ -49,15 +54,17 @@ def positions(rays: Array) -> tuple[Array, Array]:
 
 
 def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array) -> tuple[Array, Array, Array]:
-    """Pixels (K, 2) of ``rays`` (K, 6) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world; their Jacobians by
-    the camera's perturbation (K, 2, 6), as in :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6).
+    """Predict the pixels of points given as ``rays`` (K, 6), in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the
+    world.
 
-    A pixel depends on the direction only, so the inverse depth may be zero (section III).
+    Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6), as in
+    :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6). A pixel depends only on the direction from the
+    camera to the point, so the inverse depth may be zero (section III).
     """
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5, None]
     away = rays[:, :3] - position
-    # the vector to the point, times its inverse depth
+    # the vector from the camera to the point, times the inverse depth
     direction = inverse * away + ahead
     pixels, by_camera, by_direction = linearize_in_space(model, np.zeros(3), rotation, direction)
     by_camera[..., 3:] = -inverse[:, None] * (by_direction @ rotation)
@@ -71,8 +78,11 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
 def begin(
     model: CameraModel, position: Array, rotation: Array, pixel: Array, inverse_depth: float
 ) -> tuple[Array, Array, Array]:
-    """Initialize a ray (6,) from its first ``pixel`` (2,), in a camera as in :func:`linearize`. Returns also its Jacobians by the
-    camera's perturbation (6, 6), and by the pixel and the inverse depth (6, 3) (section IV)."""
+    """Initialise a ray from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m] (section IV).
+
+    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,) and its Jacobians by the camera's
+    perturbation (6, 6), and by the pixel and the inverse depth (6, 3).
+    """
     (local,) = rays(model, pixel[None])
     _, _, by_local = linearize_in_space(model, np.zeros(3), np.eye(3), local[None])
     ahead = rotation @ local
@@ -96,9 +106,11 @@ def begin(
 
 
 def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
-    """The linearity index (K,) of ``rays`` (K, 6) with standard deviations ``sigmas`` (K,) of their inverse depths, seen from
-    ``position`` (3,), infinite for inverse depths that are not positive. Below :data:`LINEAR`, x, y, z are nearly Gaussian
-    (section VI)."""
+    """The linearity index (K,) of ``rays`` (K, 6) for a camera at ``position`` (3,) (section VI).
+
+    ``sigmas`` (K,): standard deviations of the inverse depths. If the index is below :data:`LINEAR`, the point's x, y, z are nearly
+    Gaussian, and can replace the ray. The index is infinite if the inverse depth is not positive.
+    """
     inverse = rays[:, 5]
     index = np.full(len(rays), np.inf)
     near = inverse > 0.0

@@ -1,4 +1,4 @@
-"""Compiled kernels of :mod:`factors.camera.model` and :mod:`factors.camera.point`."""
+"""Compiled functions of :mod:`factors.camera.model` and :mod:`factors.camera.point`: projection, distortion and derivatives."""
 
 import math
 
@@ -8,26 +8,29 @@ from factors.compiled import compiled
 from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
-NEAREST = 0.05  # m in front of the camera
+NEAREST = 0.05  # m; points with a smaller depth are projected as if at this depth
 MOST_STEPS, ENOUGH = 50, 1e-14  # of Newton's method: maximum steps, and norm of the residual at convergence
-BLOCK = 256  # poses whose likelihoods are computed together, so that their data fit into the cache
+BLOCK = 256  # number of poses whose likelihoods are computed together, so that their data fit into the cache
 BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
-# columns of a Jacobian: by the pose, by roll and pitch, by the point, and by all parameters of the camera
+# The columns of a full Jacobian are the pose (3), roll and pitch (2), the point (3), and the camera's constants (8). These are the
+# first columns of the last three groups, and the number of columns.
 TILT, POINT, CONSTANTS, WIDTH = 3, 5, 8, 16
 
-# fx, fy, cx, cy, k1, k2, p1, p2, and 1 / r^2; the distortion is valid where x^2 + y^2 < r^2. Lenses that are not Brown's have also
-# their kind, k3, k4, k5, k6: numba compiles code for tuples of either length, without a branch
+# The elements of a lens are fx, fy, cx, cy, k1, k2, p1, p2, and 1 / r^2, where the distortion is valid for x^2 + y^2 < r^2. A lens
+# without Brown's distortion has five more: its kind (RATIONAL or FISHEYE), k3, k4, k5, k6. Numba compiles separate code for each
+# length of the tuple, so that Brown's distortion needs no branch.
 Lens = tuple[float, ...]
-BROWN = 9
+BROWN = 9  # the number of elements of a lens with Brown's distortion
 RATIONAL, FISHEYE = 0.0, 1.0
-Place = tuple[tuple[float, ...], ...]
+Place = tuple[tuple[float, ...], ...]  # a camera's pose in the robot frame: position, and the three axes of the camera
 
 
 @compiled
 def _radial(k: Lens, rr: float) -> tuple[float, float]:
-    """The radial factor of a lens that is not Brown's at the square ``rr`` of the distance from the axis, and twice its slope.
+    """The radial factor of a rational or fisheye lens, and twice its derivative by ``rr``.
 
-    Kannala and Brandt, "A generic camera model and calibration method", PAMI 28(8), 2006, eq. 6, for a fisheye lens.
+    ``rr``: the squared distance x^2 + y^2 of the direction from the axis. The distorted distance is the distance times the radial
+    factor. Fisheye lens: Kannala and Brandt, "A generic camera model and calibration method", PAMI 28(8), 2006, eq. 6.
     """
     k1, k2, k3, k4, k5, k6 = k[4], k[5], k[-4], k[-3], k[-2], k[-1]
     if k[-5] == RATIONAL:
@@ -46,14 +49,16 @@ def _radial(k: Lens, rr: float) -> tuple[float, float]:
 
 @compiled
 def radial_slope(k: Lens, rr: float) -> float:
-    """The slope of the distorted distance from the axis, of a lens that is not Brown's, at the square ``rr`` of the distance."""
+    """The derivative of the distorted distance from the axis by the undistorted distance, of a rational or fisheye lens. ``rr``:
+    the squared undistorted distance."""
     radial, slope = _radial(k, rr)
     return float(radial + rr * slope)
 
 
 @compiled(inline="always")
 def _bent(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """The distortion at direction (x, y) within the valid radius, and its derivatives xx, xy = yx and yy."""
+    """Distort a direction (x, y) within the valid radius. Returns the distorted direction (2 numbers), and its derivatives: x by x,
+    x by y (which equals y by x), and y by y."""
     k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
     rr = x * x + y * y
     radial = 1.0 + k1 * rr + k2 * rr * rr
@@ -70,8 +75,11 @@ def _bent(k: Lens, x: float, y: float) -> tuple[float, float, float, float, floa
 
 @compiled(inline="always")
 def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """The distorted direction, and its Jacobian by rows. Beyond its valid radius the distortion B is extrapolated radially, as
-    t B(x / t) with t = r / radius, so that nothing far outside of the image appears in it."""
+    """Distort any direction (x, y). Returns the distorted direction (2 numbers) and its Jacobian row by row (4 numbers).
+
+    Let B be the distortion and R its valid radius. Beyond R the distortion of a direction d is extrapolated radially, as
+    ``t B(d / t)`` with ``t = |d| / R``. Directions far outside of the image then do not appear in the image.
+    """
     t = math.sqrt(max(1.0, k[8] * (x * x + y * y)))
     inverse = 1.0 / t
     ex, ey = inverse * x, inverse * y
@@ -85,7 +93,7 @@ def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float,
 def pixel(
     k: Lens, p0: float, p1: float, p2: float
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
-    """The pixel of a point, and the gradients of its two coordinates."""
+    """Project a point (p0, p1, p2) in the camera frame. Returns the pixel coordinates u and v, and their gradients by the point."""
     near = 1.0 / max(p2, NEAREST)
     x, y = p0 * near, p1 * near
     xd, yd, xx, xy, yx, yy = _distorted(k, x, y)
@@ -97,7 +105,7 @@ def pixel(
 
 @compiled(inline="always")
 def mounting(position: Array, rotation: Array) -> Place:
-    """The camera's pose in the robot frame as numbers: position and axes."""
+    """The camera's ``position`` (3,) and ``rotation`` (3, 3) in the robot frame as tuples of numbers, for fast access."""
     p, r = position, rotation
     right, down, ahead = (r[0, 0], r[1, 0], r[2, 0]), (r[0, 1], r[1, 1], r[2, 1]), (r[0, 2], r[1, 2], r[2, 2])
     return (p[0], p[1], p[2]), right, down, ahead
@@ -107,8 +115,13 @@ def mounting(position: Array, rotation: Array) -> Place:
 def in_camera(
     place: Place, c: float, s: float, dx: float, dy: float, z: float
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """A point at (dx, dy, z) from a robot with heading (cosine c, sine s): relative to the camera along the robot's axes, and in
-    the camera frame."""
+    """Transform a world point to the camera frame.
+
+    ``place``: the camera's pose in the robot frame, from :func:`mounting`. ``c``, ``s``: cosine and sine of the robot's heading.
+    ``dx``, ``dy``, ``z``: the vector from the robot to the point along the world's axes.
+
+    Returns the vector from the camera to the point along the robot's axes, and the point in the camera frame.
+    """
     position, right, down, ahead = place
     ax, ay, az = c * dx + s * dy - position[0], c * dy - s * dx - position[1], z - position[2]
     lx = right[0] * ax + right[1] * ay + right[2] * az
@@ -119,8 +132,12 @@ def in_camera(
 
 @compiled(error_model="numpy")
 def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
-    """The directions (K, 2) whose distortion is ``distorted`` (K, 2), with positive determinant; and the remaining errors (K,) of
-    the distorted directions. NaN for NaN."""
+    """Invert the distortion by Newton's method.
+
+    ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and the remaining errors (K,) of their
+    distortion. Only directions at which the lens's Jacobian has a positive determinant are found. The result is NaN, with an
+    infinite error, for a direction that is NaN.
+    """
     n = len(distorted)
     directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)
     for i in range(n):
@@ -131,7 +148,7 @@ def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
             xd, yd, xx, xy, yx, yy = _distorted(k, to_x, to_y)
             eu, ev, determinant = distorted[i, 0] - xd, distorted[i, 1] - yd, xx * yy - xy * yx
             error = math.sqrt(eu * eu + ev * ev)
-            if not (determinant > 0.0 and error < errors[i]):  # step too long, or over a fold
+            if not (determinant > 0.0 and error < errors[i]):  # the step is too long, or crosses a fold of the lens
                 share *= 0.5
                 continue
             x, y, errors[i] = to_x, to_y, error
@@ -144,7 +161,7 @@ def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
 
 @compiled(error_model="numpy")
 def project(k: Lens, points: Array) -> tuple[Array, Array]:
-    """Pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3)."""
+    """The pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3) by the points."""
     n = len(points)
     pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
     for i in range(n):
@@ -157,7 +174,7 @@ def project(k: Lens, points: Array) -> tuple[Array, Array]:
 
 @compiled(error_model="numpy")
 def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array) -> tuple[Array, Array, Array]:
-    """See :func:`factors.camera.model.linearize_in_space`."""
+    """The compiled part of :func:`factors.camera.model.linearize_in_space`, with the same results."""
     n = len(points)
     pixels, by_camera, by_point = np.empty((n, 2)), np.empty((n, 2, 6)), np.empty((n, 2, 3))
     for i in range(n):
@@ -181,13 +198,20 @@ def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array)
 def project_planar(
     camera: tuple[Lens, Array, Array], pose: Array, tilt: Array, turn: Array, point: Array, jacobian: Array
 ) -> tuple[float, float, float]:
-    """Pixel and depth of a ``point`` (3,) from a robot at ``pose`` (3,) with a ``tilt`` (2,), the rotation ``turn`` (3, 3); the
-    ``jacobian`` (2, WIDTH) in place."""
+    """Project a world ``point`` (3,) from a robot on a plane.
+
+    ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame.
+    ``pose`` (3,), ``tilt`` (2,) [rad]: the robot's planar pose, and its roll and pitch. ``turn`` (3, 3): :func:`turned` of the
+    tilt.
+    ``jacobian`` (2, WIDTH): output, the derivatives of the pixel.
+
+    Returns the pixel coordinates u and v, and the depth [m].
+    """
     k, position, rotation = camera
     c, s = math.cos(pose[2]), math.sin(pose[2])
     dx, dy, z = point[0] - pose[0], point[1] - pose[1], point[2]
     x, y = c * dx + s * dy, c * dy - s * dx
-    # in the robot's frame, and from the camera along the robot's axes
+    # (bx, by, bz): the point in the robot frame; (ax, ay, az): the vector from the camera to the point along the robot's axes
     bx = turn[0, 0] * x + turn[1, 0] * y + turn[2, 0] * z
     by = turn[0, 1] * x + turn[1, 1] * y + turn[2, 1] * z
     bz = turn[0, 2] * x + turn[1, 2] * y + turn[2, 2] * z
@@ -208,7 +232,7 @@ def project_planar(
         e1 = turn[1, 0] * g0 + turn[1, 1] * g1 + turn[1, 2] * g2
         e2 = turn[2, 0] * g0 + turn[2, 1] * g1 + turn[2, 2] * g2
         jacobian[r, 0], jacobian[r, 1], jacobian[r, 2] = -e0, -e1, e0 * y - e1 * x
-        # a change of the tilt turns the robot about other axes than its own by half of the tilt
+        # second-order term: a change of the tilt rotates the robot about axes that are rotated by half of the tilt
         about = 0.5 * (g0 * by - g1 * bx)
         jacobian[r, TILT] = g1 * bz - g2 * by + about * tilt[1]
         jacobian[r, TILT + 1] = g2 * bx - g0 * bz - about * tilt[0]
@@ -217,14 +241,14 @@ def project_planar(
         jacobian[r, CONSTANTS + 3] = g1 * az - g2 * ay
         jacobian[r, CONSTANTS + 4] = g2 * ax - g0 * az
         jacobian[r, CONSTANTS + 5] = g0 * ay - g1 * ax
-        jacobian[r, CONSTANTS + 6] = u - k[2] if r == 0 else v - k[3]  # a longer focal length
+        jacobian[r, CONSTANTS + 6] = u - k[2] if r == 0 else v - k[3]  # by the logarithm of the focal length
         jacobian[r, CONSTANTS + 7] = 0.0
     return u, v, depth
 
 
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
-    """Pixels (K, 2) of ``points`` (K, 3) and their Jacobian (K, 2, WIDTH). The robot does not tilt."""
+    """The pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobian (K, 2, WIDTH)."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
     for i in range(len(points)):
@@ -234,7 +258,7 @@ def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> 
 
 @compiled(error_model="numpy")
 def turned(roll: float, pitch: float) -> Array:
-    """The rotation (3, 3) of a robot with this tilt."""
+    """The rotation (3, 3) of a tilted robot: the exponential of the rotation vector (roll, pitch, 0) [rad]."""
     angle = math.sqrt(roll * roll + pitch * pitch)
     a, b = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)) if angle > 1e-6 else (1.0, 0.5)
     turn = np.empty((3, 3))
@@ -256,10 +280,15 @@ def whiten(
     sigma: float,
     robust: float,
 ) -> tuple[Array, Array, Array]:
-    """Of N points (N, 3), each seen from a pose (N, 3) by a robot with a tilt (N, 2): whitened, robustly weighted residuals (N, 2),
-    their Jacobian (N, 2, WIDTH), and the squared residuals (N,) without weight.
+    """Linearise N pixel measurements.
 
-    ``measured`` (N, 2): pixels. ``sigma``: standard deviation of each of their coordinates.
+    ``k``, ``position``, ``rotation``: the lens, and the camera's pose in the robot frame.
+    ``poses`` (N, 3), ``tilts`` (N, 2), ``points`` (N, 3): the robot's pose and tilt, and the world point of each measurement.
+    ``measured`` (N, 2): the measured pixels. ``sigma`` [px]: the standard deviation of each coordinate.
+    ``robust``: the scale of Huber's loss in standard deviations.
+
+    Returns whitened residuals (N, 2) with robust weights, their Jacobian (N, 2, WIDTH), and the squared norms (N,) of the residuals
+    without robust weights.
     """
     n = len(measured)
     residual, jacobian, squared = np.empty((n, 2)), np.empty((n, 2, WIDTH)), np.zeros(n)
@@ -278,7 +307,8 @@ def see(
     residual: Array,
     jacobian: Array,
 ) -> float:
-    """One point of :func:`whiten`: the squared residual; fills ``residual`` and ``jacobian``. ``at``: pose, tilt, point, pixel."""
+    """Linearise one measurement of :func:`whiten`. ``at``: pose, tilt, point and measured pixel. Writes ``residual`` (2,) and
+    ``jacobian`` (2, WIDTH). Returns the squared norm of the residual without robust weight."""
     pose, tilt, point, measured = at
     u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
     residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma
@@ -308,8 +338,12 @@ def log_likelihood(
     scale: float,
     tempering: float,
 ) -> Array:
-    """See :func:`factors.camera.model.log_likelihood`; with ``whiteners`` (K, 2, 2) of the residuals, and Jacobians ``tilts``
-    (K, 2, 2) of what these make of them. The tilt of each pose is that of least squares."""
+    """The compiled part of :func:`factors.camera.model.log_likelihood`.
+
+    ``whiteners`` (K, 2, 2): the matrices that whiten the pixel errors. ``tilts`` (K, 2, 2): the Jacobian of the whitened errors by
+    roll and pitch in standard deviations. ``scale``: that of Huber's loss. The tilt of each pose is fitted by least squares,
+    without robust weights.
+    """
     place, count = mounting(position, rotation), len(points)
     px, py, c, s = poses[:, 0].copy(), poses[:, 1].copy(), np.cos(poses[:, 2]), np.sin(poses[:, 2])
     out = np.zeros(len(poses))
@@ -331,7 +365,7 @@ def log_likelihood(
             x, y, z, seen_u, seen_v = points[i, 0], points[i, 1], points[i, 2], pixels[i, 0], pixels[i, 1]
             uu, uv, vu, vv = whiteners[i, 0, 0], whiteners[i, 0, 1], whiteners[i, 1, 0], whiteners[i, 1, 1]
             ru, pu, rv, pv = tilts[i, 0, 0], tilts[i, 0, 1], tilts[i, 1, 0], tilts[i, 1, 1]
-            # the inner loops run over poses, to vectorise
+            # the inner loops run over poses, so that the compiler vectorises them
             for n in range(len(total)):
                 _, (lx, ly, lz) = in_camera(place, bc[n], bs[n], x - bx[n], y - by[n], z)
                 u, v, _, _ = pixel(k, lx, ly, lz)

@@ -1,16 +1,14 @@
 """A pinhole camera with lens distortion on a robot: projection and its derivatives.
 
-The camera is mounted on the robot at ``rTc``; its axes are z forward, x right, y down. A point in the camera frame is seen at the
-pixel (fx x + cx, fy y + cy) of its distorted direction (x, y), with radial and tangential distortion (k1, k2, p1, p2) after
-Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as in OpenCV and ``gtsam.Cal3DS2``. Pixel noise is
-Gaussian with Huber's loss (1964) against outliers.
+The axes of the camera frame are z forward, x right, y down. The direction of a point is (x, y) at depth 1. The lens distorts this
+direction, and the pixel is (fx x + cx, fy y + cy) of the distorted direction. The distortion has radial and tangential terms (k1,
+k2, p1, p2) after Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as in OpenCV and
+``gtsam.Cal3DS2``. Rational polynomials and fisheye lenses (Kannala and Brandt, 2006) are also as in OpenCV. Pixel noise is Gaussian
+with Huber's loss (1964) against outliers.
 
-Rational polynomials and fisheye lenses (Kannala and Brandt, 2006) are as in OpenCV too.
-
-The distortion is used up to the radius where the lens would fold the image; directions beyond it, outside of the image of an
-invertible lens, are extrapolated radially, so that they do not appear in the image. Points nearer than
-:data:`~factors.camera.kernels.NEAREST`, or behind the camera, are treated as at that depth: all values are finite and nothing
-raises.
+The distortion polynomial is used up to the radius where it stops growing, because it would fold the image beyond. Directions beyond
+this radius are extrapolated radially, so that they do not appear in the image. Points that are behind the camera, or nearer than
+:data:`~factors.camera.kernels.NEAREST`, are projected as if at that depth. All results are therefore finite.
 """
 
 from __future__ import annotations
@@ -28,18 +26,19 @@ from factors.camera.kernels import CONSTANTS, POINT, TILT, Lens
 from factors.compiled import compiled
 from factors.se2 import Array
 
-# the constants of a camera that can be estimated: position [m] and small rotations [rad] about the robot's axes, logarithm of the
-# focal length, and time offset [s] of images relative to their timestamps
+# The constants of a camera that can be estimated: corrections of its position [m] along the robot's axes, small rotations [rad]
+# about these axes, the logarithm of the focal length, and the time offset [s] of images relative to their timestamps.
 PARAMETERS = ("x", "y", "z", "roll", "pitch", "yaw", "focal", "time_offset")
 FOCAL, TIME_OFFSET = PARAMETERS.index("focal"), PARAMETERS.index("time_offset")
-WIDEST = 4.0  # of x^2 + y^2 (63 degrees off the axis): maximum for the distortion polynomial
-WIDEST_FISHEYE = 400.0  # likewise (87 degrees)
-STEPS = 1000  # radii at which the slope of a distortion is checked
-GRID = 33  # rows and columns of pixels at which a lens is checked
-PLANAR = [3, 4, 2]  # indices in the perturbation of a pose in space: x, y and heading of a level robot
-NONE = 1e-9  # tolerance of distorted directions
+WIDEST = 4.0  # largest x^2 + y^2 for which a distortion polynomial is used (63 degrees off the axis)
+WIDEST_FISHEYE = 400.0  # the same limit for a fisheye lens (87 degrees)
+STEPS = 1000  # number of radii at which the slope of a distortion is checked
+GRID = 33  # `folded` checks a lens at this many rows and columns of pixels
+# The indices of x, y and heading of a level robot in the perturbation (6,) of a pose in space, rotation before translation.
+PLANAR = [3, 4, 2]
+NONE = 1e-9  # largest error of a distorted direction whose undistortion succeeded
 
-# columns: axes of a forward-facing camera in the robot frame (z up)
+# The rotation of a forward-facing camera. The columns are the camera's axes in the robot frame (x forward, y left, z up).
 FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 
 
@@ -47,11 +46,16 @@ FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 class CameraModel:
     """A camera and its noise.
 
-    ``fx``, ``fy``, ``cx``, ``cy`` [px]; ``distortion`` (k1, k2, p1, p2) or (k1, k2, p1, p2, k3, k4, k5, k6), or of a ``fisheye``
-    (k1, k2, k3, k4), as in OpenCV; ``width``, ``height`` [px] of its images. ``position`` (3,) [m] and ``rotation`` (3, 3) of the
-    camera in the robot frame. ``sigma`` [px] in u and in v; ``robust``: scale of Huber's loss in standard deviations.
-    ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images. ``tilt``: standard deviation [rad]
-    of the robot's roll and pitch, which all points of an image have in common: no floor is level to a pixel.
+    ``fx``, ``fy``, ``cx``, ``cy`` [px]: focal lengths and principal point.
+    ``width``, ``height`` [px]: size of the images.
+    ``distortion``: (k1, k2, p1, p2), or (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) of a fisheye lens, as in OpenCV.
+    ``position`` (3,) [m], ``rotation`` (3, 3): pose of the camera in the robot frame.
+    ``sigma`` [px]: standard deviation of each pixel coordinate.
+    ``robust``: scale of Huber's loss in standard deviations.
+    ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images.
+    ``tilt`` [rad]: standard deviation of the robot's roll and pitch, because floors are not exactly level. All points of an image
+    have this error in common.
+    ``fisheye``: True for a fisheye lens.
     """
 
     fx: float
@@ -70,7 +74,7 @@ class CameraModel:
     fisheye: bool = False
 
     def intrinsics(self) -> Array:
-        """Focal lengths, principal point and distortion as an array."""
+        """The focal lengths, principal point and distortion as an array. A last element 1 marks a fisheye lens."""
         return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion, *((1.0,) if self.fisheye else ())))
 
     def matrix(self) -> Array:
@@ -79,35 +83,38 @@ class CameraModel:
 
     @property
     def is_brown(self) -> bool:
-        """Whether the lens has Brown's distortion (k1, k2, p1, p2)."""
+        """True if the lens has Brown's distortion (k1, k2, p1, p2)."""
         return len(self.distortion) == 4 and not self.fisheye
 
     def calibration(self) -> gtsam.Cal3DS2:
-        """The calibration for GTSAM, if the lens :attr:`is_brown`."""
+        """The calibration for GTSAM. The lens must have Brown's distortion, see :attr:`is_brown`."""
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
-        """Whether ``pixels`` (..., 2) are in the image, or at most ``margin`` pixels outside of it: booleans (...)."""
+        """A mask (...) of the ``pixels`` (..., 2) that are in the image, or at most ``margin`` pixels outside of it."""
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= -0.5 - margin) & (u <= self.width - 0.5 + margin)
         return inside & (v >= -0.5 - margin) & (v <= self.height - 0.5 + margin)
 
 
 def mounting(roll: float, pitch: float, yaw: float) -> Array:
-    """The rotation (3, 3) of a camera in the robot frame. The forward-facing camera is rotated by ``roll`` about x, ``pitch`` about
-    y (down is positive), ``yaw`` about z (left is positive)."""
+    """The rotation (3, 3) of a camera in the robot frame from three angles [rad].
+
+    A forward-facing camera is rotated by ``roll`` about x, by ``pitch`` about y (positive is down), and by ``yaw`` about z
+    (positive is left), in this order, about the axes of the robot.
+    """
     return np.asarray(gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ FORWARD)
 
 
 def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch and yaw of a camera whose optical axes are ``rotation`` (3, 3) in the robot frame: the inverse of
-    :func:`mounting`."""
+    """The roll, pitch and yaw [rad] of a camera with ``rotation`` (3, 3) in the robot frame. The inverse of :func:`mounting`."""
     roll, pitch, yaw = gtsam.Rot3(rotation @ FORWARD.T).xyz().tolist()
     return roll, pitch, yaw
 
 
 def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
-    """The model with corrections ``changes`` (8,) of :data:`PARAMETERS`; the time offset is ignored."""
+    """The model with corrected constants. ``changes`` (8,): corrections of :data:`PARAMETERS`. The time offset is ignored, because
+    it is not part of the model."""
     turn = np.asarray(gtsam.Rot3.Expmap(changes[3:6]).matrix())
     scale = math.exp(float(changes[FOCAL]))
     return replace(
@@ -120,12 +127,12 @@ def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
 
 
 def project(model: CameraModel, points: Array) -> Array:
-    """Pixels (K, 2) of ``points`` (K, 3) in the camera frame."""
+    """The pixels (K, 2) of ``points`` (K, 3), which are given in the camera frame."""
     return np.asarray(reprojection_kernels.project(lens_of(model), np.ascontiguousarray(points, dtype=float))[0])
 
 
 def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
-    """World ``points`` (K, 3) in the frame of the camera of a robot at ``pose`` (3,)."""
+    """Transform world ``points`` (K, 3) to the camera frame (K, 3). The robot is at the planar ``pose`` (3,)."""
     local = np.empty_like(points, dtype=float)
     local[:, :2] = se2.transform_to(pose, points[:, :2])
     local[:, 2] = points[:, 2]
@@ -133,12 +140,13 @@ def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
 
 
 def mounted(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``position`` (3,) with ``rotation`` (3, 3)."""
+    """The camera's position (3,) and rotation (3, 3) in the world, from the robot's ``position`` (3,) and ``rotation`` (3, 3)."""
     return position + rotation @ model.position, rotation @ model.rotation
 
 
 def lift(model: CameraModel) -> Array:
-    """Jacobian (6, 6) of the camera's perturbation in its own frame by that of the robot, rotation before translation in both."""
+    """The Jacobian (6, 6) of the camera's perturbation by the robot's perturbation. Each perturbation is in the body's own frame,
+    with rotation before translation."""
     x, y, z = model.position
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = jacobian[3:, 3:] = model.rotation.T
@@ -147,14 +155,17 @@ def lift(model: CameraModel) -> Array:
 
 
 def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """The inverse of :func:`mounted`: the robot whose camera is at ``position`` (3,) with ``rotation`` (3, 3)."""
+    """The robot's position (3,) and rotation (3, 3) in the world, from the camera's ``position`` (3,) and ``rotation`` (3, 3). The
+    inverse of :func:`mounted`."""
     turn = rotation @ model.rotation.T
     return position - turn @ model.position, turn
 
 
 def camera_pose(model: CameraModel, pose: Array, tilt: Array | None = None) -> tuple[Array, Array]:
-    """Position (3,) and rotation (3, 3) in the world of the camera of a robot at ``pose`` (3,) with the ``tilt`` (2,) [rad], a
-    rotation about its own x and y axes, by default none."""
+    """The camera's position (3,) and rotation (3, 3) in the world, from the robot's planar ``pose`` (3,).
+
+    ``tilt`` (2,) [rad]: roll and pitch of the robot, a rotation vector along its own x and y axes. None for a level robot.
+    """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
     if tilt is not None:
@@ -163,27 +174,29 @@ def camera_pose(model: CameraModel, pose: Array, tilt: Array | None = None) -> t
 
 
 def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array]:
-    """Pixels (K, 2) of world ``points`` (K, 3) from ``pose`` (3,), and their depths (K,) [m], negative behind the camera."""
+    """Predict the pixels (K, 2) of world ``points`` (K, 3) from the robot's ``pose`` (3,). Also returns the depths (K,) [m], which
+    are negative behind the camera."""
     local = in_camera(model, pose, points)
     return project(model, local), local[:, 2]
 
 
 def undistorted(model: CameraModel, pixels: Array) -> Array:
-    """Directions (K, 2), as (x, y) at depth 1 in the camera frame, of ``pixels`` (K, 2): the inverse of :func:`project`, by
-    Newton's method."""
+    """The directions (K, 2) of ``pixels`` (K, 2), as (x, y) at depth 1 in the camera frame. The inverse of :func:`project`,
+    computed by Newton's method."""
     distorted = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
     return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(distorted))[0])
 
 
 def rays(model: CameraModel, pixels: Array) -> Array:
-    """The points (K, 3) at depth 1 in the camera frame of ``pixels`` (K, 2)."""
+    """The viewing rays of ``pixels`` (K, 2), as points (K, 3) at depth 1 in the camera frame."""
     return np.column_stack((undistorted(model, pixels), np.ones(len(pixels))))
 
 
 def folded(model: CameraModel) -> Array | None:
-    """A pixel (2,) at which the lens is not invertible, on a grid over the image; None if it is invertible everywhere.
+    """Find a pixel (2,) at which the lens model is not invertible, on a grid over the image. Returns None if there is none.
 
-    The lens is invertible where the determinant of its Jacobian is positive within the valid radius of the polynomial.
+    A lens is invertible at a pixel if a direction within the valid radius of the polynomial projects to the pixel, and the
+    determinant of the lens's Jacobian is positive there.
     """
     if not any(model.distortion) and not model.fisheye:
         return None
@@ -193,23 +206,29 @@ def folded(model: CameraModel) -> Array | None:
     distorted = (pixels - (model.cx, model.cy)) / (model.fx, model.fy)
     directions, errors = reprojection_kernels.undistorted(lens, distorted)
     bad = ~(errors < NONE)
-    if not model.fisheye:  # images of a fisheye lens may have corners beyond a right angle
+    if not model.fisheye:  # a fisheye image may have corners beyond the valid radius, more than 90 degrees off the axis
         bad |= lens[8] * np.sum(directions**2, axis=1) >= 1.0
     return np.asarray(pixels[np.argmax(bad)]) if bad.any() else None
 
 
 def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array, Array, Array]:
-    """Pixels (K, 2) of ``points`` (K, 3) from the planar ``pose`` (3,), and their Jacobians: by the pose's body-frame perturbation
-    (K, 2, 3), by the points (K, 2, 3), and by corrections of :data:`PARAMETERS` (K, 2, 8); that by the time offset is zero, as it
-    needs the robot's velocity."""
+    """Predict the pixels of world ``points`` (K, 3) from the robot's planar ``pose`` (3,), with derivatives.
+
+    Returns the pixels (K, 2) and their Jacobians by the pose's body-frame perturbation (K, 2, 3), by the points (K, 2, 3), and by
+    corrections of :data:`PARAMETERS` (K, 2, 8). The derivative by the time offset is zero here, because it needs the robot's
+    velocity.
+    """
     camera = lens_of(model), model.position, model.rotation
     pixels, jacobian = reprojection_kernels.linearize(camera, pose, np.ascontiguousarray(points, dtype=float))
     return pixels, jacobian[..., :TILT], jacobian[..., POINT:CONSTANTS], jacobian[..., CONSTANTS:]
 
 
 def by_tilt(model: CameraModel, by_parameters: Array) -> Array:
-    """Jacobian (K, 2, 2) by the robot's roll and pitch about its axes on the floor, in standard deviations, from that by
-    :data:`PARAMETERS` (K, 2, 8): the camera turns, and is moved."""
+    """The Jacobian (K, 2, 2) of pixels by the robot's roll and pitch, in units of their standard deviation ``model.tilt``.
+
+    ``by_parameters`` (K, 2, 8): the Jacobian by :data:`PARAMETERS`. A robot that tilts about its axes on the floor rotates the
+    camera and also moves it.
+    """
     x, y, z = model.position
     arm = np.array(((0.0, z), (-z, 0.0), (y, -x)))
     return np.asarray(model.tilt * (by_parameters[..., 3:5] + by_parameters[..., :3] @ arm))
@@ -218,9 +237,11 @@ def by_tilt(model: CameraModel, by_parameters: Array) -> Array:
 def linearize_in_space(
     model: CameraModel, position: Array, rotation: Array, points: Array
 ) -> tuple[Array, Array, Array]:
-    """Pixels (K, 2) of ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world; their Jacobians by
-    the camera's perturbation (K, 2, 6), rotation before translation, both in the camera frame as in ``gtsam.Pose3``, and by the
-    points (K, 2, 3)."""
+    """Predict the pixels of world ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world.
+
+    Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the points (K, 2, 3). The
+    perturbation is in the camera frame with rotation before translation, as in ``gtsam.Pose3``.
+    """
     linear: tuple[Array, Array, Array] = reprojection_kernels.linearize_in_space(
         lens_of(model), *(np.ascontiguousarray(part, dtype=float) for part in (position, rotation, points))
     )
@@ -235,10 +256,12 @@ def log_likelihood(
     tilts: Array,
     covariances: Array | None = None,
 ) -> Array:
-    """The robust, tempered log-likelihood (N,), up to a constant, of seeing ``points`` (K, 3) at ``pixels`` (K, 2) from ``poses``
-    (N, 3), each with the tilt that fits best; ``tilts`` (K, 2, 2): see :func:`by_tilt`.
+    """The robust, tempered log-likelihood (N,), up to a constant, of one image at N poses. Each pose has the roll and pitch that
+    fit best.
 
-    ``covariances`` (K, 2, 2) [px^2]: of each pixel, including the map's error; by default the pixel noise only.
+    ``poses`` (N, 3): robot poses. ``points`` (K, 3): world points. ``pixels`` (K, 2): their measured pixels.
+    ``tilts`` (K, 2, 2): the Jacobian of the pixels by roll and pitch, from :func:`by_tilt`.
+    ``covariances`` (K, 2, 2) [px^2]: covariance of each pixel, including that of an inexact map. None means pixel noise only.
     """
     if covariances is None:
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
@@ -251,8 +274,11 @@ def log_likelihood(
 
 
 def lens_of(model: CameraModel) -> Lens:
-    """The camera's constants for the kernels. The distortion is valid up to the radius where its radial part stops growing, at most
-    :data:`WIDEST` or :data:`WIDEST_FISHEYE`."""
+    """The camera's intrinsic constants as a tuple for compiled code.
+
+    One element limits the radius up to which the distortion is valid. This is the radius where the radial part stops growing, and
+    at most that of :data:`WIDEST` or :data:`WIDEST_FISHEYE`.
+    """
     focal = model.fx, model.fy, model.cx, model.cy
     if not any(model.distortion) and not model.fisheye:
         return (*map(float, focal), *(0.0,) * 5)
@@ -271,20 +297,22 @@ def lens_of(model: CameraModel) -> Lens:
     return (*lens[:8], 1.0 / falls[0] if falls else lens[8], *lens[9:])
 
 
-# how level a floor is: the standard deviation of the robot's tilt is one of these. It is the same in most images; in a few, such as
-# those on a sill, it may be any of them
-SCALES = 0.0005 * 2.0 ** (0.5 * np.arange(15))  # rad: of half a millimetre in a metre, up to 0.064
-VAGUE = math.log(3.0)  # standard deviation of the logarithm of the first guess
-MEMORY = 60.0  # images that the scale is learnt from
-SILLS = 0.05  # share of images with another scale
+# The standard deviation of the robot's tilt is one of these values. It is the same in most images, and depends on how level the
+# floor is. In a few images, such as those on a door sill, it may be any of these values.
+SCALES = 0.0005 * 2.0 ** (0.5 * np.arange(15))  # rad: from half a millimetre per metre up to 0.064
+VAGUE = math.log(3.0)  # standard deviation of the logarithm of the initial guess
+MEMORY = 60.0  # number of images after which old images are forgotten
+SILLS = 0.05  # fraction of images with a different standard deviation of the tilt
 
 
 @dataclass(frozen=True)
 class TiltScale:
-    """A Bayesian filter of the tilt's scale, which measures how level a floor is. All points of an image share one tilt.
+    """A Bayesian filter that estimates the standard deviation of the robot's roll and pitch from images.
 
-    ``sigma``: the standard deviation [rad] of roll and pitch. For each of the :data:`SCALES`, ``guess``: log prior;
-    ``log_evidence``: log-likelihood of the images."""
+    ``sigma``: the estimated standard deviation [rad].
+    ``guess`` (15,): the log prior of each value in :data:`SCALES`.
+    ``log_evidence`` (15,): the log-likelihood of the images for each value.
+    """
 
     sigma: float
     guess: Array
@@ -292,12 +320,17 @@ class TiltScale:
 
     @staticmethod
     def guessed(sigma: float) -> TiltScale:
-        """A guess, which is rough."""
+        """A filter without images, with a rough initial guess ``sigma`` [rad] of the standard deviation."""
         return TiltScale(sigma, -0.5 * (np.log(SCALES / sigma) / VAGUE) ** 2, np.zeros(len(SCALES)))
 
     def learnt(self, tilt: Array, covariance: Array, prior: float) -> tuple[TiltScale, float]:
-        """The filter updated by the ``tilt`` (2,) of an image with ``covariance`` (2, 2), estimated with the prior sigma ``prior``;
-        and the expected standard deviation in this image."""
+        """Update the filter by the tilt estimated in one image.
+
+        ``tilt`` (2,) [rad], ``covariance`` (2, 2): the estimate of roll and pitch, and its covariance.
+        ``prior`` [rad]: the standard deviation of the zero-mean prior of roll and pitch that the estimate was computed with.
+
+        Returns the updated filter, and the expected standard deviation [rad] of the tilt in this image.
+        """
         log_evidence = self.log_evidence.copy()
         sigma, image_sigma = _learnt(tilt, covariance, prior, self.guess, log_evidence)
         return TiltScale(sigma, self.guess, log_evidence), image_sigma
@@ -305,13 +338,14 @@ class TiltScale:
 
 @compiled(error_model="numpy")
 def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_evidence: Array) -> tuple[float, float]:
-    """The expected standard deviations later and in this image: :meth:`TiltScale.learnt`. Updates ``log_evidence``."""
+    """Compute :meth:`TiltScale.learnt`. Updates ``log_evidence`` in place. Returns the expected standard deviations of later images
+    and of this image."""
     determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
     a, b, d = covariance[1, 1] / determinant, -covariance[0, 1] / determinant, covariance[0, 0] / determinant
     x, y = a * tilt[0] + b * tilt[1], b * tilt[0] + d * tilt[1]
     image = np.empty(len(SCALES))
     for i, scale in enumerate(SCALES):
-        # likelihood of the image under this scale, with its prior divided out
+        # log-likelihood of the image for this standard deviation, with the prior of the estimate divided out
         more = 1.0 / scale**2 - 1.0 / prior**2
         determinant = (a + more) * (d + more) - b * b
         fit = ((d + more) * x * x - 2.0 * b * x * y + (a + more) * y * y) / determinant
@@ -325,6 +359,7 @@ def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_
 
 @compiled(error_model="numpy")
 def _normalised(log: Array) -> Array:
+    """Weights with the sum 1 from log weights."""
     weights: Array = np.exp(log - log.max())
     weights /= weights.sum()
     return weights
@@ -332,7 +367,7 @@ def _normalised(log: Array) -> Array:
 
 @compiled(error_model="numpy")
 def _scale(weights: Array) -> float:
-    """The mean of its logarithm, as a few large scales would dominate any other."""
+    """The geometric mean of :data:`SCALES` with these ``weights``. An arithmetic mean would depend mostly on the largest values."""
     total = 0.0
     for i, scale in enumerate(SCALES):
         total += weights[i] * math.log(scale)

@@ -1,4 +1,4 @@
-"""A point of unknown position seen in an image: a factor on a planar pose, the tilt of the robot there, and the point."""
+"""The factors of points with unknown positions in images: the factor of one pixel, and a weak prior of a point's position."""
 
 from __future__ import annotations
 
@@ -19,11 +19,15 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class PointFactor:
-    """A point observed at a ``pixel`` (2,). ``lens``: of the ``model``, for compiled code.
+    """The pixel of one point as a factor on the robot's pose, the robot's tilt and the point's position.
 
-    The values of the factor are the robot's pose (3,); corrections (P,) of the constants with indices ``estimated`` in
-    :data:`~factors.camera.model.PARAMETERS`, if any; the robot's roll and pitch (2,) [rad]; and the point (3,). ``twist`` (3,): the
-    robot's velocity, needed if the time offset is among them.
+    ``lens``: the constants of ``model`` for compiled code, from :func:`~factors.camera.model.lens_of`.
+    ``pixel`` (2,): the measured pixel of the point.
+    ``estimated``: indices in :data:`~factors.camera.model.PARAMETERS` of the P camera constants that are estimated.
+    ``twist`` (3,): the robot's body-frame velocity. Needed if the time offset is estimated.
+
+    The methods take a list of values in this order: the robot's pose (3,), the corrections (P,) of the estimated constants if P >
+    0, the robot's roll and pitch (2,) [rad], and the point (3,) in the world.
     """
 
     model: CameraModel
@@ -34,18 +38,19 @@ class PointFactor:
 
     @property
     def alike(self) -> Hashable:
-        """The camera."""
+        """A key that is equal for factors of one camera, which are linearised together."""
         return id(self.model)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened, robustly weighted residual (2,) and its Jacobian (2, d) by each value. A point behind the camera has a constant
-        residual, as no gradient leads to its true position."""
+        """The whitened residual (2,) with robust weights, and its Jacobian (2, d) by each value. The residual of a point behind the
+        camera is constant, because no gradient leads to the true position."""
         residuals, blocks = self.linearize_all([self], [values])
         return residuals[0], [block[0] for block in blocks]
 
     @staticmethod
     def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
-        """:meth:`linearize` of N factors with the same camera and constants: residuals (N, 2) and Jacobians (N, 2, d)."""
+        """Linearise N factors of one camera, each at its own values. The constants must be equal in all. Returns residuals (N, 2)
+        and the Jacobian (N, 2, d) by each value."""
         estimated, constants = factors[0].estimated, values[0][1]
         residual, jacobian, _ = _linearize_all(factors, values)
         if TIME_OFFSET in estimated:
@@ -60,15 +65,17 @@ class PointFactor:
         return residual, blocks
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss."""
+        """The robust loss of the pixel."""
         return float(huber_loss(_linearize_all([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:
-        """Whether the point cannot be what the robot saw: it is behind the camera, or :data:`BEHIND` standard deviations away."""
+        """True if the pixel is certainly a false match: the point is behind the camera, or its predicted pixel is at least
+        :data:`BEHIND` standard deviations from the measured one."""
         return bool(_linearize_all([self], [values])[2][0] >= BEHIND**2)
 
 
 def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
+    """The weighted residuals (N, 2), their Jacobian (N, 2, WIDTH), and the squared norms (N,) of the unweighted residuals."""
     first = factors[0]
     model, lens, (_, *constants, _, _) = first.model, first.lens, values[0]
     if constants:
@@ -88,7 +95,7 @@ def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Arr
 
 
 def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
-    """The velocities (N, 3) of the robot, and how far (N, 3) it moves within the time offset."""
+    """The robot's velocities (N, 3) at each factor, and its motions (N, 3) during the estimated time offset."""
     twists = np.array([f.twist for f in factors], dtype=float)
     seconds = float(values[0][1][factors[0].estimated.index(TIME_OFFSET)])
     return twists, se2.exp(seconds * twists)
@@ -96,11 +103,12 @@ def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) ->
 
 @dataclass(frozen=True, slots=True)
 class PointPrior:
-    """A weak prior of a point: where it is from the robot, ``mean`` (3,) [m] with the standard deviation ``sigma`` [m] of each
-    coordinate.
+    """A weak prior of a point's position in the robot frame, as a factor on the robot's pose and the point.
 
-    The values of the factor are the robot's pose (3,) and the point (3,). Priors in the world frame would
-    constrain the robot: a thousand priors of 30 m fix its position to a metre.
+    ``mean`` (3,) [m]: the expected position in the robot frame. ``sigma`` [m]: the standard deviation of each coordinate. The
+    methods take a list of two values: the robot's pose (3,) and the point (3,) in the world.
+
+    A prior in the world frame would constrain the robot: a thousand such priors with 30 m would fix its position to a metre.
     """
 
     mean: Array
@@ -108,11 +116,11 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """That of a ``point`` (3,) estimated from a ``pose`` (3,)."""
+        """The prior of a world ``point`` (3,) that was estimated from the robot's ``pose`` (3,)."""
         return cls(_from_robot(pose, point), sigma)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (3,) and its Jacobians."""
+        """The whitened residual (3,), and its Jacobians (3, 3) by the pose and by the point."""
         pose, point = values
         relative = _from_robot(pose, point)
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -127,4 +135,5 @@ class PointPrior:
 
 
 def _from_robot(pose: Array, point: Array) -> Array:
+    """A world point (3,) in the robot frame."""
     return np.append(se2.transform_to(pose, point[:2]), point[2])

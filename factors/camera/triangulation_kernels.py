@@ -1,4 +1,4 @@
-"""Compiled triangulation of points that are seen from several places."""
+"""Compiled triangulation of points from several camera poses."""
 
 import math
 
@@ -9,9 +9,9 @@ from factors.compiled import compiled
 from factors.gaussian import inverse, product, product_by_transpose, solved
 from factors.se2 import Array
 
-MIN_PARALLAX = 0.03  # rad, between the outermost rays
-NEAREST = 0.3  # m of depth
-ITERATIONS, SETTLED = 4, 1e-3  # m: step below which the solution has converged
+MIN_PARALLAX = 0.03  # rad; smallest angle between the outermost rays of a point
+NEAREST = 0.3  # m; smallest depth of a triangulated point
+ITERATIONS, SETTLED = 4, 1e-3  # maximum number of steps, and the step [m] below which the solution has converged
 
 
 @compiled(error_model="numpy")
@@ -27,15 +27,20 @@ def triangulated(
     nearest: float,
     robust: float,
 ) -> tuple[bool, Array, Array, Array]:
-    """Whether cameras at ``centres`` (M, 3) with rotations ``turns`` (M, 3, 3) determine a point; the point (3,), its covariance
-    (3, 3) and squared whitened residuals (M,), infinite where the rays do not intersect in front of the cameras.
+    """Triangulate one point from M camera poses.
 
-    ``rays`` (M, 3): its directions in their frames; ``pixels`` (M, 2) with standard deviations ``sigmas`` (M,) of each coordinate.
-    ``largest_sigma``: the largest allowed standard deviation of the point, relative to its least depth. ``parallax`` [rad]: the
-    least angle between the outermost rays; ``nearest`` [m]: the least depth; ``robust``: scale of Huber's loss, infinite for least
-    squares.
+    ``centres`` (M, 3), ``turns`` (M, 3, 3): positions and rotations of the cameras in the world.
+    ``rays`` (M, 3): unit vectors to the point in each camera frame.
+    ``pixels`` (M, 2), ``sigmas`` (M,): the measured pixels, and the standard deviation of each coordinate.
+    ``largest_sigma``: the largest allowed standard deviation of the point, relative to its smallest depth.
+    ``parallax`` [rad]: the smallest allowed angle between the outermost rays. ``nearest`` [m]: the smallest allowed depth.
+    ``robust``: the scale of Huber's loss in standard deviations, infinite for least squares.
 
-    A linear start, the point nearest to all rays, then Gauss-Newton steps on the reprojection error (Hartley and Zisserman,
+    Returns four values: False if the parallax is too small or the point too uncertain, otherwise True; the point (3,) in the world;
+    its covariance (3, 3); and the squared norms (M,) of its whitened residuals. These are infinite if the point is not at least
+    ``nearest`` in front of all cameras.
+
+    The start is the point nearest to all rays. Gauss-Newton steps on the reprojection error follow (Hartley and Zisserman,
     "Multiple View Geometry", 2004, chapter 12).
     """
     directions = np.empty_like(rays)
@@ -53,7 +58,7 @@ def triangulated(
             squared[:] = np.inf
             return True, point, covariance, squared
         covariance = inverse(information)
-        # the initial point may be less accurate
+        # the limit is twice as large for the initial point, whose covariance is less accurate
         if not _is_below(covariance, ((2.0 if iteration == 0 else 1.0) * largest_sigma * depth) ** 2):
             return False, point, covariance, squared
         if iteration < ITERATIONS:
@@ -66,10 +71,12 @@ def triangulated(
 
 @compiled(error_model="numpy")
 def inverse_depths(first: Array, second: Array, position: Array, motion: Array) -> Array:
-    """The inverse depths (K,) [1/m], negative behind the camera, at which the rays of two images are nearest to each other.
+    """The inverse depths (K,) [1/m] of points in the first of two images, where the rays of both images are nearest to each other.
 
-    ``first``, ``second`` (K, 3): rays in the robot frame at each image, of depth 1 along the optical axis. ``position`` (3,): of
-    the camera on the robot. ``motion`` (3,): of the robot, which moves on a plane.
+    ``first``, ``second`` (K, 3): viewing rays of each image in the robot frame, scaled to depth 1 along the optical axis.
+    ``position`` (3,): position of the camera in the robot frame. ``motion`` (3,): the robot's planar motion between the images.
+
+    An inverse depth is negative for a point behind the camera.
     """
     inverse_depth = np.empty(len(first))
     c, s = math.cos(motion[2]), math.sin(motion[2])
@@ -88,7 +95,8 @@ def inverse_depths(first: Array, second: Array, position: Array, motion: Array) 
 
 @compiled(error_model="numpy")
 def _nearest(centres: Array, directions: Array) -> Array:
-    """The point nearest to rays from ``centres`` (M, 3) in the directions ``directions`` (M, 3)."""
+    """The point (3,) with the least squared distances from M rays. ``centres`` (M, 3): starts of the rays. ``directions`` (M, 3):
+    their unit vectors."""
     left, right = np.zeros((3, 3)), np.zeros((3, 1))
     for m in range(len(directions)):
         for i in range(3):
@@ -103,7 +111,8 @@ def _nearest(centres: Array, directions: Array) -> Array:
 def _inform(
     k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, robust: float, squared: Array
 ) -> tuple[Array, Array, float]:
-    """The information (3, 3) on a point and its gradient (3, 1), and the least depth; ``squared`` residuals (M,) in place."""
+    """The Gauss-Newton system of a ``point`` (3,). Returns its information matrix (3, 3), the negative gradient (3, 1) of the loss,
+    and the smallest depth of the point. Writes the squared norms of the whitened residuals into ``squared`` (M,)."""
     information, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
     for m in range(len(centres)):
         local = product((point - centres[m]).reshape(1, 3), turns[m])
@@ -127,7 +136,8 @@ def _inform(
 
 @compiled(error_model="numpy")
 def _is_below(covariance: Array, most: float) -> bool:
-    """Whether the largest eigenvalue of a covariance (3, 3) is less than ``most``: the difference is positive definite."""
+    """True if the largest eigenvalue of a covariance (3, 3) is less than ``most``. This is so if ``most`` times the identity minus
+    the covariance is positive definite."""
     a, b, c = most - covariance[0, 0], most - covariance[1, 1], most - covariance[2, 2]
     d, e, f = covariance[0, 1], covariance[0, 2], covariance[1, 2]
     two = a * b - d * d

@@ -1,4 +1,5 @@
-"""Known points in an image, compiled: a factor of :mod:`factors.camera.factor` on the pose and the tilt of the robot."""
+"""Compiled functions for known points in an image: the linearisation of :class:`~factors.camera.factor.ReprojectionFactor`, and the
+estimation of the robot's roll and pitch."""
 
 import math
 from typing import NamedTuple
@@ -13,14 +14,16 @@ from factors.se2 import Array, between_one, compose_one
 from factors.update import corrected
 
 Row = tuple[float, float, float]
-REWEIGHTED, STILL = 50, 1e-5  # most rounds to find a tilt, and standard deviations that the last may change it
+# The maximum number of iterations to fit a tilt, and the change of the tilt, in standard deviations, that ends the iterations.
+REWEIGHTED, STILL = 50, 1e-5
 
 
 class PackedImage(NamedTuple):
     """A :class:`~factors.camera.factor.ReprojectionFactor` on the pose only, for compiled code.
 
-    ``point_covariances`` (K, 3, 3), or (0, 3, 3) for an exact map; ``offset`` (3,) and ``offset_covariance`` (3, 3): zero for none.
-    The other fields are those of the factor and its model.
+    ``point_covariances``: (K, 3, 3), or (0, 3, 3) for an exact map.
+    ``offset`` (3,), ``offset_covariance`` (3, 3): zeros if the factor has none.
+    The remaining fields are those of the factor and its camera model.
     """
 
     lens: Lens
@@ -39,14 +42,16 @@ class PackedImage(NamedTuple):
 
 @compiled(error_model="numpy")
 def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array, Array]:
-    """See :meth:`~factors.camera.factor.ReprojectionFactor.whitened`: residual (K, 2), and the first ``width`` columns of its
-    Jacobian (K, 2, WIDTH) by the pose (3), by the tilt (2) in standard deviations, by the point (3) and by the camera's constants
-    (8), without a time offset."""
+    """The whitened residual (K, 2) of a level robot at ``pose`` (3,), predicted minus measured, and its Jacobian (K, 2, width).
+
+    The columns of a full Jacobian are the pose (3), the tilt (2) in standard deviations, the point (3), and the camera's constants
+    (8). ``width``: the number of columns to compute. The derivative by the time offset is zero.
+    """
     count, row = len(image.points), np.empty((2, WIDTH))
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, width))
     camera, scale = (image.lens, image.position, image.rotation), 1.0 / image.sigma
     at, level, upright = compose_one(pose, image.offset), np.zeros(2), np.eye(3)
-    # of the variable's pose, seen from the pose of the image
+    # the pose variable in the frame of the pose at the image's time
     back = between_one(image.offset, np.zeros(3))
     co, so = math.cos(image.offset[2]), math.sin(image.offset[2])
     exact, common = len(image.point_covariances) == 0, np.trace(image.offset_covariance) > 0.0
@@ -62,7 +67,7 @@ def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array
                 uu, uv, vv = _widened(image.point_covariances[k], row, POINT, 1.0, uu, uv, vv)
             if common:  # this error is common to all points, so it must not average out
                 uu, uv, vv = _widened(image.offset_covariance, row, 0, float(count), uu, uv, vv)
-            # by the inverse of the lower root (a, 0; b, d)
+            # multiply by the inverse of the lower Cholesky root [[a, 0], [b, d]] of the covariance
             a = math.sqrt(uu)
             b = uv / a
             d = math.sqrt(vv - b * b)
@@ -85,7 +90,11 @@ def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array
 def _widened(
     covariance: Array, row: Array, first: int, count: float, uu: float, uv: float, vv: float
 ) -> tuple[float, float, float]:
-    """The covariance (uu, uv, vv) of a pixel, plus ``count`` times that of three variables, whose columns begin at ``first``."""
+    """Add the effect of three uncertain variables to the covariance (uu, uv, vv) of a pixel.
+
+    ``covariance`` (3, 3): covariance of the variables. ``row`` (2, WIDTH): the pixel's Jacobian. ``first``: its first column for
+    the variables. ``count``: a factor of the added covariance. Returns the new uu, uv and vv.
+    """
     p = row[0, first], row[0, first + 1], row[0, first + 2]
     q = row[1, first], row[1, first + 1], row[1, first + 2]
     uu, uv = uu + count * _product(covariance, p, p), uv + count * _product(covariance, p, q)
@@ -94,15 +103,19 @@ def _widened(
 
 @compiled(error_model="numpy")
 def linearized(image: PackedImage, pose: Array) -> tuple[Array, Array]:
-    """See :meth:`~factors.camera.factor.ReprojectionFactor.linearize`: residual (2K,) and Jacobian (2K, 3)."""
+    """The whitened residual (2K,) and its Jacobian (2K, 3) by the pose, with robust weights and tempering and with the tilt
+    marginalised, as in :meth:`~factors.camera.factor.ReprojectionFactor.linearize`."""
     residual, jacobian = whitened(image, pose)
     return marginal(residual, jacobian, image.robust, image.tempering)
 
 
 @compiled(error_model="numpy")
 def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float, Array]:
-    """Roll and pitch, in standard deviations, that fit best to whitened residuals (K, 2) with Jacobians (K, 2, 2), and the robust
-    weights (K,) there: by iteratively reweighted least squares, of a convex cost."""
+    """Fit roll and pitch to whitened residuals (K, 2), by iteratively reweighted least squares. The cost is convex.
+
+    ``by_tilt`` (K, 2, 2): the Jacobian by roll and pitch in standard deviations. ``robust``: the scale of Huber's loss. Returns
+    roll and pitch in standard deviations, and the robust weights (K,) at the solution.
+    """
     n, roll, pitch = len(residual), 0.0, 0.0
     weights = np.ones(n)
     for _ in range(REWEIGHTED):
@@ -126,15 +139,19 @@ def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float
 
 @compiled(error_model="numpy")
 def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) -> tuple[Array, Array]:
-    """Whitened, robustly weighted residual (2K,) and Jacobian (2K, D) of points (K, 2) whose Jacobian (K, 2, D + 2) ends with that
-    by the tilt, an error that all have in common: with weights W the covariance of the residuals is 1 / W + T T', before it is
-    tempered.
+    """Marginalise the tilt, an error that all K points have in common.
 
-    The root of its inverse is that of W times 1 - A C A', with A = W^(1/2) T, H^2 = 1 + A'A, and 1 / C = H (H + 1).
+    ``residual`` (K, 2): whitened. ``jacobian`` (K, 2, D + 2): by D variables and, in the last two columns T, by the tilt in
+    standard deviations. ``robust``: the scale of Huber's loss. ``tempering``: the exponent of the likelihood. Returns the residual
+    (2K,) and its Jacobian (2K, D), whitened for the noise with the tilt.
+
+    With the diagonal matrix W of robust weights, the covariance of the residuals is W^-1 + T T'. A square root of its inverse is
+    (1 - A C A') W^(1/2), with A = W^(1/2) T, H^2 = 1 + A'A, and C^-1 = H (H + 1). The result is multiplied by the square root of
+    the tempering.
     """
     n, size = len(residual), jacobian.shape[2] - 2
     _, _, weights = tilted(residual, jacobian[:, :, size:], robust)
-    out = np.empty((2 * n, size + 3))  # by the values, by the tilt, and the residual
+    out = np.empty((2 * n, size + 3))  # columns: D variables, tilt (2), residual
     for k in range(n):
         root = math.sqrt(weights[k])
         for r in range(2):
@@ -165,8 +182,8 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
 
 @compiled(error_model="numpy")
 def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, Array]:
-    """Roll and pitch (2,) [rad] of a robot at a ``pose`` (3,) with this ``covariance`` (3, 3), as least squares find them in an
-    image, and their covariance (2, 2)."""
+    """Estimate the robot's roll and pitch from one image, by least squares. ``pose`` (3,), ``covariance`` (3, 3): the prior of the
+    robot's pose. Returns roll and pitch (2,) [rad] and their covariance (2, 2)."""
     residual, jacobian = whitened(image, pose)
     prior = np.eye(POINT)
     put(inverse(covariance), prior)
@@ -177,9 +194,15 @@ def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, 
 
 @compiled(error_model="numpy")
 def placed(position: Array, rotation: Array, tilt: float, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """Position (3,) and rotation (3, 3) in the world of a camera mounted at ``position`` with ``rotation`` on a robot at ``pose``
-    (3,), and the covariance (6, 6) of its perturbation in its own frame, rotation first, from ``covariance`` (3, 3) of the pose
-    and the standard deviation ``tilt`` [rad] of roll and pitch."""
+    """The pose of a camera in the world, with its covariance.
+
+    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the robot frame.
+    ``tilt`` [rad]: the standard deviation of the robot's roll and pitch.
+    ``pose`` (3,), ``covariance`` (3, 3): the robot's planar pose, and its body-frame covariance.
+
+    Returns the camera's position (3,) and rotation (3, 3) in the world, and the covariance (6, 6) of its perturbation in the camera
+    frame, with rotation before translation.
+    """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, POINT)), np.empty((6, 6))
     x, y, z = position[0], position[1], position[2]
@@ -200,7 +223,9 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
 
 @compiled(error_model="numpy")
 def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
-    """The covariance (K, 2, 2) of pixels with noise ``sigma`` [px], of points with ``covariances`` (K, 3, 3)."""
+    """The covariances (K, 2, 2) of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian of the pixels by the
+    points.
+    ``covariances`` (K, 3, 3): of the points. ``sigma`` [px]: the pixel noise."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):
         of = covariances[k]
@@ -213,7 +238,7 @@ def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
 
 @compiled(inline="always")
 def _product(matrix: Array, p: Row, q: Row) -> float:
-    """p' M q."""
+    """The bilinear form ``p' matrix q`` of a matrix (3, 3)."""
     x = matrix[0, 0] * q[0] + matrix[0, 1] * q[1] + matrix[0, 2] * q[2]
     y = matrix[1, 0] * q[0] + matrix[1, 1] * q[1] + matrix[1, 2] * q[2]
     z = matrix[2, 0] * q[0] + matrix[2, 1] * q[1] + matrix[2, 2] * q[2]

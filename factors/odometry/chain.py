@@ -1,10 +1,12 @@
-"""Integration of the odometry of a run as a chain of knots in its own frame.
+"""Integration of a run's odometry in a frame of its own. The result is a chain of knots, one for each odometry measurement. A knot
+is the integrated state at the time of the measurement.
 
 Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9). Commanded velocities
 act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
 
-A gyro replaces the rotation of the wheels, for velocities and increments; without recent gyro rows that of the wheels is used.
-While the wheels report rest the robot is at rest, whatever noise and bias of the gyro.
+The rotation measured by a gyro replaces that of the wheels. If there is no recent gyro measurement, the rotation of the wheels is
+used. The robot is at rest if the wheels report rest and the gyro reports a small rate, so that gyro noise and bias do not turn a
+resting robot.
 """
 
 import math
@@ -45,15 +47,21 @@ from factors.odometry.kernels import State, carried, predicted, recalibrated, re
 from factors.odometry.model import OdometryModel, composed
 from factors.se2 import Array, Integers, body_to_world_one, compose_scalars
 
-TWIST_TIME = 0.1  # s over which a velocity is averaged
+TWIST_TIME = 0.1  # s; a velocity is the mean over this time
 
 
 class OdometryChain:
-    """The integrated odometry of a run, as a chain of knots in its own frame.
+    """The integrated odometry of a run. Add rows (odometry measurements), then ask for states and motions at any time.
 
-    Rows arrive in order of time, or late (then the knots after them are computed again). After the last row its velocity is held.
-    Rows more than ``horizon`` seconds before the newest one are forgotten; adding an older row returns False. ``estimated``: the
-    numbers, in :data:`~factors.odometry.model.PARAMETERS`, of P constants for which motions are corrected.
+    Rows may arrive late. The knots after a late row are then computed again. After the last row, the robot is assumed to continue
+    with its velocity.
+
+    ``model``: the odometry's constants and noise.
+    ``use_gyro``: True if gyro rows replace the rotation of the wheels.
+    ``horizon`` [s]: rows that are this much older than the newest row may be deleted. A row before the first remaining knot is
+    rejected.
+    ``estimated``: indices in :data:`~factors.odometry.model.PARAMETERS` of the P constants that the estimator estimates. Methods
+    with ``constants`` (P,) correct motions for changes of these.
     """
 
     def __init__(
@@ -67,7 +75,7 @@ class OdometryChain:
         self._rows = np.zeros((256, ROW))
         self._knots = np.zeros((256, KNOT))
         self._count = 0
-        self.begin = -math.inf  # s, from when on it is known: rows of before were forgotten
+        self.begin = -math.inf  # s; the time of the first knot after older rows were deleted
         m = model
         scales = (
             m.scale_distance,
@@ -82,12 +90,16 @@ class OdometryChain:
         self._noise = np.array(m.noise())
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
-        """A row with forward velocity [m/s] and turn rate [rad/s], held from ``t`` until the next row."""
+        """Add a row with forward velocity [m/s] and turn rate [rad/s], valid from ``t`` until the next row. Returns False if the
+        row is too old and is ignored."""
         return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
-        """Add the motion from the previous row until ``t``, in the robot frame at the previous row. If there is already a motion
-        until ``t``, this one is appended to it. False if the rows of that time are forgotten."""
+        """Add the motion (dx, dy, dtheta) from the previous row until ``t``, in the robot frame at the previous row.
+
+        If there is already a motion until ``t``, the new motion is composed with it. Returns False if the row is too old and is
+        ignored.
+        """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
             last -= 1
@@ -98,11 +110,12 @@ class OdometryChain:
         return self._insert(t, INCREMENT, *se2.log(move).tolist())
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
-        """A row of a gyro [rad/s], held from ``t`` until the next; it replaces the rotation of the wheels."""
+        """Add a gyro row with turn rate ``w`` [rad/s], valid from ``t`` until the next gyro row. It replaces the rotation of the
+        wheels. Returns False if the row is too old and is ignored."""
         return self._insert(t, GYRO, w, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
-        """Add rows (N,), in order of time; returns how many were kept."""
+        """Add N rows as :meth:`add_velocity` does, in order of time. Returns the number of rows that are not too old."""
         if not len(t):
             return 0
         self._reserve(len(t))
@@ -114,7 +127,8 @@ class OdometryChain:
         return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
-        """Add rows (N,), in order of time and after all others; rows with equal timestamps are composed."""
+        """Add N motions as :meth:`add_increment` does, in order of time and after all existing rows. Motions with equal timestamps
+        are composed."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
             return
@@ -126,51 +140,54 @@ class OdometryChain:
         self._now_has(count, forgets=count < end)
 
     def state(self, t: float) -> ChainState:
-        """The state of the chain at ``t``; before the first knot the motion is unknown and the pose constant. ValueError if the
-        rows of then are no longer kept."""
+        """The integrated state at time ``t`` [s]. Before the first row the pose is constant and the motion counts as unknown.
+        Raises ValueError if the rows of that time are deleted."""
         if t < self.begin:
-            raise ValueError(f"the motion at {t:.3f} s was asked for, but only that from {self.begin:.3f} s on is kept")
+            raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
 
     def states(self, t: Array) -> Array:
-        """The states (M, 8) at times (M,): t, x, y, heading, path, turn, unknown, still, as in :class:`ChainState`."""
+        """The integrated states (M, 8) at times (M,) [s]. The columns are the fields of :class:`ChainState`."""
         out = np.empty((len(t), STATE))
         states_at(self._knots, self._count, np.asarray(t, dtype=float), self._constants, out)
         return out
 
     def begin_slip(self, since: float) -> None:
-        """The wheels slip since then: the motion is unknown until :meth:`end_slip`.
+        """Report that the wheels slip since the time ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
 
-        A late row from before that takes the time before the newest row as known again.
+        If a row from before ``since`` arrives later, the motion between ``since`` and the newest row counts as known again, because
+        knots are recomputed.
         """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
             self._constants[SLIPPING] = 1.0
 
     def end_slip(self) -> None:
-        """The wheels slip no more."""
+        """Report that the wheels no longer slip."""
         self._constants[SLIPPING] = 0.0
 
     @property
     def is_slipping(self) -> bool:
-        """Whether the wheels slip."""
+        """True between :meth:`begin_slip` and :meth:`end_slip`."""
         return bool(self._constants[SLIPPING])
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
-        """The motion from ``start`` to ``end``. ``start`` may be an earlier result of :meth:`state`; the motion then includes
-        corrections by later rows."""
+        """The motion from ``start`` to ``end``, two results of :meth:`state`. If rows before ``start`` arrived after ``start`` was
+        computed, the motion includes their corrections."""
         return Increment(*relative(self._noise, tuple(start), tuple(end)))
 
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
-        """The state at ``t`` and the motion from ``start`` to there: :meth:`state` and :meth:`relative` in one call."""
+        """The integrated state at ``t`` [s] and the motion from ``start`` to this state: :meth:`state` and :meth:`relative` in one
+        call."""
         known = self._knots, self._count, self._constants, self._noise
         end, delta, covariance, duration, still = travelled(*known, tuple(start), t)
         return ChainState(*end), Increment(delta, covariance, duration, still)
 
     def twist(self, t: float) -> Array:
-        """The robot's velocity (3,) just before ``t``, in the robot frame."""
+        """The robot's mean velocity (3,) in the :data:`TWIST_TIME` before ``t``, in the robot frame [m/s, m/s, rad/s]. Raises
+        ValueError if the rows of that time are deleted."""
         if t - TWIST_TIME < self.begin:
-            raise ValueError(f"the motion at {t:.3f} s was asked for, but only that from {self.begin:.3f} s on is kept")
+            raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return np.array(twist_at(self._knots, self._count, self._constants, t))
 
     def predicted(
@@ -182,12 +199,19 @@ class OdometryChain:
         constants: Array,
         first: int,
     ) -> tuple[ChainState, Array, Array, Array, Array]:
-        """Predict a Gaussian from ``start`` to ``t``: the state there, the pose (3,), the first rows (3, S) of the transition (the
-        other rows are those of the identity), the covariance (3, 3) that the motion adds to the first three components, and the
-        covariance (S, S) of the error state. The columns of ``constants`` (P,) in the error state begin at ``first``."""
+        """Predict a Gaussian error state (S,) from the odometry state ``start`` to time ``t`` [s].
+
+        ``pose`` (3,), ``covariance`` (S, S): the estimate at ``start``. The first three components of the error state are the pose.
+        ``constants`` (P,): corrections of the estimated odometry constants. ``first``: the index of the first of them in the error
+        state.
+
+        Returns five values: the odometry state at ``t``; the predicted pose (3,); the first three rows (3, S) of the transition
+        matrix, whose remaining rows are those of the identity; the covariance (3, 3) of the motion; the predicted covariance (S,
+        S).
+        """
         size = len(covariance)
         at, transition, noise, out = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
-        # into arrays that are there: each that compiled code returns takes longer than its arithmetic
+        # compiled code writes into existing arrays, because returning an array takes longer than computing it
         end = predicted_at(
             self._knots,
             self._count,
@@ -210,27 +234,30 @@ class OdometryChain:
     def moved(
         self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
     ) -> tuple[Array, Array, Array]:
-        """A pose (3,) with body-frame ``covariance`` (3, 3) at ``start``, moved to ``t``, for ``constants`` (P,): the pose, and its
-        covariance in the body frame and in the world frame."""
+        """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to time ``t`` [s].
+
+        ``constants`` (P,): corrections of the estimated odometry constants. Returns the pose (3,), its body-frame covariance (3,
+        3), and its covariance (3, 3) of (x, y, heading) in the world frame.
+        """
         known = self._knots, self._count, self._constants, self._noise
-        contiguous = np.ascontiguousarray(covariance)  # each other memory order would compile the function again
+        contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order
         at, body, world = moved_to(*known, tuple(start), t, pose, contiguous, constants, self._indices)
         return at, body, world
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
-        """The relative motions between states (N, 8), see :meth:`states`, for ``constants`` (P,): poses (N, 3) and covariances
-        (N, 3, 3)."""
+        """The motions between N pairs of states (N, 8) from :meth:`states`. ``constants`` (P,): corrections of the estimated
+        odometry constants. Returns relative poses (N, 3) and covariances (N, 3, 3)."""
         deltas, covariances = relatives(self._noise, starts, ends, constants, self._indices)
         return deltas, covariances
 
     def factor(self, increment: Increment, *, scale_known: bool) -> OdometryFactor:
-        """An increment as a factor on two poses, and on the constants if there are any. ``scale_known``: whether anything else than
-        the motion determines the scale of what is estimated."""
+        """An increment as a factor on two poses and on the estimated odometry constants. ``scale_known``: True if measurements
+        other than odometry determine the scale of the map."""
         kind = OdometryFactor if scale_known else ScaleFreeOdometryFactor
         return kind(increment, self._estimated)
 
     def exact_factor(self, increment: Increment) -> OdometryFactor:
-        """An increment without constants as a factor on two poses."""
+        """An increment as a factor on two poses only, with the odometry constants of the model."""
         return OdometryFactor(increment)
 
     def _insert(self, t: float, kind: float, a: float, b: float, c: float) -> bool:
@@ -249,6 +276,7 @@ class OdometryChain:
             self._knots = np.concatenate((self._knots, np.zeros((more, KNOT))))
 
     def _now_has(self, count: int, *, forgets: bool) -> None:
+        """Set the number of rows. ``forgets``: True if rows at the front were deleted."""
         self._count = count
         if forgets:
             self.begin = float(self._knots[0, T])
@@ -256,7 +284,8 @@ class OdometryChain:
 
 @compiled
 def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
-    """t, x, y, heading, path, turn, unknown and still at ``t``, from the last knot before it."""
+    """The integrated state at time ``t``, from the last of ``count`` knots before it. The elements are the fields of
+    :class:`~factors.motion.ChainState`."""
     if count == 0:
         return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
     i = np.searchsorted(knots[:count, T], t, side="right") - 1
@@ -270,7 +299,7 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
 
 @compiled
 def twist_at(knots: Array, count: int, constants: Array, t: float) -> tuple[float, float, float]:
-    """See :meth:`OdometryChain.twist`."""
+    """The robot's mean velocity before ``t``, as :meth:`OdometryChain.twist` defines it."""
     a, b = state_at(knots, count, t - TWIST_TIME, constants), state_at(knots, count, t, constants)
     moved = se2.between_scalars(a[1], a[2], a[3], b[1], b[2], b[3])
     x, y, turned = se2.log_scalars(moved[0], moved[1], moved[2])

@@ -1,4 +1,8 @@
-"""Compiled integration of odometry: rows, and the knots of a chain that they become."""
+"""Compiled integration of odometry.
+
+A row is one odometry or gyro measurement. A knot is the integrated state at the time of a row, with the velocity after it. Each row
+has one knot, with the same index.
+"""
 
 import math
 
@@ -7,30 +11,36 @@ import numpy as np
 from factors.compiled import compiled
 from factors.se2 import Array, arc_coefficients
 
-# columns of a row: time of its effect, its kind, and its values
-ROW = 5
-VELOCITY, INCREMENT, GYRO = 0.0, 1.0, 2.0  # v, w, -; twist of the whole increment; w, -, -
-# columns of a knot: state at the time of a row, the velocity in the robot frame, the velocity that it converges to, whether the
-# wheels are at rest, and the time of the last row of a gyro
+ROW = 5  # the number of columns of a row: time, kind, and three values
+# Kinds of rows. The values are (v, w, 0) of a velocity, the twist of an increment, and (w, 0, 0) of a gyro.
+VELOCITY, INCREMENT, GYRO = 0.0, 1.0, 2.0
+# Columns of a knot: the integrated state (8), the velocity in the robot frame (3), the target velocity that it converges to (3),
+# whether the wheels are at rest, and the time of the last gyro row.
 T, X, Y, HEADING, PATH, TURN, UNKNOWN, STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS, _GYRO_T = range(16)
 KNOT, STATE = 16, 8
 
-# m/s and rad/s, relative to the biases: wheels below are at rest; a gyro below agrees that the robot does not turn
+# Limits in m/s and rad/s, after subtraction of the biases. Wheels with smaller velocities are at rest. A gyro with a smaller rate
+# is consistent with rest.
 _REST, _GYRO_REST = 1e-3, 0.02
 
-# indices in the array of the model's constants: an array, because a tuple is slower to pass to compiled code
-_COS, _SIN, LAG, HOLD, _GYRO_BIAS, _USES_GYRO, SLIPPING = range(6, 13)  # behind scales and biases
+# Indices in the array of the model's constants. The first six are scales, biases and other constants, in the order of `integrate`.
+# The constants are an array because a tuple is slower to pass to compiled code.
+_COS, _SIN, LAG, HOLD, _GYRO_BIAS, _USES_GYRO, SLIPPING = range(6, 13)
 
 
 @compiled
 def copy(row: Array, to: Array) -> None:
+    """Copy a vector (N,) into another."""
     for j in range(len(row)):
         to[j] = row[j]
 
 
 @compiled
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
-    """Drop old rows; returns the new count. Called rarely, for many rows, because the remaining ones move to the front."""
+    """Delete the rows and knots that are more than ``horizon`` seconds older than the newest one. Returns the new count.
+
+    Nothing is deleted before the oldest row is two horizons old, because each deletion moves all remaining rows to the front.
+    """
     newest = knots[count - 1, T]
     if newest - knots[0, T] <= 2.0 * horizon:
         return count
@@ -53,8 +63,11 @@ def append(
     constants: Array,
     horizon: float,
 ) -> int:
-    """Append rows of velocities and their knots to the ``count`` existing ones, and forget old ones; returns the new count, -1
-    if the first row is older than the last existing one."""
+    """Append rows of velocities and their knots to the ``count`` existing rows, and delete old rows.
+
+    ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the times.
+    Returns the new count. If the first new row is older than the last existing one, returns -1 and changes nothing.
+    """
     if count and t[0] + delay < knots[count - 1, T]:
         return -1
     for i in range(len(t)):
@@ -77,8 +90,11 @@ def insert(
     constants: Array,
     horizon: float,
 ) -> int:
-    """Insert a row at its place in time among the ``count`` existing ones, after those of its time; forget old ones if it is the
-    newest. Returns the new count."""
+    """Insert one row among the ``count`` existing rows, in order of time and after rows of equal time.
+
+    ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`, with the values ``a``, ``b``, ``c``. Old rows are deleted if the
+    new row is the newest. Returns the new count.
+    """
     i = count
     if count and t < knots[count - 1, T]:
         i = int(np.searchsorted(knots[:count, T], t, side="right"))
@@ -91,7 +107,7 @@ def insert(
 
 @compiled
 def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array) -> None:
-    """Compute the knots of the rows from ``begin`` to ``end``, each from the knot before it."""
+    """Compute the knots of the rows from index ``begin`` up to, but not including, ``end``. Each follows from the previous knot."""
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
     c, s, lag, hold = constants[_COS], constants[_SIN], constants[LAG], constants[HOLD]
@@ -139,14 +155,18 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
 
 @compiled
 def _take_gyro(knot: Array, t: float, turn: float) -> None:
+    """Set the turn rate of a knot to the rate ``turn`` of a gyro row at ``t``. The rate is zero if wheels and gyro agree on
+    rest."""
     knot[_GYRO_T] = t
     knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
 
 
 @compiled
 def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
-    """Compute the knot of an increment in row ``i``, and again those of the gyro since the previous increment: the robot moves by
-    the increment and rotates by the gyro."""
+    """Compute the knot of the increment in row ``i``, with the translation of the increment and the rotation of the gyro.
+
+    This recomputes the knots of the gyro rows since the previous increment, because the translation in that time is known only now.
+    """
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift = constants[3], constants[4]
     c, s, hold, gyro_bias = constants[_COS], constants[_SIN], constants[HOLD], constants[_GYRO_BIAS]
@@ -154,7 +174,7 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     first = i - 1
     while first >= 0 and rows[first, 1] != INCREMENT:
         first -= 1
-    known = first >= 0 and t > knots[first, T]  # otherwise the start of the motion is unknown
+    known = first >= 0 and t > knots[first, T]  # False if the start time of the increment is unknown
     first = max(first, 0)
     duration = t - knots[first, T]
     forward, sideways, turn, stands = 0.0, 0.0, 0.0, False
@@ -181,8 +201,11 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 
 @compiled
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
-    """The knot after ``duration`` seconds: the motion continues for at most ``hold`` seconds, then it is unknown. If ``slipping``
-    is 1 all motion is unknown."""
+    """Write the knot ``duration`` seconds after ``knot`` into ``out``.
+
+    The velocity converges to its target with the time constant ``lag`` [s], and continues for at most ``hold`` seconds. The motion
+    after that is unknown. If ``slipping`` is 1, all motion is unknown.
+    """
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)
     rests = knot[_STANDS] and uw == 0.0

@@ -1,4 +1,4 @@
-"""Increments of odometry as factors of a graph, one by one or stacked."""
+"""Odometry increments as factors of a graph, single or combined for speed."""
 
 import math
 from collections.abc import Hashable, Sequence
@@ -15,7 +15,11 @@ from factors.se2 import Array, Integers, between_one, inverse_right_jacobian, tw
 
 
 class Steps(NamedTuple):
-    """K increments for compiled code: :attr:`OdometryFactor.packed` of each, stacked."""
+    """K increments as arrays for compiled code.
+
+    ``deltas`` (K, 3): the increments. ``twists`` (K, 3): their logarithms. ``moving`` (K,) [s]: the times in motion.
+    ``whiteners`` (K, 3, 3): the matrices that whiten the residuals.
+    """
 
     deltas: Array
     twists: Array
@@ -24,8 +28,11 @@ class Steps(NamedTuple):
 
 
 class OdometryStack:
-    """Increments ``factors``, each between the pose ``first`` (K,) by number and the next one. All have the same constants
-    estimated, which are the parameters from ``column`` on."""
+    """Several odometry factors with the same estimated constants, linearised together.
+
+    ``factors``: K factors. ``first`` (K,): the number of the first pose of each factor; the second pose is the next one.
+    ``column``: the index of the first estimated constant among the parameters of the graph.
+    """
 
     def __init__(self, factors: Sequence["OdometryFactor"], first: Sequence[int], column: int) -> None:
         self._first, self._column = np.array(first, dtype=np.int64), column
@@ -35,11 +42,12 @@ class OdometryStack:
 
     @property
     def first(self) -> Integers:
-        """The number of the first pose that each residual depends on."""
+        """The number (3 K,) of the first pose that each residual depends on."""
         return np.repeat(self._first, 3)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Fill ``residual`` (3 K,) and ``jacobian`` (3 K, 6 + P), see :mod:`factors.chain`."""
+        """Write the whitened residuals into ``residual`` (3 K,) and their Jacobian into ``jacobian`` (3 K, 6 + P), whose columns
+        :mod:`factors.chain` defines."""
         given = self._steps, self._constants(parameters), self._indices
         linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
 
@@ -52,10 +60,10 @@ class OdometryStack:
 
 
 class OdometryFactor:
-    """The increment between two poses, with odometry constants as a third variable.
+    """An odometry increment as a factor on two poses, and optionally on constants of the odometry.
 
-    ``estimated``: indices in :data:`PARAMETERS` of the P constants. The values of the factor are the two poses (3,), and the
-    constants (P,) unless P is zero.
+    ``estimated``: the indices in :data:`factors.odometry.model.PARAMETERS` of the P constants that are estimated. The methods take
+    a list of values: the pose (3,) at the start, the pose (3,) at the end, and the corrections (P,) of the constants if P > 0.
     """
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
@@ -68,20 +76,20 @@ class OdometryFactor:
 
     @property
     def packed(self) -> tuple[Array, Array, float, Array]:
-        """The increment (3,), its logarithm (3,), how long the robot moved, and what whitens it (3, 3)."""
+        """The increment (3,), its logarithm (3,), the time in motion [s], and the matrix (3, 3) that whitens the residual."""
         return self._increment.delta, self._arc, self._moving, self._whitener
 
     @property
     def kind(self) -> Hashable:
-        """Equal for increments that are linearised together."""
+        """A key that is equal for factors that can be linearised together."""
         return self.estimated
 
     def stack(self, factors: Sequence["OdometryFactor"], numbers: Sequence[int], column: int) -> OdometryStack:
-        """Increments of this kind as one: see :class:`~factors.graph.Stackable`."""
+        """Combine factors of the same ``kind`` into one object, for speed. See :class:`~factors.graph.Stackable`."""
         return OdometryStack(factors, numbers, column)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)`` and its Jacobians."""
+        """The whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobian by each value."""
         start, end, *constants = values
         if constants:
             changed = self._arc, self._moving, constants[0], self._indices
@@ -97,16 +105,19 @@ class OdometryFactor:
 
 
 class ScaleFreeOdometryFactor(OdometryFactor):
-    """An increment if only the wheels determine the scale of the estimates; the residual is in the unit of the wheels.
+    """An odometry factor for graphs in which only the wheels determine the scale of the map. The residual is in the unit of the
+    wheels' report.
 
-    A residual in metres becomes smaller as the world does, and nothing opposes that: the most probable world would be too small by
-    ``n s^2``, where ``n`` increments are estimated and ``s`` is the standard deviation of the scale.
+    A residual in metres becomes smaller if the estimated world shrinks, and no other measurement opposes that. The most probable
+    world would be too small by the fraction ``n s^2``, where ``n`` is the number of increments and ``s`` the standard deviation of
+    the scale.
     """
 
-    kind = None  # not linearised together
+    kind = None  # always linearised alone
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, its translation divided by the scale, and its Jacobians."""
+        """The whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, whose translation is divided by the estimated scale, and
+        its Jacobian by each value."""
         start, end, *constants = values
         if not constants:
             return super().linearize(values)
@@ -117,7 +128,7 @@ class ScaleFreeOdometryFactor(OdometryFactor):
 
 @compiled
 def whitener(covariance: Array) -> Array:
-    """The inverse of the lower root of a covariance (3, 3)."""
+    """The inverse (3, 3) of the lower Cholesky root of a covariance (3, 3). Pivots that rounding makes too small are raised."""
     a = math.sqrt(covariance[0, 0])
     b, c = covariance[1, 0] / a, covariance[2, 0] / a
     d = math.sqrt(max(covariance[1, 1] - b * b, ROUNDING * covariance[1, 1]))
@@ -136,14 +147,21 @@ def whitener(covariance: Array) -> Array:
 def linearize(
     start: Array, end: Array, delta: Array, by_changes: Array, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by both poses (3, 3) and, through ``by_changes``
-    (3, P) of ``delta``, by the constants (3, P)."""
+    """Linearise an increment between two poses.
+
+    ``start``, ``end`` (3,): the poses. ``delta`` (3,): the measured increment.
+    ``by_changes`` (3, P): the derivative of ``delta``, as a body-frame perturbation, by the estimated constants.
+    ``whitener`` (3, 3): the matrix that whitens the residual.
+
+    Returns the whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by ``start`` (3, 3), by ``end`` (3, 3)
+    and by the constants (3, P).
+    """
     relative = between_one(start, end)
     rx, ry, turned = relative[0], relative[1], relative[2]
     error = twist_to(delta, relative)
     by_end = product(whitener, inverse_right_jacobian(error))
     c, s = math.cos(turned), math.sin(turned)
-    # the adjoint of the inverse of the relative pose, negative
+    # minus the adjoint of the inverse relative pose
     adjoint = np.array(((-c, -s, c * ry - s * rx), (s, -c, -c * rx - s * ry), (0.0, 0.0, -1.0)))
     by_delta = product(whitener, inverse_right_jacobian(-error))
     for i in range(3):
@@ -159,7 +177,8 @@ def linearize(
 def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """:func:`linearize` of an increment whose logarithm is ``twist`` (3,), under changed ``constants``: see :func:`changed`."""
+    """Linearise an increment for changed constants, as :func:`linearize` does. ``twist`` (3,): the logarithm of the increment.
+    ``moving``, ``constants``, ``indices``: as of :func:`factors.odometry.kernels.changed`."""
     delta, by_changes = changed(twist, moving, constants, indices)
     return linearize(start, end, delta, by_changes, whitener)
 
@@ -168,7 +187,8 @@ def linearize_changed(
 def linearize_as_reported(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """:func:`linearize_changed` with the translation of the residual, and its noise, in the unit that the wheels report."""
+    """:func:`linearize_changed`, but with the residual's translation divided by the estimated scale of distances. The translation
+    is then in the unit of the wheels' report, like its noise."""
     unit = 1.0 + all_changes(constants, indices)[0]
     as_reported = whitener.copy()
     for i in range(3):
@@ -195,8 +215,13 @@ def linearize_all(
     residual: Array,
     column: int,
 ) -> None:
-    """Residuals (3 K,) of K increments and their Jacobian (3 K, 6 + P), see :mod:`factors.chain`, between the poses ``first`` (K,)
-    and those that follow; ``column``: of the constants."""
+    """Linearise K increments. Writes the whitened residuals (3 K,) and their Jacobian (3 K, 6 + P), whose columns
+    :mod:`factors.chain` defines.
+
+    ``poses`` (N, 3), ``first`` (K,): increment k is between the poses ``first[k]`` and ``first[k] + 1``.
+    ``constants``, ``indices``: as of :func:`factors.odometry.kernels.changed`.
+    ``column``: the first column of the constants in the Jacobian.
+    """
     deltas, twists, moving, whiteners = steps
     for k in range(len(first)):
         start, end, row = poses[first[k]], poses[first[k] + 1], 3 * k

@@ -1,4 +1,5 @@
-"""Compiled kernels of the odometry: relative motion for each measurement, and its change with the constants."""
+"""Compiled functions for odometry: the relative motion between two measurements, its covariance, and its change with the odometry's
+constants."""
 
 import math
 
@@ -15,39 +16,45 @@ from factors.se2 import (
     wrap_scalar,
 )
 
-# Minimum variance of positions relative to the largest one. A pose known only to a hundred metres is not known better than to a
-# tenth of a millimetre in any direction; otherwise its covariance would be numerically singular.
-ROUNDING, FAR = 1e-12, 1e4  # m^2
+# Where the variance of the position exceeds FAR [m^2], ROUNDING times this variance is added in both directions. Otherwise a
+# covariance with a standard deviation of a hundred metres in one direction could be numerically singular.
+ROUNDING, FAR = 1e-12, 1e4
 
-# s: variance of the share of its way that a robot goes while its wheels slip, uniform over a width of one, times the second for
-# which the share is the same
+# s; while wheels slip, the robot moves an unknown fraction of its reported way. The fraction has a uniform distribution of width 1,
+# whose variance is 1/12, and changes every second.
 SHARE_VARIANCE = 1.0 / 12.0
-SHORTEST = 1e-6  # s: a duration that is not zero
+SHORTEST = 1e-6  # s; minimum of a duration, against division by zero
 
-NO_CONSTANTS = np.zeros((3, 0))  # the derivative of an increment by no constants
+NO_CONSTANTS = np.zeros((3, 0))  # the derivative of an increment if no constants are estimated
 
-# direction of travel; variances per distance, rotation and time of longitudinal, lateral and heading error; variances per time
-# without odometry of position and heading; minimum variances, and minimum variances per time
+# The elements of a noise model are, in this order:
+# - the direction of travel [rad];
+# - nine variances: of the longitudinal, lateral and heading error, each per distance, per rotation and per time;
+# - the variances per time of position and heading without odometry;
+# - the variances of position and heading added to each increment, and their minimum variances per time.
 Noise = tuple[float, ...]
-State = tuple[float, ...]  # of a chain: t, x, y, heading, path, turn, unknown, still
+State = tuple[float, ...]  # a state of the integrated odometry: t, x, y, heading, path, turn, unknown, still
 
 
 @compiled
 def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
-    """See :func:`factors.odometry.model.relative_motion`: pose (3,), covariance (3, 3), duration and time at rest, for two states
-    of a chain (t, x, y, heading, path, turn, unknown, still)."""
+    """The motion between two states of the integrated odometry, as in :func:`factors.odometry.model.relative_motion`.
+
+    ``noise``: a :data:`Noise` as an array. Returns the relative pose (3,), its covariance (3, 3), the duration [s], and the time at
+    rest [s].
+    """
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
     x, y, turned = c * dx + s * dy, c * dy - s * dx, wrap_scalar(end[3] - start[3])
     distance, rotation, duration = abs(end[4] - start[4]), abs(end[5] - start[5]), abs(end[0] - start[0])
     unknown, still = max(0.0, end[6] - start[6]), min(duration, abs(end[7] - start[7]))
-    # time-dependent noise grows in motion only; the total is at least the minimum noise
+    # noise grows with time only while the robot moves; the total is at least the minimum noise
     moving, least_position, least_heading = duration - still, noise[14] * duration, noise[15] * duration
     along = max(noise[1] * distance + noise[2] * rotation + noise[3] * moving, least_position) + noise[10] * unknown
     lateral = max(noise[4] * distance + noise[5] * rotation + noise[6] * moving, least_position) + noise[10] * unknown
     heading = max(noise[7] * distance + noise[8] * rotation + noise[9] * moving, least_heading) + noise[11] * unknown
-    if unknown > 0.0:  # the robot went an unknown share of what its speed was
+    if unknown > 0.0:  # the robot moved an unknown fraction of the reported way
         along += unknown * SHARE_VARIANCE * (distance / max(duration, SHORTEST)) ** 2
-    # the start seen from the end, rotated by 90 degrees: displacement of the end by a heading change at the start
+    # (nx, ny): displacement of the end, in its own frame, per change of the heading at the start
     c, s = math.cos(turned), math.sin(turned)
     nx, ny = s * x - c * y, c * x + s * y
     # the mean heading during the motion differs from the final one by half the rotation
@@ -65,7 +72,11 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 
 @compiled
 def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
-    """:func:`relative` for states (N, 8): poses (N, 3), :func:`recalibrated` by ``constants`` (P,), and covariances (N, 3, 3)."""
+    """The motions between N pairs of states (N, 8) by :func:`relative`, corrected for changed constants by :func:`recalibrated`.
+
+    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants. Returns the
+    relative poses (N, 3) and their covariances (N, 3, 3).
+    """
     count = len(starts)
     deltas, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
     for k in range(count):
@@ -83,10 +94,12 @@ def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indice
 
 @compiled
 def carried(covariance: Array, delta: Array, noise: Array) -> Array:
-    """The body-frame covariance (3, 3) of a pose after the motion ``delta`` (3,) with covariance ``noise``."""
+    """Propagate the body-frame ``covariance`` (3, 3) of a pose over the motion ``delta`` (3,), whose covariance is ``noise`` (3,
+    3).
+    Returns the body-frame covariance (3, 3) of the pose after the motion."""
     c, s = math.cos(delta[2]), math.sin(delta[2])
     x, y = s * delta[0] - c * delta[1], c * delta[0] + s * delta[1]
-    # the adjoint of the inverse of the motion
+    # the adjoint of the inverse motion
     adjoint = ((c, s, x), (-s, c, y), (0.0, 0.0, 1.0))
     out = np.empty((3, 3))
     for i in range(3):
@@ -115,11 +128,18 @@ def predicted(
     transition: Array,
     out: Array,
 ) -> None:
-    """Predict a motion by ``delta`` (3,) with covariance ``noise`` (3, 3) and time ``moving``, under changed ``constants`` (P,) at
-    the places ``indices`` (P,), with columns in the error state from ``first`` on. Writes the pose ``at`` (3,), the first rows
-    ``transition`` (3, S), whose other rows are those of the identity, and the covariance ``out`` (S, S)."""
+    """Predict a Gaussian error state (S,) of a pose and further components over one motion.
+
+    ``delta`` (3,), ``noise`` (3, 3): the motion and its covariance. ``moving`` [s]: the time in motion.
+    ``pose`` (3,), ``covariance`` (S, S): the pose and the covariance of the error state before the motion.
+    ``constants`` (P,), ``indices`` (P,): corrections of the estimated odometry constants, and their indices among all constants.
+    ``first``: the index of the first of these constants in the error state.
+    ``at`` (3,): output, the predicted pose.
+    ``transition`` (3, S): output, the first three rows of the transition matrix. The remaining rows are those of the identity.
+    ``out`` (S, S): output, the predicted covariance.
+    """
     size, count = len(covariance), len(constants)
-    columns = np.arange(3 + count)  # where the transition is not zero
+    columns = np.arange(3 + count)  # the columns of the transition that are not zero
     for j in range(3 * size):
         transition[j // size, j % size] = 0.0
     x, y, turned = delta[0], delta[1], delta[2]
@@ -131,7 +151,7 @@ def predicted(
         for i in range(3):
             for j in range(count):
                 transition[i, first + j], columns[3 + j] = by_changes[i, indices[j]], first + j
-    # the adjoint of the inverse of the motion
+    # the adjoint of the inverse motion
     c, s = math.cos(turned), math.sin(turned)
     transition[0, 0], transition[0, 1], transition[0, 2] = c, s, s * x - c * y
     transition[1, 0], transition[1, 1], transition[1, 2] = -s, c, c * x + s * y
@@ -155,7 +175,8 @@ def predicted(
 
 @compiled(inline="always")
 def _widen(covariance: Array) -> None:
-    """Keep a covariance (3, 3) invertible: see :data:`FAR`."""
+    """Increase the variances of the position in a covariance (3, 3) if they are large, so that it stays invertible. See
+    :data:`FAR`."""
     variance = covariance[0, 0] + covariance[1, 1]
     if variance > FAR:
         covariance[0, 0] += ROUNDING * variance
@@ -164,7 +185,10 @@ def _widen(covariance: Array) -> None:
 
 @compiled
 def recalibrated(delta: Array, moving: float, constants: Array, indices: Integers) -> Array:
-    """The increment ``delta`` (3,) as :func:`recalibrate` corrects it for ``constants`` (P,) with ``indices`` (P,) among all."""
+    """Correct the increment ``delta`` (3,) for changed constants, as :func:`recalibrate` does, without derivatives.
+
+    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants.
+    """
     changes = all_changes(constants, indices)
     x, y, phi = log_scalars(delta[0], delta[1], delta[2])
     turn = phi + changes[1] * phi - changes[2] * moving + changes[3] * math.hypot(x, y)
@@ -173,10 +197,13 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
 
 @compiled
 def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
-    """An increment with corrected constants, as one arc, which is exact at constant curvature; and its Jacobian (3, 4).
+    """Correct an increment for changed odometry constants. The increment counts as one arc, which is exact for constant curvature.
 
-    ``twist`` (3,): log of the increment; ``moving`` [s]: its time in motion. ``changes`` (4,): relative changes of the scales of
-    distance and rotation, additional heading-rate bias [rad/s] in motion, additional heading drift [rad/m].
+    ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: its time in motion.
+    ``changes`` (4,): the relative changes of the scales of distance and rotation, the change of the heading-rate bias [rad/s], and
+    the change of the heading drift [rad/m].
+
+    Returns the corrected increment (3,) and its Jacobian (3, 4) by ``changes``.
     """
     x, y, phi = twist[0], twist[1], twist[2]
     distance = math.hypot(x, y)
@@ -194,7 +221,11 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
 
 @compiled
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
-    """:func:`recalibrate` for corrections ``constants`` (P,) with ``indices`` (P,) among all constants; the Jacobian is (3, P)."""
+    """Correct an increment as :func:`recalibrate` does, for P of the four constants.
+
+    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants. Returns the
+    corrected increment (3,) and its Jacobian (3, P) by ``constants``.
+    """
     delta, by_changes = recalibrate(twist, moving, all_changes(constants, indices))
     out = np.empty((3, len(indices)))
     for i in range(3):
@@ -205,7 +236,7 @@ def changed(twist: Array, moving: float, constants: Array, indices: Integers) ->
 
 @compiled
 def all_changes(constants: Array, indices: Integers) -> Array:
-    """The changes (4,) of all constants: ``constants`` (P,) at the places ``indices`` (P,), else zero."""
+    """The changes (4,) of all odometry constants: ``constants`` (P,) at the indices ``indices`` (P,), and zeros elsewhere."""
     changes = np.zeros(4)
     for i in range(len(indices)):
         changes[indices[i]] = constants[i]

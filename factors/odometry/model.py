@@ -1,12 +1,13 @@
 """The model of wheel odometry and gyro: relative poses with covariance.
 
-Odometry is integrated in its own frame (:mod:`factors.odometry.chain`); a relative pose is the difference of two of its states.
+:mod:`factors.odometry.chain` integrates the odometry in a frame of its own. A relative pose is the difference of two states of this
+integration.
 
-Variances of longitudinal, lateral and heading errors grow linearly with distance, rotation and time, so that the result does not
-depend on how a path is divided.
+The variances of longitudinal, lateral and heading errors grow linearly with distance, rotation and time. The covariance of a path
+therefore does not depend on its division into increments.
 
-Rest is a measurement of zero velocity: errors that grow with time do not grow, and only the minimum noise acts. That minimum
-applies to all odometry, because an increment without noise would make a graph singular.
+A robot at rest is a measurement of zero velocity. While the robot rests, its variances do not grow with time, except for a minimum
+noise. The minimum noise is part of all increments, because an increment without noise would make a graph singular.
 """
 
 import math
@@ -24,18 +25,18 @@ from factors.odometry.kernels import (
 )
 from factors.se2 import Array
 
-# minimum noise of an increment without duration, whose covariance must be invertible
+# Variances that are added to each increment, so that the covariance of an increment without duration is invertible: m^2, rad^2.
 MINIMUM_POSITION_VARIANCE = 1e-8
 MINIMUM_HEADING_VARIANCE = 1e-8
-SLIPS = 0.01  # 1/s: how often wheels slip
-LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m, rad per sqrt(s): minimum noise
+SLIPS = 0.01  # 1/s: the rate at which wheel slips begin
+LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m and rad per sqrt(s): minimum noise
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """Standard deviation of one error component per square root of distance, rotation and time.
+    """The standard deviation of one error component per square root of distance, of rotation, and of time.
 
-    The unit is that of the component (m or rad) per sqrt(m), per sqrt(rad) and per sqrt(s).
+    The units are those of the component (m or rad) per sqrt(m), per sqrt(rad) and per sqrt(s).
     """
 
     per_distance: float = 0.0
@@ -43,7 +44,7 @@ class Growth:
     per_time: float = 0.0
 
     def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> "Growth":
-        """With independent errors of these standard deviations added."""
+        """The growth with further independent errors, which have these standard deviations."""
         return Growth(
             math.hypot(self.per_distance, per_distance),
             math.hypot(self.per_rotation, per_rotation),
@@ -53,13 +54,17 @@ class Growth:
 
 @dataclass(frozen=True, slots=True)
 class OdometryModel:
-    """Wheel odometry, optionally with the rotation from a gyro.
+    """The constants and the noise of wheel odometry, optionally with a gyro.
 
-    ``scale_distance``, ``scale_rotation``: true divided by reported motion. ``speed_bias`` [m/s], ``heading_rate_bias`` and
-    ``gyro_bias`` [rad/s]: reported at rest; ``heading_drift`` [rad/m]: unreported change of heading. ``direction`` [rad]: of
-    travel, in the robot frame. For commanded velocities: ``delay`` and ``lag`` [s], and ``turn_slowdown`` [m/rad], the loss of
-    forward speed per turn rate. A velocity is held for at most ``max_hold`` seconds; then the motion is unknown, and its variance
-    grows with ``unknown_distance`` [m per sqrt(s)] and ``unknown_rotation`` [rad per sqrt(s)].
+    ``scale_distance``, ``scale_rotation``: the true motion divided by the reported motion.
+    ``speed_bias`` [m/s], ``heading_rate_bias`` [rad/s], ``gyro_bias`` [rad/s]: the values reported by a robot at rest.
+    ``heading_drift`` [rad/m]: the change of heading per distance that the wheels do not report.
+    ``direction`` [rad]: the direction of travel in the robot frame.
+    ``delay``, ``lag`` [s]: the dead time of commanded velocities, and the time constant of the robot's first-order response.
+    ``turn_slowdown`` [m/rad]: the loss of forward speed per turn rate, for commanded velocities.
+    ``max_hold`` [s]: the longest time for which a velocity is assumed to continue. After that the motion is unknown.
+    ``unknown_distance`` [m per sqrt(s)], ``unknown_rotation`` [rad per sqrt(s)]: the noise of an unknown motion.
+    ``along``, ``lateral``, ``heading``: the noise along the direction of travel, across that direction, and of the heading.
     """
 
     scale_distance: float = 1.0
@@ -80,7 +85,7 @@ class OdometryModel:
     heading: Growth = field(default_factory=Growth)
 
     def noise(self) -> Noise:
-        """The noise for compiled code: see :data:`factors.odometry.kernels.Noise`."""
+        """The noise of the model as a tuple for compiled code. See :data:`factors.odometry.kernels.Noise`."""
         growths = (self.along, self.lateral, self.heading)
         sigmas = [s for g in growths for s in (g.per_distance, g.per_rotation, g.per_time)]
         sigmas += [self.unknown_distance, self.unknown_rotation]
@@ -89,19 +94,20 @@ class OdometryModel:
 
 
 def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) -> Increment:
-    """The motion between two states of a chain, with its covariance.
+    """The motion between two states of the integrated odometry, with its covariance.
 
-    The heading error is a random walk along the path, so it also displaces the end: by a third of its variance, and half of it as
-    covariance, if the walk is uniform along the chord.
+    The heading error is a random walk along the path, so it also displaces the end of the motion. Let v be the variance of the
+    heading, and r the lever, the distance from start to end. For a uniform walk along a straight line, the variance of the
+    displacement is v r^2 / 3. Its covariance with the heading is v r / 2.
     """
     return Increment(*relative(np.array(model.noise()), start, end))
 
 
 def slip(model: OdometryModel, increment: Increment, *, use_gyro: bool) -> tuple[Array, float]:
-    """The covariance (3, 3) that an increment has more if its wheels slip, and minus the logarithm of how probable that is.
+    """The additional covariance (3, 3) of an increment whose wheels slip, and the negative log-probability of a slip in it.
 
-    The errors along the motion and of the heading are then those of an unknown motion, and displace the end as in
-    :func:`relative_motion`. A gyro still measures the heading; wheels do not slip sideways.
+    During a slip the errors along the motion and of the heading are those of an unknown motion. The heading error displaces the end
+    of the motion as in :func:`relative_motion`. With ``use_gyro`` the heading has no additional error. Wheels do not slip sideways.
     """
     duration = max(increment.duration, SHORTEST)
     along, heading = model.unknown_distance**2 * duration, 0.0 if use_gyro else model.unknown_rotation**2 * duration
@@ -114,13 +120,16 @@ def slip(model: OdometryModel, increment: Increment, *, use_gyro: bool) -> tuple
     return covariance, -math.log(-math.expm1(-SLIPS * duration))
 
 
-# the constants that an increment can be corrected for: see `factors.odometry.kernels.recalibrate`
+# The constants that can be estimated: `factors.odometry.kernels.recalibrate` corrects an increment for changes of these.
 PARAMETERS = ("scale_distance", "scale_rotation", "heading_rate_bias", "heading_drift")
 
 
 def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int64], Array]:
-    """Compose motions with equal timestamps ``t`` (N,), sorted: indices (M,) of the last row of each timestamp, and the motions (M,
-    3) since the timestamp before, from ``moves`` (N, 3)."""
+    """Compose the motions that have equal timestamps.
+
+    ``t`` (N,): sorted timestamps. ``moves`` (N, 3): motions. Returns the index of the last row of each distinct timestamp (M,), and
+    the composed motion (M, 3) of each distinct timestamp.
+    """
     last = np.flatnonzero(np.append(np.diff(t) > 0, True)[: len(t)])
     first = np.append(0, last[:-1] + 1)[: len(last)]
     out = np.array(moves[first], dtype=float)

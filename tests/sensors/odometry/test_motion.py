@@ -65,7 +65,7 @@ def test_motion_of_before_what_is_kept_is_refused():
         motion.add(VelocityOdometry(0.1 * i, 1.0, 0.0))
     moved = motion.relative(motion.state(29.0 - motion.horizon), motion.state(29.0))
     assert moved.delta[0] == pytest.approx(motion.horizon)
-    with pytest.raises(ValueError, match=r"the motion at 10\.000 s was asked for, but only that from"):
+    with pytest.raises(ValueError, match=r"the odometry at 10\.000 s was deleted, and is available only from"):
         motion.state(10.0)
 
 
