@@ -1,6 +1,7 @@
-"""Checks of whole logs: bounds of columns and time span that every log must satisfy, and warnings.
+"""Checks of whole logs: bounds of values, the time span, and warnings.
 
-Readers check what they can attribute to a file and row; values computed from several rows or foreign formats are checked here.
+A reader checks the values that it can attribute to a row of a file. This module also checks values that a reader computes from
+several rows, or converts from foreign formats.
 """
 
 from collections.abc import Sequence
@@ -20,13 +21,13 @@ from factorgraph_loc.sensors.tables import columns_of
 from factorgraph_loc.text import Notice, listed, notice
 from factors.se2 import Array
 
-TURNED = 2.0  # rad
-LONG_GAP = 5.0  # s
+TURNED = 2.0  # rad by which the odometry turns, beyond which a reference with constant heading has no valid headings
+LONG_GAP = 5.0  # s between successive timestamps above which a gap is reported
 TOLERANCE = 1e-9  # relative tolerance for converted values
 
 
 def require_bounds(log: Log) -> None:
-    """InputError at the first value of a log that is outside of its column's bounds, with its time."""
+    """Raise InputError, with the time, at the first value of a log that is outside of the bounds of its column."""
     for name, stream in log.streams.items():
         for column in columns_of(channel(name), stream) if kind_of(name) in channels() else ():
             _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
@@ -40,7 +41,10 @@ def require_bounds(log: Log) -> None:
 
 
 def _require(where: str, column: Column, t: Array, values: Array) -> None:
-    """InputError at the first of ``values`` (N,) that is out of bounds by more than rounding; ``t`` (N,): its time."""
+    """Raise InputError at the first of ``values`` (N,) that is out of bounds by more than rounding.
+
+    ``where``: the beginning of the error. ``t`` (N,): the times of the values [s].
+    """
     low, high = column.low - TOLERANCE * abs(column.low), column.high + TOLERANCE * abs(column.high)
     bad = replace(column, low=low, high=high).outside(values)
     if bad.any():
@@ -49,8 +53,9 @@ def _require(where: str, column: Column, t: Array, values: Array) -> None:
 
 
 def require_one_span(log: Log) -> None:
-    """InputError if a timestamp of a log, or its start, is more than :data:`~factorgraph_loc.files.columns.MAX_SPAN` from the
-    others: the clocks of sensors disagree.
+    """Raise InputError if a timestamp of a log or of its start is too far from the others, because the clocks of sensors disagree.
+
+    The limit is :data:`~factorgraph_loc.files.columns.MAX_SPAN`.
     """
     filled = {name: stream.t for name, stream in log.streams.items() if len(stream.t)}
     if not filled:
@@ -72,13 +77,13 @@ def require_one_span(log: Log) -> None:
 
 
 def long_gaps(t: Array) -> tuple[tuple[float, float], ...]:
-    """Start and length [s] of the gaps above :data:`LONG_GAP` between ascending timestamps ``t`` (N,)."""
+    """Return the start and the length [s] of each gap above :data:`LONG_GAP` between ascending timestamps ``t`` (N,) [s]."""
     steps = np.diff(t)
     return tuple((float(t[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + ROUNDING))
 
 
 def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]:
-    """A warning about the gaps (start, length) of a stream, if there are any."""
+    """Return a warning about the ``gaps`` (start [s], length [s]) of the stream ``name``. The list is empty without gaps."""
     if not gaps:
         return []
     start, length = max(gaps, key=lambda gap: gap[1])
@@ -88,8 +93,11 @@ def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]
 
 
 def without_false_headings(log: Log) -> Log:
-    """The log, whose reference has no headings if these never change while the odometry turns by more than :data:`TURNED`: systems
-    that measure positions alone report an orientation of zero."""
+    """Return the log, with a reference without headings if its headings are evidently meaningless.
+
+    Headings are meaningless if they never change while the odometry turns by more than :data:`TURNED`. Systems that measure only
+    positions may report an orientation of zero.
+    """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not reference.has_heading or len(reference.t) < 2 or np.ptp(reference.poses[:, 2]) > 1e-9:
         return log
@@ -109,7 +117,7 @@ def without_false_headings(log: Log) -> Log:
 
 
 def look_over(log: Log) -> list[Notice]:
-    """Warnings about a whole log; InputError if it has measurements but no odometry."""
+    """Return warnings about a whole log. Raises InputError if the log has measurements but no odometry."""
     odometry = log.streams.get("odometry")
     if odometry is None and log.reference is not None and not log.streams:
         return []

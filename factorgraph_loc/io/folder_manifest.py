@@ -1,4 +1,7 @@
-"""A proposed manifest for a folder of tables: which file is which sensor, with columns, units and clock offsets."""
+"""Proposes a manifest, the description of a log, for a folder of tables.
+
+The manifest states which file is the table of which sensor, and its columns, units and clock offset.
+"""
 
 import os
 import re
@@ -40,25 +43,25 @@ FIELDS = {
 }
 POSITIONS = re.compile("uwb|gps|gnss|position|(^|[-_.])(fix|ble)", re.IGNORECASE)  # in names of tables of positions
 MAPS = ("tags", "landmarks")
-WINDOW = 1.0  # s over which distances are compared
-TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m: examples of what no file says
+WINDOW = 1.0  # s: the resolution in time at which distances are summed
+TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m per encoder count, m, m: examples of sizes that no file states
 SIGMA = 0.1  # m: an example of the noise of a range or a position
-APART = 5.0  # s that clocks may begin apart
+APART = 5.0  # s by which tables may miss each other in time before a clock offset is proposed
 
 
 @dataclass
 class _Roles:
-    """The table of each role, and ``remarks``."""
+    """The proposed role of each table, such as ``odometry``. ``tables``: the table by its role. ``remarks``: for the user."""
 
     tables: dict[str, Guess] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
 
 def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
-    """Propose a manifest for the tables in a folder.
+    """Propose a manifest for the folder ``tables``.
 
-    It is to be saved in ``folder`` if ``tables`` is below it, else in the folder that contains ``tables``.
-    InputError if no file of the folder is a table with times.
+    The manifest is to be saved in ``folder`` if ``tables`` is below ``folder``, else in the folder that contains ``tables``.
+    Raises InputError if no file in ``tables`` is a table with times.
     """
     path, folder = Path(os.path.realpath(tables)), folder.resolve()
     guesses = _guesses(path)
@@ -75,11 +78,11 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
             options[role] = _described(role, table, roles, path)
     if "odometry" not in options:
         roles.remarks.append(
-            "no file looks like odometry, which every estimator needs: describe one in [options.odometry]"
+            "no file was recognised as odometry, which every estimator needs: describe one in [options.odometry]"
         )
     if "rfid" in options and not roles.tables["rfid"].has("antenna"):
         options["rfid"]["antenna"] = "antenna"
-        roles.remarks.append("the reads name no antenna: all are assigned to one, set in antenna")
+        roles.remarks.append("the reads name no antenna: all are assigned to one, whose name is set in antenna")
     reference = roles.tables.get("reference")
     if reference is not None and not _has_headings(reference):
         roles.remarks.append(f"{reference.name}: has no headings")
@@ -101,26 +104,28 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
 
 
 def _needs_of_rig(roles: _Roles) -> list[str]:
-    """What the rig has to have for the tables, with the commands that write it."""
+    """Return remarks about the sections that the rig needs for the tables, with the commands that write such a rig."""
     out = []
     if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
         antennas = dict.fromkeys(roles.tables["rfid"].columns[roles.tables["rfid"].fields["antenna"]])
         names = shlex.quote(",".join(antennas)) if len(antennas) < LISTED else listed(antennas)
-        out.append(f"the rig needs antennas of these names, as `fgloc rigs new --antennas {names}` writes them")
+        out.append(
+            f"the rig needs antennas with the names in the reads: `fgloc rigs new --antennas {names}` writes such a rig"
+        )
     radios = [role for role in roles.tables if kind_of(role) == "bearing_range"]
     sections = listed(f"[{role}]" for role in radios)
     if len(radios) > 1:
         each = ",".join(f"{role.partition('.')[2]}={SIGMA}" for role in radios)
-        out.append(f"the rig needs {sections}, as `fgloc rigs new --landmarks {each}` writes them")
+        out.append(f"the rig needs {sections}: `fgloc rigs new --landmarks {each}` writes such a rig")
     if "position" in roles.tables:
-        out.append(f"the rig needs [position], as `fgloc rigs new --position {SIGMA}` writes it")
+        out.append(f"the rig needs [position]: `fgloc rigs new --position {SIGMA}` writes such a rig")
     if radios and "landmarks" in roles.tables and roles.tables["landmarks"].has("z"):
         out.append(f"the landmarks have heights: set z, the height of the sensor, in {sections} of the rig")
     return out
 
 
 def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
-    """The lines of a world file for a map that is a table in the parent folder."""
+    """Return a remark with the lines of a world file, if the parent folder has a table that is a map. Else the list is empty."""
     for table in _guesses(path.parent):
         role = _role(table)
         if role in MAPS:
@@ -131,12 +136,12 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
             )
             world = {"name": name, **({} if walls is None else {"walls": walls}), role: _in_map(role, roles)}
             lines = toml_of(world).splitlines()
-            return [f"{table.name} looks like a map: save these lines as {name}.world.toml next to it", *lines]
+            return [f"{table.name} seems to be a map: save these lines as {name}.world.toml next to it", *lines]
     return []
 
 
 def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
-    """The keys of a table of a map; EPCs in the letter case of the reads."""
+    """Return the settings that describe the table of a map in a world file. EPCs get the letter case of the reads."""
     table, reads = roles.tables[role], roles.tables.get("rfid")
     settings = table.mapping(FIELDS[role])
     if role == "tags" and reads is not None:
@@ -148,7 +153,7 @@ def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
 
 
 def _guesses(folder: Path) -> list[Guess]:
-    """The guesses about the tables in a folder, without files that cannot be read as tables."""
+    """Return the guessed columns and units of each table in a folder. Files that cannot be read as tables are left out."""
     out = []
     for file in sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES and entry.is_file()):
         with suppress(InputError):
@@ -158,7 +163,10 @@ def _guesses(folder: Path) -> list[Guess]:
 
 
 def _roles(guesses: Sequence[Guess]) -> _Roles:
-    """The role of each table. Poses are the reference if the name of the file says so, or if there is other odometry."""
+    """Assign a role to each table.
+
+    A table of poses is the reference if the name of its file suggests ground truth, or if another table is the odometry.
+    """
     out = _Roles()
     poses = [g for g in guesses if g.has("t", "x", "y") and not g.has("epc") and not g.has("landmark")]
     truths = [g for g in poses if TRUTH.search(g.name)]
@@ -191,7 +199,7 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
 
 
 def _role(table: Guess) -> str | None:
-    """The role that the fields of a table show; None for poses and for unknown tables."""
+    """Return the role that the fields of a table imply. Returns None for a table of poses, and for a table of unknown content."""
     if not table.has("t"):
         return "tags" if table.has("epc", "x", "y") else "landmarks" if table.has("landmark", "x", "y") else None
     if table.has("epc"):
@@ -206,12 +214,12 @@ def _role(table: Guess) -> str | None:
 
 
 def _sides(table: Guess) -> tuple[str, ...]:
-    """The fields of two or four wheels, if the table has them."""
+    """Return the fields of two or four wheels. Returns an empty tuple if the table has no such fields."""
     return tuple(name for name in table.fields if name.removeprefix("rear_").startswith(("left", "right")))
 
 
 def _described(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
-    """The keys of a table of the manifest, for tables in the folder ``path``."""
+    """Return the settings that describe a table in the manifest. ``path``: the folder of the table."""
     sides = _sides(table) if role == "odometry" else ()
     if sides:
         settings = table.mapping(("t", *sides))
@@ -228,7 +236,10 @@ def _has_headings(table: Guess) -> bool:
 
 
 def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], roles: _Roles, path: Path) -> None:
-    """The distance between the wheels, and the distance per unit of counters: from the reference, or examples."""
+    """Add the distance between the wheels, and the distance per encoder count, to the ``settings`` of odometry.
+
+    Both are estimated from the reference. If that is impossible, they are examples, and a remark asks to replace them.
+    """
     settings["track"] = TRACK
     if sides[0] != "left":
         if sides[0] in ("left_angle", "left_rate"):
@@ -248,8 +259,8 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
         length, travelled = _lengths(table.times(), left + right, replace(reference, t=reference.t + offset))
         tick = float(f"{2.0 * length / max(travelled, 1e-9):.3g}") if travelled > 0.0 and length > 0.0 else TICK
         roles.remarks.append(
-            f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])}, as the reference travels {length:.1f} m "
-            f"over {travelled / 2.0:.0f} of them; replace it by the size of your wheels"
+            f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])}, because the reference travels {length:.1f} m "
+            f"while the wheels count {travelled / 2.0:.0f}; replace it by the size of your wheels"
         )
         if turned is not None and turned.ratio > 0.0:
             track = float(f"{tick * turned.ratio:.3g}")
@@ -262,13 +273,13 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
     else:
         settings["track"] = track
         roles.remarks.append(
-            f"{table.name}: track = {track:g} m, as the reference turns; replace it by what you measure"
+            f"{table.name}: track = {track:g} m, estimated from the turns of the reference; replace it by a measured value"
         )
     settings.setdefault("units", {}).update(dict.fromkeys(sides, tick))
 
 
 def _reference(roles: _Roles, path: Path) -> Trajectory | None:
-    """The reference of the folder ``path``, as its reader reads it; None without one that can be read."""
+    """Return the reference trajectory of the folder ``path``. Returns None if there is none, or if it cannot be read."""
     if (table := roles.tables.get("reference")) is None:
         return None
     with suppress(InputError):
@@ -278,8 +289,10 @@ def _reference(roles: _Roles, path: Path) -> Trajectory | None:
 
 
 def _lengths(t: Array, counted: Array, reference: Trajectory) -> tuple[float, float]:
-    """The length [m] of the reference and the change of what was ``counted`` (N,) at ``t`` (N,), both over the time that they
-    have in common; over all their time if they have none in common."""
+    """Return the length of the reference [m], and the total change of the encoder counts, over the time that both have in common.
+
+    ``t`` (N,): times [s]. ``counted`` (N,): encoder counts. If they have no time in common, each is summed over all its time.
+    """
     during = (t >= reference.t[0]) & (t <= reference.t[-1])
     of_reference = (reference.t >= t[0]) & (reference.t <= t[-1])
     if not during.any() or not of_reference.any():
@@ -289,12 +302,12 @@ def _lengths(t: Array, counted: Array, reference: Trajectory) -> tuple[float, fl
 
 
 def _each_second(t: Array, values: Array) -> Array:
-    """The first row of ``values`` (N, ...) in each :data:`WINDOW` of the times ``t`` (N,) [s]."""
+    """Return the first of the ``values`` (N, ...) in each interval of :data:`WINDOW`. ``t`` (N,): the times of the values [s]."""
     return np.asarray(values[np.unique(np.floor((t - t[0]) / WINDOW), return_index=True)[1]])
 
 
 def _counted(table: Guess, sides: Sequence[str]) -> tuple[Array, Array]:
-    """The counts (N,) of the left and of the right wheels since the first row, as if no counter wrapped."""
+    """Return the counts (N,) of the left wheels and of the right wheels since the first row. Counters that wrap are continued."""
     steps = {name: wheel_steps(table.values(name), 1.0) for name in sides}
     left, right = (np.mean([steps[name] for name in sides if side in name], axis=0) for side in ("left", "right"))
     return np.append(0.0, np.nancumsum(left)), np.append(0.0, np.nancumsum(right))
@@ -305,7 +318,7 @@ def _turns_of(reference: Trajectory) -> Turns:
 
 
 def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
-    """The turns that the table of a role shows; None if it shows none."""
+    """Return the headings over time in the table of a role. Returns None if the table has no headings or turns."""
     table = roles.tables[role]
     if role == "reference":
         reference = _reference(roles, path)
@@ -322,8 +335,10 @@ def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
 
 
 def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
-    """Offsets of clocks that differ from that of most tables: such that both show the same turns. If no offset
-    is clear, both begin together."""
+    """Add clock offsets to tables whose time does not overlap that of most other tables.
+
+    The offset makes both show the same turns. If no offset is clear, it makes both begin at the same time.
+    """
     starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}
     if not starts:
@@ -343,8 +358,8 @@ def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
             same = None if first is None or second is None else match(first, second)
             offset = None if same is None else same.offset
             options[role]["clock_offset"] = round(starts[usual] - start if offset is None else offset, 3)
-            how = "begin together; correct it if they did not" if offset is None else "show the same turns"
+            how = "begin at the same time; correct it if they did not" if offset is None else "show the same turns"
             roles.remarks.append(
-                f"{roles.tables[role].name}: its clock differs from that of {roles.tables[usual].name}: clock_offset is such that "
-                f"both {how}"
+                f"{roles.tables[role].name}: its clock differs from that of {roles.tables[usual].name}: "
+                f"clock_offset makes both {how}"
             )

@@ -1,6 +1,6 @@
-"""Guesses of what the table of another program has: separator, header, and the field and the unit of each column.
+"""Guesses the content of a table of another program: separator, header, and the field and the unit of each column.
 
-A guess is by the name of a column first, and by its values second. Each one comes with its reason.
+The name of a column decides first, and its values second. A guess by values comes with its reason.
 """
 
 import re
@@ -22,7 +22,7 @@ from factors.se2 import Array
 TRUTH = re.compile(
     r"truth|(^|[/_.])gt($|[/_.])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
 )
-# of the last part of a field's path, without separators and without a unit at the end
+# by field of an RFID read: common names of columns or message fields, without separators and units
 READ: dict[str, tuple[str, ...]] = {
     "epc": ("epc", "epchex", "tagepc", "tagid", "epcid", "uid", "tag", "serial", "tagserial"),
     "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
@@ -31,12 +31,12 @@ READ: dict[str, tuple[str, ...]] = {
     "frequency": ("frequency", "freq", "carrier", "channelfrequency", "channelmhz", "channelkhz"),
     "stamp": ("firstseen", "firstseentimestamp", "firstseentimestamputc", "readtime", "timestamp"),
 }
-# names of columns in a table of ranges to radios or landmarks, the likeliest first
+# common names of columns with the landmark and the range in a table of ranges, the likeliest first
 LANDMARK = ("anchorid", "anchor", "anchorname", "responderid", "beaconid", "beacon", "landmarkid", "nodeid", "id")
 RANGE = ("range", "distance", "dist", "dis", "rangem", "distancem")
 UNIT = re.compile(r"(deg(rees)?|rad(ians)?|[mk]?hz|[mun]s|dbm)$")
 SEPARATORS = ("\t", ";", ",", " ")
-LOOKED_AT = 50  # lines that separator and header are guessed from
+LOOKED_AT = 50  # number of lines that decide on separator and header
 TIME = re.compile(r"^(t|time.*|.*time|.*stamp|when|date.*|millis|uptime|clock|secs?|seconds|finished|end(ed)?|begin)$")
 BRACKETS = re.compile(r"\s*[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
@@ -59,7 +59,7 @@ OTHERS = {
     "facing": ("facing", "faces", "direction", "facingdirection"),
 }
 NAMES: dict[str, Sequence[str]] = {**{k: v for k, v in READ.items() if k != "stamp"}, **POSE, **MOTION, **OTHERS}
-# names of units at the end of a column's name, by kind of field
+# by the end of a column's name: the unit that it means, for each kind of field
 SECONDS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "millis": "ms", "micros": "us", "nanos": "ns"}
 LENGTHS = {unit: unit for unit in LENGTH}
 ANGLES = {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"}
@@ -73,9 +73,9 @@ ENDS: dict[str, Mapping[str, str]] = {
     "w": RATES,
     "frequency": {"hz": "Hz", "khz": "kHz", "mhz": "MHz"},
 }
-TEXTS = ("epc", "antenna", "landmark")  # fields that need no numbers
-FASTEST = 15.0  # m/s that no robot has
-# units of values of at most this size
+TEXTS = ("epc", "antenna", "landmark")  # fields whose values need not be numbers
+FASTEST = 15.0  # m/s above which a speed is assumed to be in another unit
+# by field: possible units, each with the largest value that it explains; the first unit that explains all values is used
 LARGER: dict[str, tuple[tuple[str, float], ...]] = {
     **dict.fromkeys(("heading", "bearing", "facing"), (("rad", 6.4), ("deg", np.inf))),
     "w": (("rad/s", 12.0), ("deg/s", np.inf)),
@@ -91,9 +91,13 @@ EPC = re.compile(r"(0x)?[0-9A-Fa-f]{8,}$")
 
 @dataclass
 class Guess:
-    """A table with ``columns`` of texts, by name or, without ``header``, by number from 1; ``separator`` and ``decimal`` mark.
+    """A table of another program and what its columns are guessed to mean.
 
-    Guessed are its ``fields`` with the column of each and their ``units``; ``reasons``: of guesses by values.
+    ``separator``, ``decimal``: the separator of columns and the decimal mark.
+    ``header``: True if the first row has the names of the columns.
+    ``columns``: the texts of each column by its name, or by its number from 1 if the table has no header.
+    ``fields``: the guessed column of each field. ``units``: the guessed unit of each field.
+    ``reasons``: the reasons of guesses by values.
     """
 
     path: Path
@@ -111,7 +115,7 @@ class Guess:
         return self.path.name
 
     def numbers(self, name: str) -> Array | None:
-        """The numbers (N,) of a column, NaN where it is empty; None if it has other texts, or none."""
+        """Return the numbers (N,) of a column, NaN where it is empty. Returns None if a text is no number, or all are empty."""
         texts = self.columns[name]
         with suppress(ValueError):
             values = np.array([float(t.replace(self.decimal, ".")) if t else np.nan for t in texts])
@@ -119,12 +123,12 @@ class Guess:
         return None
 
     def values(self, name: str) -> Array:
-        """The numbers (N,) of a field."""
+        """Return the numbers (N,) of a field. Returns an empty array if its column is not numeric."""
         values = self.numbers(self.fields[name])
         return np.empty(0) if values is None else values
 
     def times(self) -> Array:
-        """The timestamps (N,) in seconds; empty without any."""
+        """Return the timestamps (N,) [s]. Returns an empty array if the table has no times."""
         unit = self.units.get("t")
         if unit == "iso":
             return np.array([iso_nanoseconds(text) / 1e9 for text in self.columns[self.fields["t"]]])
@@ -132,15 +136,15 @@ class Guess:
 
     @property
     def is_tum(self) -> bool:
-        """Whether the table is a TUM file."""
+        """True if the table is a trajectory in TUM format."""
         return not self.header and self.separator == " " and self.has("qw") and self.units.get("t") == "s"
 
     def has(self, *names: str) -> bool:
-        """Whether the table has all these fields."""
+        """True if the table has all these fields."""
         return all(name in self.fields for name in names)
 
     def mapping(self, names: Sequence[str]) -> dict[str, Any]:
-        """The keys of a manifest that map the fields ``names``, as far as the table has them."""
+        """Return the settings that describe the table in a manifest, with those of the fields ``names`` that the table has."""
         out: dict[str, Any] = {"file": self.name}
         if self.is_tum:
             return out | {"format": "tum"}
@@ -154,17 +158,20 @@ class Guess:
 
 
 def plain(name: str) -> str:
-    """A name in lower case, without separators."""
+    """Return a name in lower case, without spaces, underscores, hyphens and dots."""
     return re.sub(r"[\s_\-.]", "", name).lower()
 
 
 def rank(name: str, known: Sequence[str]) -> int | None:
-    """The index of a plain name in ``known``, with its unit or without; None if it is unknown."""
+    """Return the index of ``name`` in ``known``, also without a unit at its end. Returns None if the name is unknown.
+
+    ``name`` is in lower case and without separators, see :func:`plain`.
+    """
     return next((known.index(text) for text in (name, UNIT.sub("", name)) if text in known), None)
 
 
 def guess(path: Path) -> Guess | None:
-    """The fields and units of a table; None if the file is no table of at least two rows and columns."""
+    """Guess the fields and units of a table. Returns None if the file is not a table of at least two rows and two columns."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     for separator in SEPARATORS:
@@ -189,7 +196,7 @@ def guess(path: Path) -> Guess | None:
 
 
 def _is_value(text: str) -> bool:
-    """Whether a text is a number or a time, and so no name of a column."""
+    """True if a text is a number or a time, and therefore not the name of a column."""
     return bool(re.match(r"[-+]?[\d.,]+(e[-+]?\d+)?$", text, re.IGNORECASE)) or _is_time(text)
 
 
@@ -200,7 +207,7 @@ def _is_time(text: str) -> bool:
 
 
 def _filled(out: Guess) -> Guess:
-    """The table with its fields and units."""
+    """Add the guessed fields and units to a table, and return the table."""
     _add_time(out)
     if not out.header:
         _add_tum(out)
@@ -219,14 +226,14 @@ def _filled(out: Guess) -> Guess:
     for name, texts in out.columns.items():
         if "epc" not in out.fields and name not in taken and all(EPC.match(text) for text in texts[:LOOKED_AT]):
             out.fields["epc"] = name
-            out.reasons.append(f"{quoted(name)} has hexadecimal numbers as EPCs have")
+            out.reasons.append(f"{quoted(name)} is used as the EPC: it has hexadecimal numbers")
     _add_wheels(out)
     _add_units(out)
     return out
 
 
 def _split(name: str) -> tuple[str, str]:
-    """The name of a column without its unit, and the unit in lower case, or ""."""
+    """Split the name of a column into the name without its unit, and the unit in lower case. The unit is "" if there is none."""
     if bracket := BRACKETS.search(name):
         return name[: bracket.start()], bracket[1].lower()
     words = WORDS.findall(name)
@@ -236,7 +243,10 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _add_time(out: Guess) -> None:
-    """The column of the time: named so, with times or numbers that hardly ever fall; without header the first one."""
+    """Guess the column of the time and its unit.
+
+    Columns with a name of times are tried first, then the first column. The values must be times, or numbers that hardly ever fall.
+    """
     names = list(out.columns)
     named = [name for name in names if TIME.match(plain(_split(name)[0]))] if out.header else names[:1]
     for name in [*named, *names[:1]]:
@@ -261,7 +271,7 @@ def _add_time(out: Guess) -> None:
 
 
 def _unit_of_times(values: Array) -> str:
-    """The unit of timestamps, by their size since 1970, or by the steps of a clock that begins with the log."""
+    """Return the unit of timestamps: by their size if they count from 1970, else by the median step between them."""
     if (unit := unit_since_1970(float(values[0]))) is not None:
         return unit
     step = float(np.median(np.diff(np.unique(values))))
@@ -270,7 +280,7 @@ def _unit_of_times(values: Array) -> str:
 
 
 def _add_tum(out: Guess) -> None:
-    """The eight columns of a TUM file: time, position, and a quaternion of length 1."""
+    """Add the fields of a TUM file, if the table has its eight columns: time, position, and a quaternion of length 1."""
     names = list(out.columns)
     values = [out.numbers(name) for name in names]
     if len(names) != 8 or any(v is None for v in values):
@@ -281,7 +291,7 @@ def _add_tum(out: Guess) -> None:
 
 
 def _add_wheels(out: Guess) -> None:
-    """The columns of two or four wheels: their speeds, rates, angles or distances, or counters, which are whole numbers."""
+    """Add the fields of two or four wheels, if the table has them: their speeds, rates, angles, distances or encoder counts."""
     words = {name: [word.lower() for word in WORDS.findall(name)] for name in out.columns}
     sides = {
         side: [
@@ -323,7 +333,7 @@ def _add_wheels(out: Guess) -> None:
 
 
 def _add_units(out: Guess) -> None:
-    """Units that values show: angles above a turn, and speeds and positions that no robot has in metres."""
+    """Add units that follow from the size of values, such as degrees for large angles and millimetres for large positions."""
     for name, sizes in LARGER.items():
         size = np.nanmax(np.abs(out.values(name)), initial=0.0) if out.has(name) else 0.0
         if size > 0.0 and name not in out.units:

@@ -1,4 +1,7 @@
-"""Motion between odometry poses or encoder counts, which may be reset during a log; radius and track of wheels."""
+"""Computes the motion between odometry poses, or from encoder counts or speeds of wheels.
+
+Odometry may be reset during a log. The sizes of wheels come from the manifest or the rig.
+"""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -16,34 +19,38 @@ from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array, Integers
 
-# m/s and rad/s: minimum rate of a jump, and its minimum ratio to the largest rate before
+# a jump is FASTER times as fast as all motion before; slower motion than SPEED [m/s] and TURN [rad/s] counts as if it had that rate
 SPEED, TURN, FASTER = 1.0, 2.0, 3.0
-RESET_DISTANCE, ZERO = 0.05, 1e-6  # m: from the origin after a reset of odometry; and tolerance of zeros
+RESET_DISTANCE, ZERO = (
+    0.05,
+    1e-6,
+)  # m: maximum distance from the origin after a reset; magnitude below which a value is zero
 HOLD_TIME = 1.0  # s for which the previous motion is continued across a reset
-COUNTERS = (2**8, 2**16, 2**32)  # ranges of encoders that wrap to 0
-TURNS = ("left_angle", "left_rate")  # columns with angles of wheels, which need a radius
+COUNTERS = (2**8, 2**16, 2**32)  # numbers of counts after which encoders wrap to 0
+TURNS = ("left_angle", "left_rate")  # columns with angles or angular rates of wheels, which need a radius
 WHEELS = ("left", "left_speed", *TURNS)
-UNEVEN = 0.1  # minimum ratio of the sideways motion of wheels without rollers to their motion ahead that is doubtful
+UNEVEN = 0.1  # ratio of sideways to total motion of wheels above which a warning asks whether they are mecanum wheels
 
 
 class WheelSizes(FileModel):
-    """The sizes of a drive with two or four wheels. Those of the rig ([odometry.wheels]) have precedence."""
+    """The sizes of a drive with two or four wheels. Sizes in the rig ([odometry.wheels]) have precedence over these settings."""
 
     track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
     """distance between the left and the right wheels"""
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
-    """radius of the wheels, if their angles are given"""
+    """radius of the wheels, needed if their angles or angular rates are given"""
     base: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")] | None = None
-    """distance between the axles of four mecanum wheels; without it, four wheels have no rollers"""
+    """distance between the axles of four mecanum wheels; without it, four wheels are ordinary wheels"""
 
     def has_sizes(self) -> bool:
-        """Whether any size is given."""
+        """True if any size is given."""
         return any(size is not None for size in (self.track, self.radius, self.base))
 
     def metres(self, source: object, what: str, *, turns: bool) -> float:
-        """Metres per unit. ``turns``: whether angles of wheels are given.
+        """Return the distance on the ground per unit of a wheel's value: the radius for angles, 1 for distances.
 
-        InputError if a size is missing that ``what`` needs.
+        ``turns``: True if the values are angles or angular rates. ``source``, ``what``: the file and the setting to name in errors.
+        Raises InputError if a needed size is missing.
         """
         if self.track is None or (turns and self.radius is None):
             lacking = "track" if self.track is None else "radius"
@@ -51,10 +58,11 @@ class WheelSizes(FileModel):
         return self.radius if turns and self.radius else 1.0
 
     def twists(self, source: object, wheels: Array, warnings: list[Notice]) -> Array:
-        """The motion (N, 3) ahead, to the left and about the vertical from the motion (N, 2 or 4) of the wheels: left and right,
-        and those behind.
+        """Return the motion (N, 3) of the robot ahead [m], to the left [m] and about the vertical [rad].
 
-        Mecanum wheels: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot", 2015, eq. 22 to 24.
+        ``wheels`` (N, 2 or 4): the distances [m] of the left and the right wheel, and of the rear left and the rear right wheel.
+        Speeds [m/s] of the wheels give rates. Mecanum wheels: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum
+        wheeled mobile robot", 2015, eq. 22 to 24.
         """
         assert self.track is not None
         left, right, rear_left, rear_right = (wheels if wheels.shape[1] == 4 else np.hstack((wheels, wheels))).T
@@ -71,15 +79,16 @@ class WheelSizes(FileModel):
 
 
 def wheels_of(left: str, count: int) -> tuple[str, ...]:
-    """The names of two or four wheels, by that of the left one."""
+    """Return the names of the columns of two or four wheels. ``left``: the column of the (front) left wheel."""
     pair = (left, left.replace("left", "right"))
     return pair if count == 2 else (*pair, *(f"rear_{name}" for name in pair))
 
 
 def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[Notice]) -> Array:
-    """The motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
+    """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
-    At a reset (a jump to the origin faster than any motion before, or zeros after a pause) the previous motion is continued.
+    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause. At a reset, the
+    previous motion is continued, with a warning.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -94,13 +103,16 @@ def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[N
 
 
 def after_rest(moves: Array) -> Array:
-    """Motions (N - 1, 3) as increments (N, 3): the first row only defines the start."""
+    """Return motions (N - 1, 3) as increments (N, 3). The first row has no motion and only defines the start."""
     return np.vstack((np.zeros((1, 3)), moves))
 
 
 def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[Notice]) -> Array:
-    """The motions (N - 1, W) from the distances (N, W) [m] of wheels at N timestamps [ns]; ``scales`` (W,): metres per encoder
-    tick. Wrapping of encoders is handled; resets are treated as for poses."""
+    """Return the motions (N - 1, W) [m] of W wheels between N timestamps [ns].
+
+    ``distances`` (N, W): the distances of the wheels [m]. ``scales`` (W,): metres per encoder count. Encoders that wrap to 0 are
+    continued. At a reset, a fast jump to zero, the previous motion is continued, with a warning.
+    """
     steps = np.stack([wheel_steps(distances[:, i], float(scale)) for i, scale in enumerate(scales)], axis=-1)
     durations = _durations(t_ns)
     speeds = np.abs(steps).max(axis=1, initial=0.0) / durations
@@ -113,13 +125,18 @@ def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array
 def between_wheels(
     source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[Notice]
 ) -> Array:
-    """The motions (N - 1, 3) of a drive with ``sizes``; for the other arguments see :func:`between_ways`."""
+    """Return the motions (N - 1, 3) of a robot from the distances of its wheels. ``sizes``: the sizes of the drive.
+
+    The other arguments are those of :func:`between_ways`.
+    """
     return se2.exp(sizes.twists(source, between_ways(source, t_ns, distances, scales, warnings), warnings))
 
 
 def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[Notice]) -> Array:
-    """Speed and turn rate (N, 2) from the speeds (N, 2 or 4) of wheels; for mecanum wheels increments (N, 3), as each speed holds
-    until the next row."""
+    """Return the speed [m/s] and the turn rate [rad/s] (N, 2) of a robot from the speeds (N, 2 or 4) [m/s] of its wheels.
+
+    For mecanum wheels it returns increments (N, 3) instead. Each speed is assumed constant until the next timestamp.
+    """
     twists = sizes.twists(source, speeds, warnings)
     if sizes.base is None:
         return twists[:, [0, 2]]
@@ -127,22 +144,22 @@ def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, 
 
 
 def odometry_stream(t_ns: Integers, values: Array, t0_ns: int) -> IncrementStream | VelocityStream:
-    """The stream of velocities (N, 2), or of increments (N, 3), at N timestamps [ns]."""
+    """Return the odometry stream of ``values``: velocities (N, 2) or increments (N, 3), at N timestamps [ns]."""
     t = checks.seconds(t_ns, t0_ns)
     return IncrementStream(t, *values.T) if values.shape[1] == 3 else VelocityStream(t, *np.ascontiguousarray(values.T))
 
 
 def wheel_steps(distances: Array, scale: float) -> Array:
-    """Steps (N - 1,) between the distances (N,) of one wheel, with ``scale`` per tick; counters that wrap are continued.
+    """Return the steps (N - 1,) between the distances (N,) of one wheel. ``scale``: distance per encoder count.
 
-    Less than half of a counter's range is assumed between rows.
+    Counters that wrap are continued. Between rows, a wheel is assumed to move less than half of the counter's range.
     """
     steps: Array = np.diff(distances)
     ticks = distances / scale
     if not np.allclose(ticks, np.rint(ticks), atol=1e-3):
         return steps
     size = next((size for size in COUNTERS if ticks.min() >= -(size // 2) and ticks.max() < size), None)
-    # the range of a counter that never wraps is unknown and irrelevant
+    # the counter has no known range, or it never wraps
     if size is None or np.abs(steps).max(initial=0.0) <= 0.5 * size * abs(scale):
         return steps
     whole = size * scale
@@ -150,12 +167,12 @@ def wheel_steps(distances: Array, scale: float) -> Array:
 
 
 def _durations(t_ns: Integers) -> Array:
-    """Durations (N - 1,) [s] between N timestamps, at least a millisecond, as timestamps may repeat."""
+    """Return the durations (N - 1,) [s] between N timestamps. Each is at least a millisecond, because timestamps may repeat."""
     return np.asarray(np.maximum(np.diff(t_ns), 1_000_000) / 1e9)
 
 
 def _largest_before(rates: Array, least: float) -> Array:
-    """The largest (N,) of all rates (N,) before each without jumps, at least ``least``."""
+    """Return, for each of the ``rates`` (N,), the largest rate before it that is not a jump, but at least ``least``."""
     out, most = np.empty(len(rates)), least
     for i, rate in enumerate(rates.tolist()):
         out[i] = most
@@ -165,7 +182,10 @@ def _largest_before(rates: Array, least: float) -> Array:
 
 
 def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
-    """Steps (N - 1, D), with the previous one continued at each reset; ``resets``: their indices."""
+    """Return the ``steps`` (N - 1, D), where the step at each reset is replaced by the previous motion. Adds a warning.
+
+    ``resets``: the indices of the steps with a reset.
+    """
     durations = _durations(t_ns)
     for i in resets.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])
@@ -179,7 +199,7 @@ def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, w
 
 
 def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The options of a reader, with radius and track of the rig if they have wheels and the rig has these sizes."""
+    """Return the options of a reader. If they describe wheels, the radius and track of the rig replace those in the options."""
     drive = None if rig is None else rig.of(OdometrySettings).wheels
     odometry = options.get("odometry")
     if drive is None or not isinstance(odometry, Mapping):
@@ -193,7 +213,7 @@ def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, 
 
 
 def with_wheels_in(rig: Rig, options: Mapping[str, Any]) -> Rig:
-    """The rig, with the two wheels of the options if it has none and they are valid."""
+    """Return the rig. If it has no wheels, it gets the radius and track of two wheels from the options of the reader."""
     odometry = options.get("odometry")
     settings = rig.of(OdometrySettings)
     if settings.wheels is not None or not isinstance(odometry, Mapping):

@@ -1,4 +1,4 @@
-"""Proposed manifests, with remarks on what they assume."""
+"""Writes proposed manifests (descriptions of logs) as TOML, with remarks on their assumptions."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -20,8 +20,11 @@ COMPANIONS = {
 
 @dataclass(frozen=True)
 class Proposal:
-    """A proposed manifest: its ``content``, and its ``text`` as TOML with ``remarks`` as comments. Its paths are relative to
-    ``folder``."""
+    """A proposed manifest.
+
+    ``content``: its keys and values. ``text``: the manifest as TOML, with ``remarks`` as comments. ``folder``: the folder in which
+    to save it; paths in the manifest are relative to this folder.
+    """
 
     content: Mapping[str, Any]
     remarks: tuple[str, ...]
@@ -32,10 +35,11 @@ class Proposal:
 def proposal_of(
     reader: str, path: Path, folder: Path, options: Mapping[str, Any], remarks: Sequence[str], *, with_map: bool = True
 ) -> Proposal:
-    """The manifest of a log at ``path`` with the ``options`` of a reader, in ``folder`` if the log is below it, else in its parent.
+    """Return the manifest of the log at ``path`` with the ``options`` of a reader.
 
-    Rig and map are files in the parent folder: those that begin with the log's name, or the only ones. Without ``with_map``, the
-    options have the map.
+    It is to be saved in ``folder`` if the log is below ``folder``, else in the folder that contains the log. Rig and map are files
+    beside the log: those with the log's name, or the only ones. If ``with_map`` is false, no map is missed, because the options
+    describe the map.
     """
     root = folder if path.is_relative_to(folder) else path.parent
     kind = "bag" if reader == "rosbag" else "folder"
@@ -57,7 +61,10 @@ def proposal_of(
 
 
 def toml_of(content: Mapping[str, Any], name: str = "") -> str:
-    """Settings as TOML, or as the table ``name``: values, then tables, whose own tables are in braces."""
+    """Return settings as TOML: first the values, then the tables. Tables within these tables are written in braces.
+
+    With a ``name``, the settings are written as the table of that name.
+    """
     content = {each: settings for key, value in content.items() for each, settings in _sensors(key, value).items()}
     tables = {key: value for key, value in content.items() if isinstance(value, dict)}
     values = [_line(key, value) for key, value in content.items() if key not in tables]
@@ -69,14 +76,18 @@ def toml_of(content: Mapping[str, Any], name: str = "") -> str:
 
 
 def _sensors(key: str, value: Any) -> dict[str, Any]:
-    """The tables of several sensors of a kind, each by its key; any other value by its own."""
+    """Return the settings of each sensor, if ``value`` describes several sensors of the kind ``key``, else ``value`` by its key."""
     if key in several() and all(isinstance(settings, dict) for settings in value.values()):
         return by_name(key, value)
     return {key: value}
 
 
 def distinct(names: Sequence[str]) -> list[str]:
-    """Short names of several sensors: the words in the ``names`` of their topics or files that not all have."""
+    """Return short distinct names of several sensors.
+
+    A short name has those words of a topic or file in ``names`` that are not common to all. If that is ambiguous, sensors are
+    numbered.
+    """
     words = [re.findall(r"[^\W_]+", name) for name in names]
     common = set.intersection(*map(set, words))
     short = ["_".join(word for word in own if word not in common) for own in words]

@@ -1,4 +1,4 @@
-"""The files of a stored run, see :func:`~factorgraph_loc.experiments.output.write_run`: their names, and their one reader."""
+"""Reads the files of a stored run, which :func:`~factorgraph_loc.experiments.output.write_run` writes, and defines their names."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,27 +17,30 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.text import error_text
 from factors.se2 import Array
 
-INDEX = "results.parquet"  # of several runs
+INDEX = "results.parquet"  # the table of all runs of an experiment
 ESTIMATES, INNOVATIONS, EVENTS = "estimates.parquet", "innovations.parquet", "events.csv"
 STAMP = "t_ns"
 ERRORS = ("error_position", "error_heading", "nees")
 NUMBERS = ("x", "y", "heading", *COVARIANCES, *ERRORS)
 COLUMNS = {STAMP: pl.Int64, "kind": pl.String, "status": pl.String, **dict.fromkeys(NUMBERS, pl.Float64)}
 FINAL, CAUSAL, LEARNT, CONFIG, METRICS = "final.tum", "causal.tum", "learnt.json", "config.toml", "metrics.json"
-FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)  # the last one is written last
+FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)  # METRICS is written last
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Estimates of one kind: their ``trajectory`` (N poses), and by the names in :data:`ERRORS` the errors (N,) [m], [rad] and the
-    NEES, NaN where unknown."""
+    """The estimates of one kind, causal or final, from a stored run.
+
+    ``trajectory``: N estimated poses. ``errors``: by the names in :data:`ERRORS`, the errors of position (N,) [m] and heading (N,)
+    [rad], and the normalised estimation error squared (N,). An unknown error is NaN.
+    """
 
     trajectory: Trajectory
     errors: dict[str, Array]
 
     @classmethod
     def of(cls, table: pl.DataFrame, t0_ns: int) -> "Estimates":
-        """The rows of an ``estimates.parquet``, in seconds after ``t0_ns``."""
+        """Return the estimates in the rows of ``estimates.parquet``, with times in seconds after ``t0_ns`` [ns]."""
         numbers = {name: table[name].fill_null(np.nan).to_numpy() for name in NUMBERS}
         covariances = symmetric([numbers[name] for name in COVARIANCES])
         t = (table[STAMP].to_numpy() - t0_ns) / 1e9
@@ -45,27 +48,32 @@ class Estimates:
         return cls(Trajectory(t, poses, covariances), {name: numbers[name] for name in ERRORS})
 
     def rows(self, which: NDArray[np.bool_]) -> "Estimates":
-        """The estimates at ``which`` (N,)."""
+        """Return the estimates where the mask ``which`` (N,) is True."""
         return Estimates(self.trajectory.rows(which), {name: values[which] for name, values in self.errors.items()})
 
 
 @dataclass(frozen=True)
 class ResultFiles:
-    """The files of a run. ``read`` returns the content of a file by its name; ``folder``: named in errors. Times are in seconds
-    after ``t0_ns``, by default after the first estimate. InputError names a damaged file."""
+    """The files of a stored run.
+
+    ``read``: a function that returns the content of a file by its name.
+    ``t0_ns``: the absolute time of t = 0 [ns]. If None, estimates begin at t = 0; events and innovations have absolute times.
+    ``folder``: the folder to name in errors.
+    Methods raise InputError if a file is damaged.
+    """
 
     read: Callable[[str], bytes]
     t0_ns: int | None = None
     folder: Path = Path()
 
     def estimates(self) -> dict[str, Estimates]:
-        """The estimates of each of :data:`KINDS`: the causal ones from the first localized one on, and the final ones."""
+        """Return the estimates of each of :data:`KINDS`. Causal estimates begin with the first one that is localized."""
         source = self.folder / ESTIMATES
         table = parse_parquet(self.read(ESTIMATES), source, list(COLUMNS))
         with foreign(source, "is no table of estimates"):
             table = table.cast(COLUMNS)  # type: ignore[arg-type]
         if not table[STAMP].is_between(-LATEST, LATEST).fill_null(value=False).all():
-            raise InputError(f"{source}: {STAMP} has a row without a stamp, or with one beyond {LATEST:.1e} ns")
+            raise InputError(f"{source}: a row has no timestamp in {STAMP}, or one beyond {LATEST:.1e} ns")
         t0_ns = table[STAMP].min() if self.t0_ns is None else self.t0_ns
         by_kind = {kind: table.filter(pl.col("kind") == kind) for kind in KINDS}
         localized = (by_kind["causal"]["status"] == "localized").arg_true()
@@ -77,20 +85,18 @@ class ResultFiles:
             raise InputError(f"{source}: holds no trajectory: {error_text(error)}") from error
 
     def innovations(self) -> dict[str, Array]:
-        """By sensor: rows (K, 3) of time, normalised innovation squared and degrees of freedom."""
+        """Return the innovations of each sensor: rows (K, 3) of time [s], normalised innovation squared and degrees of freedom."""
         table = parse_parquet(self.read(INNOVATIONS), self.folder / INNOVATIONS)
         table = table.select("sensor", (pl.col(STAMP) - (self.t0_ns or 0)) / 1e9, "nis", "dof")
         groups = table.group_by("sensor", maintain_order=True)
         return {str(sensor): rows.drop("sensor").to_numpy() for (sensor,), rows in groups}
 
     def events(self) -> tuple[tuple[float, str], ...]:
-        """Time and text of the events."""
+        """Return the time [s] and the text of each event."""
         source = self.folder / EVENTS
         with foreign(source, "is no table of events"):
             table = pl.read_csv(self.read(EVENTS), schema_overrides={STAMP: pl.Int64, "event": pl.String})
             table = table.select(STAMP, "event")
         if table.null_count().sum_horizontal().item() or not table[STAMP].is_between(-LATEST, LATEST).all():
-            raise InputError(
-                f"{source}: has a row that lacks its stamp or its event, or a stamp beyond {LATEST:.1e} ns"
-            )
+            raise InputError(f"{source}: a row has no timestamp or no event, or a timestamp beyond {LATEST:.1e} ns")
         return tuple(((t_ns - (self.t0_ns or 0)) / 1e9, text) for t_ns, text in table.iter_rows())

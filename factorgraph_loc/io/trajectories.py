@@ -1,7 +1,7 @@
-"""Trajectories by name, from files of poses, topics of bags, results of runs, or references of logs, and their export.
+"""Reads trajectories from files of poses, topics of bags, results of runs, or references of logs, and writes trajectories.
 
-Conversion to and from those of evo (https://github.com/MichaelGrupp/evo) and ROS messages. Both libraries are imported only by
-these functions.
+Also converts trajectories to and from those of evo (https://github.com/MichaelGrupp/evo) and messages of ROS. The libraries evo
+and rosbags are imported only when these functions are called.
 """
 
 from collections.abc import Iterable
@@ -27,16 +27,20 @@ from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 
-TOPIC = ":"  # between a bag and a topic
+TOPIC = ":"  # separates a bag and a topic
 LOG = ".toml"
 MESSAGES = "PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped or PointStamped"
 
 
 def read_trajectory(source: str | Path) -> PosePath:
-    """The trajectory that ``source`` names.
+    """Return the trajectory that ``source`` names. ``source`` is one of:
 
-    A file in TUM, KITTI or EuRoC format, according to its first row; ``BAG:TOPIC`` or ``BAG:/tf:PARENT.CHILD``; the final
-    trajectory in the folder of a run; or the reference of a log. InputError describes the problem in one line.
+    - a file in TUM, KITTI or EuRoC format, recognized by its first row
+    - a topic of a bag, as ``BAG:TOPIC`` or ``BAG:/tf:PARENT.CHILD``
+    - the folder of a run, for its final trajectory
+    - a log, for its reference
+
+    Raises InputError with a message of one line.
     """
     path, text = Path(source), str(source)
     if (bag := _in_bag(text)) is not None:
@@ -46,12 +50,12 @@ def read_trajectory(source: str | Path) -> PosePath:
     if (path / FINAL).is_file():
         return replace(read_pose_file(path / FINAL), name=text)
     if path.is_dir() and (runs := sorted(path.glob(f"runs/*/*/seed*/{FINAL}"))):
-        raise InputError(f"{path}: holds {len(runs)} runs, expected the folder of one, such as {runs[0].parent}")
+        raise InputError(f"{path}: contains {len(runs)} runs, expected the folder of one run, such as {runs[0].parent}")
     return _reference(text)
 
 
 def _in_bag(text: str) -> tuple[Path, str] | None:
-    """The bag and the topic that ``text`` names, the topic empty where it is left out; None if it names no bag."""
+    """Split ``text`` into the bag and the topic that it names. The topic is "" if it is left out. Returns None without a bag."""
     parts = text.split(TOPIC)
     for i in range(len(parts), 0, -1):
         path = Path(TOPIC.join(parts[:i]))
@@ -68,11 +72,11 @@ def _reference(log: str) -> PosePath:
 
 
 def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
-    """Write a trajectory in TUM format, or in KITTI format if the name ends with .kitti; return the files. ``t0_ns``: time zero of
-    a planar one.
+    """Write a trajectory in TUM format, or in KITTI format if ``path`` ends with .kitti. Returns the written files.
 
-    In KITTI format times [s], of a planar trajectory from the log's start, go to ``NAME.times.txt``. Poses are of the robot's frame
-    (x forward, z up), not of a camera, and not relative to the first one.
+    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. In KITTI format, times [s] are written to ``NAME.times.txt``;
+    those of a planar trajectory are relative to its t = 0. Poses in KITTI format are those of the robot (x forward, z up), not of a
+    camera, and not relative to the first pose.
     """
     path = Path(path)
     if path.suffix != ".kitti":
@@ -89,8 +93,10 @@ def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns:
 
 
 def to_evo(trajectory: Trajectory | PosePath, t0_ns: int = 0) -> Any:
-    """A trajectory as evo's ``PoseTrajectory3D``. ``t0_ns``: time zero of a planar one. InputError if evo is not installed, or a
-    pose is not finite."""
+    """Return a trajectory as evo's ``PoseTrajectory3D``. ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory.
+
+    Raises InputError if evo is not installed, or if a pose is not finite.
+    """
     try:
         from evo.core.trajectory import PoseTrajectory3D  # type: ignore[import-untyped] # noqa: PLC0415
     except ImportError as error:
@@ -100,7 +106,10 @@ def to_evo(trajectory: Trajectory | PosePath, t0_ns: int = 0) -> Any:
 
 
 def from_evo(trajectory: Any) -> PosePath:
-    """The poses of a trajectory of evo, which has no times if it is a ``PosePath3D``. InputError if it is no trajectory."""
+    """Return the poses of a trajectory of evo. A ``PosePath3D`` gives poses without times.
+
+    Raises InputError if ``trajectory`` is not a trajectory of evo.
+    """
     try:
         turns = np.roll(np.asarray(trajectory.orientations_quat_wxyz, dtype=float), -1, axis=1)
         table = np.column_stack((trajectory.positions_xyz, turns))
@@ -113,8 +122,11 @@ def from_evo(trajectory: Any) -> PosePath:
 
 
 def to_ros(trajectory: Trajectory | PosePath, frame_id: str = "map", t0_ns: int = 0) -> Any:
-    """A trajectory as a ``nav_msgs/Path``: of ROS 2 where its environment is sourced, else of rosbags. ``t0_ns``: time zero of a
-    planar one. InputError if there is neither, or a pose is not finite."""
+    """Return a trajectory as a ``nav_msgs/Path`` message: of ROS 2 if its environment is sourced, else of the library rosbags.
+
+    ``frame_id``: the frame of the poses. ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. Raises InputError if
+    neither ROS 2 nor rosbags is available, or if a pose is not finite.
+    """
     make = _messages()
     path = _posed(trajectory, t0_ns)
     stamps, turns = path.stamps().tolist(), path.quaternions().tolist()
@@ -133,10 +145,11 @@ def to_ros(trajectory: Trajectory | PosePath, frame_id: str = "map", t0_ns: int 
 
 
 def from_ros(messages: Any) -> PosePath:
-    """The poses of a ``nav_msgs/Path``, or of several messages: ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``,
-    ``TransformStamped``, or ``PointStamped`` without rotations.
+    """Return the poses of a ``nav_msgs/Path`` message, or of a sequence of messages.
 
-    Messages of rclpy or rosbags, for example; their headers have the times. InputError names the invalid message.
+    Their types may be ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``, ``TransformStamped`` or ``PointStamped``, which
+    has no rotation. Messages of rclpy and of rosbags are accepted. Times are those of the headers. Raises InputError with the
+    number of an invalid message.
     """
     given: Iterable[Any] = getattr(messages, "poses", messages)
     rows, stamps, points = [], [], set()
@@ -154,14 +167,17 @@ def from_ros(messages: Any) -> PosePath:
 
 
 def _posed(trajectory: Trajectory | PosePath, t0_ns: int) -> PosePath:
-    """The poses of a trajectory. InputError if there are none, or one is not finite."""
+    """Return the poses of a trajectory. ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory.
+
+    Raises InputError if there is no pose, or if a pose is not finite.
+    """
     path = trajectory.path("the trajectory", t0_ns) if isinstance(trajectory, Trajectory) else trajectory
     require_poses(path)
     return path
 
 
 def _seven(message: Any) -> tuple[float, ...]:
-    """x, y, z and the quaternion x, y, z, w."""
+    """Return x, y, z [m] and the quaternion x, y, z, w of a message. A point has the identity quaternion."""
     if hasattr(message, "transform"):
         return seven(message.transform, "translation", "rotation")
     if hasattr(message, "point"):
@@ -170,7 +186,7 @@ def _seven(message: Any) -> tuple[float, ...]:
 
 
 def _messages() -> Any:
-    """Makes messages of ROS 2, or of rosbags, by package, type and fields."""
+    """Return a function that makes a message from its package, its type and its fields. Its types are those of ROS 2 or rosbags."""
     try:
         import nav_msgs.msg  # type: ignore[import-not-found] # noqa: F401, PLC0415
     except ImportError:
@@ -183,7 +199,10 @@ def _messages() -> Any:
 
 
 def _path(name: str, table: Array, t_ns: Any) -> PosePath:
-    """The path of rows (N, 7) with position and quaternion. InputError if one is not finite, or no unit quaternion."""
+    """Return the poses of a ``table`` (N, 7) of positions x, y, z and quaternions x, y, z, w, at the times ``t_ns`` (N,) or None.
+
+    Raises InputError if a number is not finite, or if a quaternion is not a unit quaternion.
+    """
     rows = np.arange(1, len(table) + 1)
     path = PosePath(name, table[:, :3], checked_rotations(name, rows, table), t_ns)
     require_poses(path)

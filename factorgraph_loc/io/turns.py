@@ -1,4 +1,4 @@
-"""The turns that two tables of one drive show, compared: the offset between their clocks, and the ratio of their sizes."""
+"""Compares the turns of a robot in two tables of one drive, to find their clock offset and the ratio of their units."""
 
 from dataclasses import dataclass
 
@@ -7,24 +7,24 @@ from scipy.signal import correlate
 
 from factors.se2 import Array
 
-STEP = 0.05  # s between compared turns
-WINDOW = 1.0  # s over which turns are compared
+STEP = 0.05  # s between the times at which turns are compared
+WINDOW = 1.0  # s over which a turn is measured
 ALIKE = 0.9  # minimum correlation of two tables of one drive
-DISTINCT = 2.0  # minimum ratio of what the correlation leaves unexplained at other offsets to that at the best one
-NEAR = 5.0  # s between offsets that count as one
-LONGEST = 86400.0  # s that a table may last; a longer one has a clock that was set
-OVERLAP = 0.9  # minimum share of the shorter table that is compared
+DISTINCT = 2.0  # minimum ratio of 1 - correlation at any other offset to 1 - correlation at the best offset
+NEAR = 5.0  # s by which another offset must differ from the best one
+LONGEST = 86400.0  # s that a table may last; the clock of a longer table was set meanwhile
+OVERLAP = 0.9  # minimum fraction of the shorter table that must overlap the other table
 
 
 @dataclass(frozen=True)
 class Turns:
-    """An angle ``angle`` (N,) that counts on over whole turns, at the times ``t`` (N,) [s]. Its unit may be unknown."""
+    """The turns of a robot over time. ``t`` (N,): times [s]. ``angle`` (N,): an angle without wrapping, in any unit."""
 
     t: Array
     angle: Array
 
     def each_window(self) -> Array:
-        """The change of the angle (K,) over the :data:`WINDOW` that begins at each :data:`STEP`."""
+        """Return the changes of the angle (K,) over K windows of length :data:`WINDOW`, which begin every :data:`STEP`."""
         grid = np.arange(self.t[0], self.t[-1], STEP)
         angle = np.interp(grid, self.t, self.angle)
         width = round(WINDOW / STEP)
@@ -33,7 +33,7 @@ class Turns:
 
 @dataclass(frozen=True)
 class SameTurns:
-    """Two tables that show the same turns.
+    """The comparison of two tables that show the same turns.
 
     ``offset`` [s]: the clock of the first table minus the clock of the second; None if the turns agree at several offsets.
     ``ratio``: the angle of the first table divided by the angle of the second.

@@ -57,7 +57,7 @@ def test_convert_overwrites_a_log_alone(fgloc, refused, short_log, tmp_path):
     assert not (out / "odometry.csv").exists()
     assert [path.name for path in tmp_path.glob(".*")] == []
     (out / "notes.md").write_text("mine")
-    assert "contains notes.md, not part of its log" in refused("convert", short_log, out, "--overwrite")
+    assert "contains notes.md, which overwriting would delete" in refused("convert", short_log, out, "--overwrite")
     (out / "run.toml").unlink()
     assert "expected a new one, or one with a log" in refused("convert", short_log, out, "--overwrite")
     assert (out / "notes.md").read_text() == "mine"

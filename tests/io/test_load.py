@@ -170,4 +170,4 @@ def test_files_that_are_no_logs(tmp_path, refused):
     (tmp_path / "a.csv").write_text("t,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
     refused(tmp_path / "a.csv", "is a table: describe its columns in a manifest")
     (tmp_path / "a.txt").write_text("hello\n")
-    refused(tmp_path / "a.txt", "is not a manifest (.toml); name the reader of this format")
+    refused(tmp_path / "a.txt", "is not a manifest (.toml): name the reader of its format")

@@ -222,8 +222,7 @@ def test_names_of_the_map_and_the_map_are_tables_of_the_folder(hall, one):
     assert list(seen.landmark) == ["A", "B"]
     np.testing.assert_array_equal(seen.range, (2.5, 1.5))
     assert any(
-        "seen.csv: 2 rows have a landmark that is not among the names taken from codes.csv" in str(told)
-        for told in log.warnings
+        "seen.csv: 2 rows are skipped: their landmark is not listed in codes.csv" in str(told) for told in log.warnings
     )
     assert (log.world.name, list(log.world.landmarks)) == ("yard", ["A", "B"])
     for name, expected in {"A": (1.0, 2.0, 0.002), "B": (-0.5, 0.0, 0.004)}.items():
@@ -235,7 +234,11 @@ def test_names_of_the_map_and_the_map_are_tables_of_the_folder(hall, one):
     ("file", "text", "fragments"),
     [
         ("codes.csv", "code,post,moves\n63,A,no\n63,B,no\n", ("codes.csv:3: code is '63'", "each name once")),
-        ("codes.csv", "code,post,moves\n7,A,no\n", ("seen.csv: no row has a landmark", "codes.csv names, such as 7")),
+        (
+            "codes.csv",
+            "code,post,moves\n7,A,no\n",
+            ("seen.csv: no row has a landmark", "listed in codes.csv, such as 7"),
+        ),
         ("posts.csv", "post,x,y,sx,sy\nA,1,2,1,1\nA,1,2,1,1\n", ("posts.csv:3: landmark is 'A'", "than in row 2")),
     ],
 )

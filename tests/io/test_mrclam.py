@@ -32,16 +32,17 @@ def test_what_is_read(mrclam, read):
     assert log.world.landmarks["6"].sigma == 0.0002
     np.testing.assert_array_equal(log.reference.t, (-0.056, 0.044))
     left_out, no_rig = map(str, log.warnings)
-    assert (
-        "Robot1_Measurement.dat: 2 rows have a landmark that is not among the names taken from Barcodes.dat: skipped"
-        in left_out
-    )
+    assert "Robot1_Measurement.dat: 2 rows are skipped: their landmark is not listed in Barcodes.dat" in left_out
     assert "no rig is given" in no_rig
 
 
 BAD = {
     "too late": ("Robot1_Measurement.dat", "2.0 63 1 0\n1.4 63 1 0\n", ":2: time", "at most 0.5 s older"),
-    "half a barcode": ("Robot1_Measurement.dat", "2.0 63.5 1 0\n", "no row has a landmark that Barcodes.dat names"),
+    "half a barcode": (
+        "Robot1_Measurement.dat",
+        "2.0 63.5 1 0\n",
+        "no row has a landmark that is listed in Barcodes.dat",
+    ),
     "barcode twice": ("Barcodes.dat", "6 63\n7 63\n", "Barcodes.dat:2: 2 is '63'", "once"),
     "landmark twice": ("Landmark_Groundtruth.dat", "6 0 0 0 0\n6 1 1 0 0\n", ":2: landmark is '6'", "in row 1"),
 }

@@ -25,7 +25,7 @@ def test_what_is_read(bag, read):
     np.testing.assert_allclose(reads.phase, (np.pi / 2, np.pi, 0.0))
     assert reads.rssi.tolist() == [-60.5, -61.0, -50.0]
     assert np.isnan(reads.frequency).all()
-    assert log.metadata["clock"].endswith("(median): /odom 0.005 s, /rfid 0.020 s, /truth 0.007 s")
+    assert log.metadata["clock"].endswith("header's timestamp: /odom 0.005 s, /rfid 0.020 s, /truth 0.007 s")
 
 
 def test_messages_as_rounds_tell_of_antennas_that_read_nothing(mcap, read):

@@ -46,7 +46,7 @@ def test_a_type_of_ros_that_the_bag_defines_otherwise(tmp_path, bag_maker, refus
         fill(made)
     file = tmp_path / "drive" / "drive.mcap"
     file.write_bytes(file.read_bytes().replace(b"Quaternion orientation", b"Quaternion orientatiom"))
-    refuse(file, "/odom:1: nav_msgs/msg/Odometry is defined in the bag unlike in ROS", rfid=None)
+    refuse(file, "/odom:1: the definition of nav_msgs/msg/Odometry in the bag differs from that of ROS", rfid=None)
 
 
 IDL = """\

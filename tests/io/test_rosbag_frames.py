@@ -51,7 +51,10 @@ def test_odometry_from_transforms(maker, read_drive, refused):
     for changed, message in (
         ({"child": None}, "/tf: parent or child is missing: give two frames, such as map and base_link"),
         ({"child": "base_lnk"}, "there is no frame 'base_lnk': did you mean base_link?"),
-        ({"topic": "/odom"}, "/odom: odometry.parent or odometry.child is given, but this is nav_msgs/msg/Odometry"),
+        (
+            {"topic": "/odom"},
+            "/odom: odometry.parent or odometry.child is given, but the type is nav_msgs/msg/Odometry",
+        ),
     ):
         refused(maker.path, message, reader="rosbag", options={"odometry": options | changed})
 
@@ -80,5 +83,5 @@ def test_what_is_measured_comes_before_frames(maker, read_drive):
     assert found.options == {"odometry": {"topic": "/odom"}, "reference": {"topic": "/mocap/pose"}}
     assert found.remarks == [
         "odometry could also be /tf",
-        "/tf has the frames axle in odom, odom in vicon: parent and child of [options.reference] would use two",
+        "/tf has the frames axle in odom, odom in vicon: to use one as the reference, set parent and child in [options.reference]",
     ]

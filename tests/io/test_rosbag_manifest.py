@@ -56,7 +56,7 @@ def test_odometry_without_poses_is_read_by_its_velocities(proposal, tmp_path):
 
     found, manifest, text = proposal(fill)
     assert found.options["odometry"] == {"topic": "/odom", "use": "twist"}
-    assert "# the orientations in /odom are not set: its velocities are used, not its poses\n" in text
+    assert "# the quaternions in /odom are zero: its velocities are used instead of its poses\n" in text
     del manifest["options"]["reference"]
     (tmp_path / "drive.toml").write_text(tomli_w.dumps(manifest))
     log = fgloc.read_log(tmp_path / "drive.toml")
@@ -85,7 +85,7 @@ def test_reads_by_the_names_of_fields(proposal):
     }
     assert rfid["units"] == {"phase": "deg", "stamp": "us"}
     assert "rounds" not in rfid
-    assert "no topic looks like odometry" in text
+    assert "no topic was recognised as odometry" in text
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_ranges_of_radios_by_the_names_of_fields(proposal, tmp_path):
     found, manifest, text = proposal(fill)
     fields = {"landmark": "anchor_id", "range": "distance"}
     assert found.options["bearing_range"] == {"topic": "/uwb", "fields": fields}
-    assert "# /uwb is taken for ranges [m] to landmarks of the map that anchor_id names\n" in text
+    assert "# /uwb is read as ranges [m] to landmarks of the map; anchor_id has the name of the landmark\n" in text
     (tmp_path / "drive.toml").write_text(tomli_w.dumps(manifest))
     ranges = fgloc.read_log(tmp_path / "drive.toml").streams["bearing_range"]
     assert list(ranges.landmark) == ["7"] * 3
@@ -152,7 +152,7 @@ def test_topics_of_several_sensors_of_landmarks(proposal, tmp_path):
     assert set(manifest["options"]["bearing_range"]) == {"front_fiducials", "rear_fiducials", "uwb"}
     assert '[options.bearing_range.front_fiducials]\ntopic = "/front/fiducials"' in text
     assert found.uses["/rear/fiducials"] == "bearing_range.rear_fiducials"
-    assert "are sensors of their own" in text
+    assert "are separate sensors" in text
     (tmp_path / "drive.toml").write_text(tomli_w.dumps(manifest))
     log = fgloc.read_log(tmp_path / "drive.toml")
     assert set(log.streams["bearing_range.uwb"].range) == {4.0}
@@ -169,7 +169,7 @@ def test_images_and_what_tells_of_their_camera(proposal):
 
     found, _, text = proposal(fill)
     assert found.options["camera"] == {"topic": "/front/image_raw/compressed"}
-    assert "no CameraInfo belongs to the images" in text
+    assert "the images have no CameraInfo topic" in text
 
 
 def test_what_is_proposed_of_odometry_and_a_gyro_is_used_by_a_run(proposal, tmp_path):

@@ -46,7 +46,7 @@ def test_velocities_with_and_without_a_header(maker, read_drive, one):
     bare = one(maker.path, reader="rosbag", options={"odometry": {"topic": "/cmd"}})
     assert bare.t0_ns == T0
     assert bare.streams["odometry"].v.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
-    assert "as received: /cmd" in bare.metadata["clock"]
+    assert "have the time of receipt: /cmd" in bare.metadata["clock"]
 
 
 def test_the_gyro(maker, read_drive):

@@ -85,7 +85,7 @@ def test_what_is_wrong_with_wheels(maker, refuse_drive, refused):
         (PAIR | {"track": None, "unit": "m"}, "odometry.wheels needs track [m]"),
         (PAIR | {"left": "speed"}, "wheel is 'speed', which std_msgs/msg/Float64 lacks; its fields: data"),
         (PAIR | {"right_topic": "/right"}, "has no topic '/right'"),
-        (PAIR | {"right_topic": None}, "odometry.wheels.right_topic is missing, as std_msgs/msg/Float64 has no joints"),
+        (PAIR | {"right_topic": None}, "odometry.wheels.right_topic is missing, which std_msgs/msg/Float64 needs"),
     ):
         options = {"odometry": topic | {"wheels": {k: v for k, v in wheels.items() if v is not None}}}
         refused(maker.path, message, reader="rosbag", options=options)

@@ -80,7 +80,7 @@ def test_a_topic_of_a_bag(maker):
     assert not read_trajectory(f"{maker.path}:/gnss").has_rotations
     assert len(read_trajectory(f"{maker.path}:/odom")) == COUNT
     for source, message in (
-        (f"{maker.path}", ":TOPIC, with one of its topics: /gnss, /mocap, /odom"),
+        (f"{maker.path}", ":TOPIC with one of its topics of poses: /gnss, /mocap, /odom"),
         (f"{maker.path}:/mocup", "has no topic '/mocup': did you mean /mocap?"),
     ):
         with pytest.raises(InputError, match=message):
@@ -98,7 +98,7 @@ def test_a_frame_in_a_frame(maker):
     np.testing.assert_allclose(found.positions, [(5.0, 0.1 * i, 1.4) for i in range(COUNT)], atol=1e-12)
     assert found.t_ns.tolist() == [BAG_T0 + 100 * MS * i for i in range(COUNT)]
     for frames, message in (
-        ("", "/tf holds transforms, expected two frames too: .*:/tf:map.base_link"),
+        ("", "/tf holds transforms, expected two frames as well, such as .*:/tf:map.base_link"),
         (":map.base", "no transforms connect base to map: there is no frame 'base'"),
         (":map.map", "map does not move in map"),
     ):

@@ -1,6 +1,7 @@
-"""Images in a bag, which are extracted to the user's cache folder, as a log refers to files.
+"""Images and camera descriptions of a ROS bag.
 
-Compressed images are written unchanged, others as PGM or PPM without loss.
+A log refers to images as files. The images of a bag are therefore extracted to the user's cache folder. Compressed images are
+written unchanged, other images as PGM or PPM without loss.
 """
 
 import hashlib
@@ -31,11 +32,11 @@ INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
 LOCK = ".lock"  # held while a folder of images is moved into place
 Pixels = NDArray[Any]
-# number, timestamp of the header [ns], time of receipt [ns]; file, whose name has these
+# number of a message, timestamp of its header [ns], time of receipt [ns], name of the image file
 _Row = tuple[int, int, int, str]
 
 
-# conversion of channels to red, green, blue
+# by the encoding of a raw image: type of its numbers, number of channels, conversion to grey or to red, green, blue
 ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
     "mono8": (np.uint8, 1, lambda p: p),
     "8UC1": (np.uint8, 1, lambda p: p),
@@ -57,12 +58,15 @@ class CameraTopic(TopicSettings):
     """A topic of images."""
 
     info: str | None = None
-    """topic with lens, size and frame of the camera"""
+    """topic of the CameraInfo messages: lens, image size and frame of the camera"""
 
 
 class Images:
-    """Collects the images of a topic. ``known``: whether they are in the cache folder, so that messages need not be read;
-    ``stack``: holds the temporary folder of new images."""
+    """Collects the images of a topic.
+
+    ``known`` is True if all images are in the cache folder already. The messages are not read then. ``stack`` deletes the
+    temporary folder of newly extracted images when it is closed.
+    """
 
     def __init__(self, bag: Bag, name: str, stamper: Stamper, stack: ExitStack) -> None:
         self._source = f"{bag.path} {name}"
@@ -99,10 +103,11 @@ class Images:
         self._t_ns.append(t_ns)
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> ImageStream:
-        """The images; newly extracted ones are moved to the cache folder."""
+        """Return the stream of images, with times in seconds after ``t0_ns`` [ns]. Newly extracted images are moved to the cache
+        folder."""
         if self._written is not None:
             with writing(self._folder), locked(self._folder.parent / LOCK):
-                # otherwise another process was faster, and may be using its files
+                # keep a complete folder that another process wrote meanwhile: that process may use its files
                 if not _images_in(self._folder, self._count):
                     if self._folder.exists():
                         self._folder.rename(self._written.with_name("damaged"))
@@ -113,7 +118,7 @@ class Images:
 
 
 class Info:
-    """Collects the first message that describes a camera."""
+    """Collects the first CameraInfo message of a topic: image size, lens and frame of the camera."""
 
     def __init__(self, bag: Bag, name: str) -> None:
         bag.topic(name, INFO)
@@ -134,7 +139,7 @@ class Info:
             )
         count = COUNTS[kind][-1]
         if np.any(d[count:]):
-            raise InputError(f"{self._source}:{item.row}: d has {len(d)} numbers, {kind} has {count}")
+            raise InputError(f"{self._source}:{item.row}: d has {len(d)} numbers, expected {count} for {kind}")
         self.frame = str(info.header.frame_id)
         self._content = {
             "width": int(info.width),
@@ -148,12 +153,15 @@ class Info:
         }
 
     def settings(self, mounting: dict[str, float]) -> CameraSettings:
-        """The camera at ``mounting``."""
+        """Return the settings of the camera. ``mounting``: its position x, y, z [m] and roll, pitch, yaw [rad] on the robot."""
         return parse_model(CameraSettings, self._content | mounting, self._source)
 
 
 def netpbm(image: Any, where: str) -> tuple[bytes, str]:
-    """A raw image as file content and suffix. InputError for an unsupported encoding or missing pixels."""
+    """Convert a raw image message to a Netpbm file. Returns the content and the suffix of the file.
+
+    ``where`` names the message in errors. Raises InputError if the encoding is not supported or pixels are missing.
+    """
     if image.encoding not in ENCODINGS:
         raise InputError(f"{where}: encoding is {quoted(image.encoding)}, expected one of {', '.join(ENCODINGS)}")
     kind, channels, convert = ENCODINGS[image.encoding]
@@ -161,7 +169,7 @@ def netpbm(image: Any, where: str) -> tuple[bytes, str]:
     used = width * channels * np.dtype(kind).itemsize
     data = np.asarray(image.data, dtype=np.uint8)
     if len(data) != step * height or step < used:
-        raise InputError(f"{where}: has {len(data)} bytes, expected {height} rows of {max(step, used)}")
+        raise InputError(f"{where}: has {len(data)} bytes, expected {height} rows of {max(step, used)} bytes")
     order = np.dtype(kind).newbyteorder(">" if image.is_bigendian else "<")
     packed: Pixels = np.ascontiguousarray(data.reshape(height, step)[:, :used]).view(order)
     packed = packed.reshape(height, width, channels)
@@ -172,14 +180,17 @@ def netpbm(image: Any, where: str) -> tuple[bytes, str]:
 
 
 def _key(path: Path, topic: str) -> str:
-    """A key for the images of a topic, which changes with the bag."""
+    """Return the name of the cache folder for the images of a topic. The name changes when a file of the bag changes."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     facts = [(str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     return hashlib.sha256(repr((facts, topic)).encode()).hexdigest()[:24]
 
 
 def _images_in(folder: Path, count: int) -> list[_Row]:
-    """The images in a folder; none if there are not ``count``, or the folder has other files."""
+    """Return the images in a cache folder, sorted by message number.
+
+    Returns an empty list if the folder does not have exactly ``count`` images, or has other files.
+    """
     rows = []
     try:
         for file in folder.iterdir():

@@ -1,7 +1,8 @@
-"""Access to ROS bags with the library ``rosbags``, without ROS: version 1 (``.bag``), version 2 (a folder, or its ``.mcap`` or
-``.db3``).
+"""Access to ROS bags with the library ``rosbags``, without ROS.
 
-Messages are read one by one; only the index and the current chunk of a bag are kept in memory. A bag is compressed by chunks
+A bag of version 1 is a file ``.bag``. A bag of version 2 is a folder, or a single file ``.mcap`` or ``.db3``.
+
+Messages are read one by one. Only the index and the current chunk of a bag are kept in memory. A bag is compressed by chunks
 (``.bag``, ``.mcap``), by messages, or as a whole file that is unpacked to disk (version 2). The size of unpacked content is
 limited, because a few bytes may expand to gigabytes.
 """
@@ -29,16 +30,16 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection, MessageDefinition
     from rosbags.typesys.store import Typestore
 
-SMALL, LARGE = 2**24, 2**27  # bytes of a chunk that are always unpacked, and the maximum
-FILE = 2**30  # bytes of a file that are always unpacked, if the disk has room
-CHUNK_RATIO, FILE_RATIO = 1000, 50  # maximum compression ratios beyond that
-STEP = 2**22
+SMALL, LARGE = 2**24, 2**27  # bytes: a chunk may always unpack to SMALL, and never to more than LARGE
+FILE = 2**30  # bytes to which a file may always unpack, if the disk has room
+CHUNK_RATIO, FILE_RATIO = 1000, 50  # maximum compression ratio of a chunk above SMALL, of a file above FILE
+STEP = 2**22  # bytes that are unpacked at a time
 ROS1 = ".bag"
 SUFFIXES = (ROS1, ".mcap", ".db3")
 METADATA = "metadata.yaml"  # in the folder of a version 2 bag
-NO_FILE = 2**63 - 1  # the start time of a bag without messages in rosbags
+NO_FILE = 2**63 - 1  # the start time that rosbags returns for a bag without messages
 
-# messages of rosbags, and advice
+# words in an error message of rosbags, and the cause and repair that our message adds
 HINTS = {
     "not indexed": "its recording was cut off: `rosbag reindex` repairs it",
     "index looks damaged": "it is truncated: `rosbag reindex` repairs it",
@@ -49,7 +50,7 @@ HINTS = {
 
 @cache
 def bound() -> None:
-    """Replace the decompression functions in all readers of ``rosbags`` by those below."""
+    """Replace the decompression functions in all readers of ``rosbags`` by functions that limit the unpacked size."""
     import lz4.frame  # type: ignore[import-untyped] # noqa: PLC0415 - optional libraries
     from rosbags.rosbag1 import reader as reader1  # noqa: PLC0415
     from rosbags.rosbag2 import reader as reader2  # noqa: PLC0415
@@ -65,7 +66,10 @@ def bound() -> None:
 
 
 def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
-    """Decompress ``data`` frame by frame with decompressors from ``make``; ValueError if it is too large or truncated."""
+    """Return ``data`` decompressed, frame by frame. ``make`` creates the decompressor of a frame.
+
+    Raises ValueError if the result is too large, or if ``data`` is truncated.
+    """
     limit = max(SMALL, min(LARGE, CHUNK_RATIO * len(data)))
     parts: list[bytes] = []
     count = 0
@@ -85,7 +89,10 @@ def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
 
 
 class _File:
-    """A compressed file for reading, which raises ValueError beyond its limit. ``content``: decompresses ``file``."""
+    """A file that is decompressed while it is read. Reading raises ValueError if the file unpacks to more bytes than allowed.
+
+    ``file``: the compressed file. ``content``: the decompressing stream on it.
+    """
 
     def __init__(self, content: BinaryIO, file: BinaryIO) -> None:
         self._content = content
@@ -109,7 +116,7 @@ class _File:
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its message type in ROS 2 notation (``nav_msgs/msg/Odometry``), and its number of messages."""
+    """A topic of a bag. ``type``: its message type in ROS 2 notation (``nav_msgs/msg/Odometry``). ``count``: its messages."""
 
     name: str
     type: str
@@ -118,7 +125,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Stamped:
-    """A message, its number ``row`` in its topic from 1, and its time of receipt [ns]."""
+    """A message. ``row``: its number within the topic, counted from 1. ``received``: its time of receipt [ns]."""
 
     topic: str
     row: int
@@ -127,7 +134,7 @@ class Stamped:
 
 
 class Bag:
-    """An open bag. ``topics`` by name; ``duration`` [s] from the first message to the last."""
+    """An open bag. ``topics``: its topics by name. ``duration``: time from the first message to the last [s]."""
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path = path
@@ -135,7 +142,7 @@ class Bag:
         self._stores: dict[str, Typestore] = {}
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
-            # SQLite may store bytes and numbers in text columns
+            # a text column of SQLite may contain bytes or numbers
             if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
                 raise InputError(f"{path}: the name or the type of a topic is not text")
             self._connections.setdefault(connection.topic, []).append(connection)
@@ -146,7 +153,11 @@ class Bag:
         self.duration = 0.0 if reader.start_time == NO_FILE else max(reader.end_time - 1 - reader.start_time, 0) / 1e9
 
     def topic(self, name: str, *types: str) -> Topic:
-        """A topic with messages, of one of ``types`` if any are given; InputError if the bag lacks it."""
+        """Return the topic ``name``.
+
+        Raises InputError if the bag lacks the topic, if it has no messages or messages of several types, or if its type is not
+        among ``types``. Without ``types``, any type is accepted.
+        """
         if name not in self.topics:
             raise InputError(f"{self.path}: has no topic {quoted(name)}{nearest(name, list(self.topics))}")
         topic = self.topics[name]
@@ -163,7 +174,7 @@ class Bag:
         return topic
 
     def store(self, name: str) -> Typestore:
-        """The message types of a topic, from the definitions in the bag, or those of ROS 2 if it has none."""
+        """Return the message definitions of the topic ``name``. Those of ROS 2 are used if the bag contains no definitions."""
         if name not in self._stores:
             connection = self._connections[name][0]
             definition = connection.msgdef
@@ -180,7 +191,7 @@ class Bag:
         return self._stores[name]
 
     def messages(self, topics: Sequence[str]) -> Iterator[Stamped]:
-        """The messages of ``topics`` in order of receipt."""
+        """Yield the messages of ``topics`` in order of receipt. Raises InputError if a message cannot be read."""
         if not topics:
             return
         chosen = [connection for name in topics for connection in self._connections[name]]
@@ -207,32 +218,34 @@ class Bag:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path looks like a bag."""
+    """True if the path is a ROS bag, judged by its suffix, or by a metadata.yaml in the folder."""
     return (path / METADATA).is_file() if path.is_dir() else path.suffix in SUFFIXES
 
 
 def require_metadata(folder: Path) -> None:
-    """InputError if ``folder`` has the files of a version 2 bag, but not its metadata."""
+    """Raise InputError if ``folder`` has the files of a bag of version 2, but no metadata.yaml."""
     files = sorted(file.name for file in folder.iterdir() if file.suffix in SUFFIXES[1:]) if folder.is_dir() else []
     if files and not (folder / METADATA).is_file():
-        advice = f"`ros2 bag reindex {folder}` writes it; a single file, {folder / files[0]}, can be read without"
+        advice = f"`ros2 bag reindex {folder}` writes it; a single file, {folder / files[0]}, can be read without it"
         raise InputError(f"{folder}: is a ROS 2 bag without {METADATA}: {advice}")
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open the bag at ``path``; InputError if it cannot be read, or ``rosbags`` is not installed."""
+    """Open the bag at ``path``. Raises InputError if it cannot be read, or if ``rosbags`` is not installed."""
     if not path.exists():
         raise InputError(f"{path}: does not exist")
     require_metadata(path)
     if not is_bag(path):
         expected = f"a file {', '.join(SUFFIXES)}, or a folder with {METADATA}"
         raise InputError(f"{path}: is not a ROS bag, expected {expected}")
-    # no links to the outside
+    # a link to a file outside of the folder is an InputError
     files = [inside(path, file.name, path) for file in path.iterdir()] if path.is_dir() else [path]
     for file in files:
         if not file.is_dir():
-            with opened(file, sys.maxsize):  # no FIFO, which would block, and no pointer of Git LFS
+            with opened(
+                file, sys.maxsize
+            ):  # raises InputError at a FIFO, which would block, and at a pointer of Git LFS
                 pass
     require_rosbags()
     bound()
@@ -249,7 +262,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 def require_rosbags() -> None:
-    """InputError that names the extra to install if ``rosbags`` is missing."""
+    """Raise InputError with the command that installs ``rosbags`` if the library is missing."""
     try:
         import rosbags.interfaces  # noqa: F401, PLC0415
     except ImportError as error:
@@ -258,8 +271,10 @@ def require_rosbags() -> None:
 
 @lru_cache(maxsize=64)
 def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
-    """The types of a definition. They are compiled, which takes a hundred times as long as reading a message, so they are cached
-    for all topics and bags."""
+    """Return the compiled message types of a definition.
+
+    Compilation takes a hundred times as long as reading a message. The result is therefore cached for all topics and bags.
+    """
     from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore  # noqa: PLC0415
 
@@ -280,7 +295,7 @@ def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
 
 @contextmanager
 def _bag_errors(path: Path) -> Iterator[None]:
-    """Convert exceptions of ``rosbags``, which raises nearly anything on damaged files, to InputError."""
+    """Convert exceptions inside the block to InputError. ``rosbags`` raises many types of exceptions on damaged files."""
     try:
         yield
     except InputError:

@@ -1,4 +1,7 @@
-"""A proposed manifest for a bag: the sensor of each topic, by message types and common names."""
+"""Proposes a manifest, the description of a log, for a ROS bag: which topic is which sensor.
+
+Topics are recognised by their message types and by common names.
+"""
 
 import os
 import re
@@ -25,18 +28,24 @@ from factorgraph_loc.text import listed
 
 LEFT, RIGHT = re.compile("left", re.IGNORECASE), re.compile("right", re.IGNORECASE)
 WHEEL, REAR = re.compile("wheel", re.IGNORECASE), re.compile("rear|back", re.IGNORECASE)
-WHEELS = {"radius": 0.1, "track": 0.5}  # m
+WHEELS = {"radius": 0.1, "track": 0.5}  # m: examples that the user replaces
 NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORECASE)
 
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
-# suffixes of field names that imply a unit; the longest match is used
+IF_UNSTATED = {"phase": "rad", "frequency": "Hz", "stamp": "us"}  # units of fields whose names imply none
+# by field of an RFID read: suffixes of names that imply a unit, of which the longest match is used
 UNITS = {"phase": ANGLES, "frequency": ENDS["frequency"], "stamp": {unit: unit for unit in ("us", "ms", "ns")}}
 
 
 @dataclass(frozen=True)
 class TopicUse:
-    """A topic of a bag. ``rate``: messages per second, None for fewer than two; ``use``: as a sensor or reference, or None."""
+    """A topic of a bag and its proposed use.
+
+    ``messages``: number of messages.
+    ``rate``: messages per second, None if there are fewer than two.
+    ``use``: the sensor that the topic serves, or ``reference``. None if the manifest does not use the topic.
+    """
 
     topic: str
     type: str
@@ -47,7 +56,7 @@ class TopicUse:
 
 @dataclass(frozen=True)
 class BagManifest(Proposal):
-    """The proposed manifest of a bag. ``duration``: of the bag [s]; ``topics``: all that are in it."""
+    """The proposed manifest of a bag. ``duration``: length of the bag [s]. ``topics``: all topics of the bag."""
 
     duration: float
     topics: tuple[TopicUse, ...]
@@ -55,14 +64,20 @@ class BagManifest(Proposal):
 
 @dataclass
 class Uses:
-    """``options`` of the reader; ``uses``: use of each topic, by name; ``remarks`` for the user."""
+    """The proposed uses of topics.
+
+    ``options``: the settings of the reader. ``uses``: the use of each topic by its name. ``remarks``: what the user should check.
+    """
 
     options: dict[str, Any] = field(default_factory=dict)
     uses: dict[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
     def take(self, sensor: str, topics: Sequence[Topic], **settings: Any) -> None:
-        """Use the first of ``topics`` for a sensor and remark on the rest; nothing without topics."""
+        """Use the first of ``topics`` for a sensor, with ``settings``. A remark lists the other topics.
+
+        Does nothing if ``topics`` is empty.
+        """
         if topics:
             self.options[sensor] = {"topic": topics[0].name, **settings}
             self.uses[topics[0].name] = sensor
@@ -70,7 +85,7 @@ class Uses:
             self.remarks.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
 
     def take_all(self, sensor: str, topics: Mapping[str, Mapping[str, Any]]) -> None:
-        """Use each topic as one sensor of a kind. ``topics``: their settings by name."""
+        """Use each topic as a separate sensor of the kind ``sensor``. ``topics``: the settings of each topic by its name."""
         names = distinct(list(topics)) if len(topics) > 1 else []
         settings = {topic: {"topic": topic, **more} for topic, more in topics.items()}
         if names:
@@ -81,9 +96,10 @@ class Uses:
 
 
 def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
-    """Propose a manifest, to be saved in ``folder`` if the bag is below that folder, else in the folder of the bag.
+    """Propose a manifest for a bag.
 
-    InputError if the bag cannot be read.
+    The manifest is to be saved in ``folder`` if the bag is below ``folder``, else in the folder that contains the bag.
+    Raises InputError if the bag cannot be read.
     """
     path, folder = Path(os.path.realpath(bag)), folder.resolve()
     with open_bag(path) as opened:
@@ -105,7 +121,7 @@ def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
 
 
 def propose(bag: Bag) -> Uses:
-    """Propose uses of the topics. Of several topics for one sensor the most likely one is used, and a remark lists the others."""
+    """Propose a use of each topic. If several topics fit one sensor, the likeliest is used, and a remark lists the others."""
     out = Uses()
     topics = [topic for topic in bag.topics.values() if topic.count]
     tree = tree_of(bag, out.remarks)
@@ -123,7 +139,7 @@ def propose(bag: Bag) -> Uses:
     if len(out.options.get("bearing_range", {}).values()) > 1 and "topic" not in out.options["bearing_range"]:
         names = listed(by_name("bearing_range", out.options["bearing_range"]))
         out.remarks.append(
-            f"{names} are sensors of their own: remove those that repeat others; the rig needs each by name"
+            f"{names} are separate sensors: remove any that repeats another; the rig needs a section for each name"
         )
     if STATIC in bag.topics:
         out.uses[STATIC] = "sensor mounting"
@@ -136,13 +152,16 @@ def propose(bag: Bag) -> Uses:
     if tree.topic and tree.topic not in out.uses:
         frames = listed(f"{child} in {tree.parents[child]}" for child in sorted(tree.moving))
         out.remarks.append(
-            f"{tree.topic} has the frames {frames}: parent and child of [options.reference] would use two"
+            f"{tree.topic} has the frames {frames}: to use one as the reference, set parent and child in [options.reference]"
         )
     return out
 
 
 def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Prefer odometry, then transforms of its frame, then velocities, then wheels; commands are no measurements."""
+    """Propose the topic of odometry. Odometry messages come first, then transforms of its frame, velocities, and wheel joints.
+
+    Topics of commands, plans and ground truth are excluded.
+    """
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
     frames = {} if origin is None else {"parent": origin, "child": robot}
@@ -156,19 +175,23 @@ def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
         and not NOT_MEASURED.search(topic.name)
     ]
     if not ranked:
-        out.remarks.append("no topic looks like odometry, which every estimator needs: name one in [options.odometry]")
+        out.remarks.append(
+            "no topic was recognised as odometry, which every estimator needs: name one in [options.odometry]"
+        )
         return
     settings: dict[str, Any] = frames if ranked[0].type in TF else {}
     if ranked[0].type == ODOMETRY and _has_no_pose(bag, ranked[0]):
         settings = {"use": "twist"}
-        out.remarks.append(f"the orientations in {ranked[0].name} are not set: its velocities are used, not its poses")
+        out.remarks.append(
+            f"the quaternions in {ranked[0].name} are zero: its velocities are used instead of its poses"
+        )
     elif ranked[0].type == JOINTS:
         settings = _joints(bag, ranked[0], out.remarks)
     out.take("odometry", ranked, **settings)
 
 
 def _has_no_pose(bag: Bag, topic: Topic) -> bool:
-    """Whether the first message of odometry has a quaternion of zeros: drivers without poses send velocities only."""
+    """True if the quaternion in the first odometry message is zero. Drivers that measure only velocities send such messages."""
     first = next(bag.messages([topic.name]), None)
     if first is None:
         return False
@@ -177,7 +200,7 @@ def _has_no_pose(bag: Bag, topic: Topic) -> bool:
 
 
 def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
-    """The settings of wheels that are joints, by the names in the first message."""
+    """Return the proposed settings of wheels for a JointState topic, by the names of joints in its first message."""
     first = next(bag.messages([topic.name]), None)
     names = [name for name in getattr(first and first.message, "name", ()) if isinstance(name, str)]
     wheels = [name for name in names if WHEEL.search(name)] or names
@@ -189,22 +212,26 @@ def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
     if len(rear) == len(front) == 2:
         sides |= {"rear_left": next(filter(LEFT.search, rear), ""), "rear_right": next(filter(RIGHT.search, rear), "")}
         remarks.append(
-            "four wheels: if they are mecanum wheels, set base [m], the distance between the axles, in wheels"
+            "there are four wheels: if they are mecanum wheels, set base [m], the distance between the axles, in wheels"
         )
     values = getattr(first and first.message, "position", ())
     if len(values) and all(float(value).is_integer() for value in values) and any(values):
         remarks.append(
-            "positions of joints are whole numbers: if they are counts, set unit in wheels to the radians per count"
+            "positions of joints are whole numbers: if they are encoder counts, set unit in wheels to the radians per count"
         )
     remarks.append(
-        f"wheels: {left} and {right} are taken for them, of the joints {listed(names)}; measure radius and track [m]: "
-        "here, or as [odometry.wheels] in the rig, which comes first"
+        f"wheels: {left} and {right} are used, of the joints {listed(names)}; measure radius and track [m] and set them here, "
+        "or in [odometry.wheels] of the rig, which has precedence"
     )
     return {"wheels": sides | WHEELS}
 
 
 def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Poses are a reference, or positions of a sensor if they have no headings and the name of their topic does not say more."""
+    """Propose the topics of the reference and of a position sensor.
+
+    A topic whose name suggests ground truth is the reference. Otherwise, a topic of poses with headings is the reference.
+    A topic of positions without headings is a position sensor.
+    """
     poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]
     measured = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name) and t not in named]
@@ -228,13 +255,13 @@ def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None
         out.options["reference"] = settings
         out.uses[tree.topic] = ", ".join(dict.fromkeys((*filter(None, [out.uses.get(tree.topic)]), "reference")))
         out.remarks.append(
-            f"{robot} in {world}, of {tree.topic}, is used as the reference: remove it if it is an estimate, as of amcl or SLAM, "
-            "not the truth"
+            f"{robot} in {world}, of {tree.topic}, is used as the reference: remove it if it is an estimate, such as that of amcl "
+            "or SLAM, not the truth"
         )
 
 
 def _never_turns(bag: Bag, topic: Topic) -> bool:
-    """Whether all orientations in the first messages of a topic of poses are equal."""
+    """True if the orientations in the first messages of a topic of poses are all equal. Needs at least three messages."""
     get = attrgetter(f"{POSES[topic.type]}.{'rotation' if topic.type.endswith('TransformStamped') else 'orientation'}")
     turned = [get(item.message) for item in islice(bag.messages([topic.name]), SAMPLE)]
     return len(turned) > 2 and len({(q.x, q.y, q.z, q.w) for q in turned}) == 1
@@ -247,18 +274,18 @@ def _camera(out: Uses, topics: Sequence[Topic]) -> None:
         return
     infos = {topic.name.rsplit("/", 1)[0]: topic for topic in topics if topic.type == INFO}
     place = images[0].name
-    while place and place not in infos:  # the info of /camera/image_raw/compressed is /camera/camera_info
+    while place and place not in infos:  # the CameraInfo of /camera/image_raw/compressed is /camera/camera_info
         place = place.rpartition("/")[0]
     settings = {"info": infos[place].name} if place in infos else {}
     out.take("camera", images, **settings)
     if settings:
         out.uses[settings["info"]] = "camera: lens"
     else:
-        out.remarks.append("no CameraInfo belongs to the images: the rig has to describe the camera")
+        out.remarks.append("the images have no CameraInfo topic: describe the camera in the rig")
 
 
 def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
-    """The topics without a use whose messages are not of ROS itself, with the paths of their fields."""
+    """Return the unused topics whose message types do not come with ROS, each with the paths of its fields."""
     custom = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(
@@ -267,13 +294,13 @@ def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, l
             continue
         try:
             custom.append((topic, leaves(bag.store(topic.name), topic.type)))
-        except InputError as error:  # the topic may be irrelevant
+        except InputError as error:  # only a remark, because the log may not need this topic
             out.remarks.append(str(error))
     return custom
 
 
 def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
-    """The topic with a field for the EPC, and most other fields of a read."""
+    """Propose the topic of RFID reads: of the topics with a field for the EPC, the one with most fields of a read."""
     reads = [(topic, read_fields(paths)) for topic, paths in custom if not range_fields(paths)]
     candidates = [(topic, fields) for topic, fields in reads if "epc" in fields]
     if not candidates:
@@ -282,7 +309,9 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     settings: dict[str, Any] = {"fields": fields}
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
-        out.remarks.append(f"{topic.name} does not distinguish antennas: all reads are assigned to one, set in antenna")
+        out.remarks.append(
+            f"{topic.name} does not distinguish antennas: all reads are assigned to one, whose name is set in antenna"
+        )
     if units := _units(fields):
         settings["units"] = units
     if LIST in fields["epc"] and LIST not in fields.get("antenna", LIST):
@@ -293,21 +322,28 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     out.take("rfid", [topic, *(candidate for candidate, _ in candidates if candidate is not topic)], **settings)
     doubtful = [name for name in UNITS if name in fields and name not in units]
     if doubtful:
-        out.remarks.append(f"rfid: {', '.join(doubtful)}: assumed to be in rad, Hz and us, set units otherwise")
+        assumed = ", ".join(f"{name} in {IF_UNSTATED[name]}" for name in doubtful)
+        out.remarks.append(f"rfid: assumed {assumed}: correct this with units in [options.rfid]")
 
 
 def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[str, dict[str, Any]]:
-    """The topics with a field of a distance and, next to it, one of the name of a landmark, each with its settings."""
+    """Return the proposed topics of ranges to landmarks with their settings, by the name of the topic.
+
+    Such a topic has fields for a distance and, beside it in the message, for the name of a landmark.
+    """
     candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
     out.remarks += [
-        f"{topic} is taken for ranges [m] to landmarks of the map that {fields['landmark']} names"
+        f"{topic} is read as ranges [m] to landmarks of the map; {fields['landmark']} has the name of the landmark"
         for topic, fields in candidates.items()
     ]
     return {topic: {"fields": fields} for topic, fields in candidates.items()}
 
 
 def range_fields(paths: Sequence[str]) -> dict[str, str]:
-    """The fields of a range among the paths of a message type, by common names; none if one of them is missing."""
+    """Return the path of the landmark's name and of the range, among the ``paths`` of the fields of a message type.
+
+    Returns an empty dictionary if one of the two fields is missing. Fields are recognised by common names.
+    """
     distances = {p.rpartition(".")[0]: p for p in paths if _plain(p) in RANGE and p.count(LIST) <= 1}
     named = [p for p in paths if _plain(p) in LANDMARK and p.rpartition(".")[0] in distances]
     if not named:
@@ -317,20 +353,23 @@ def range_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
-    """The fields of a read among the paths of a message type, by common names."""
+    """Return the path of each field of an RFID read, among the ``paths`` of the fields of a message type.
+
+    Fields are recognised by common names. A field that the message type lacks is left out.
+    """
     usable = [path for path in paths if path.count(LIST) <= 1 and not path.startswith("header.")]
     out = {}
     for name, known in READ.items():
         fitting = [(at, len(path), path) for path in usable if (at := rank(_plain(path), known)) is not None]
         if fitting:
             out[name] = min(fitting)[-1]
-    if "stamp" not in out:  # the timestamp of a read in the message of its EPC
+    if "stamp" not in out:  # a list of reads may have a timestamp for each read
         out.update([("stamp", path) for path in paths if path.endswith("stamp") and LIST in path][:1])
     return out
 
 
 def _units(fields: Mapping[str, str]) -> dict[str, str]:
-    """Units implied by field names."""
+    """Return the units that the names of ``fields`` imply. ``fields``: the path of each field of a read."""
     out = {}
     for name, ends in UNITS.items():
         plain = _plain(fields.get(name, ""))

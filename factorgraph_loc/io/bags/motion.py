@@ -1,6 +1,6 @@
-"""Motion of the robot in a bag: poses or velocities of odometry, the gyro of an IMU, or the wheels of a differential drive.
+"""Reads the motion of the robot from a bag: poses or velocities of odometry, turn rates of an IMU, or the motion of wheels.
 
-Each wheel has a topic, or both wheels are joints of one message.
+Wheels are joints of one message, or each of two wheels has a topic.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from factorgraph_loc.text import Notice, notice, quoted
 from factors.se2 import Array, Integers
 
 JOINTS = "sensor_msgs/msg/JointState"
-MAX_OFFSET = 0.5  # of the usual time between messages of a wheel: more between left and right are no pair
+MAX_OFFSET = 0.5  # maximum time between the messages of a pair of wheels, as a fraction of the median message interval
 ODOMETRY = "nav_msgs/msg/Odometry"
-TWISTS = {  # path of the twist by type
+TWISTS = {  # path of the twist in a message, by message type
     "geometry_msgs/msg/Twist": "",
     "geometry_msgs/msg/TwistStamped": "twist.",
 }
 IMU = "sensor_msgs/msg/Imu"
-# timestamps (N,) [ns], and velocities (N, 2) or increments (N, 3), after the bag is read; adds to the warnings
+# A function to call after the bag is read. It returns timestamps (N,) [ns] and velocities (N, 2) or increments (N, 3), and appends
+# to the warnings.
 Motion = Callable[[list[Notice]], tuple[Integers, Array]]
 
 
@@ -40,26 +41,29 @@ class WheelSettings(motions.WheelSizes):
     """Two or four wheels. ``radius`` and ``track`` of the rig ([odometry.wheels]) have precedence over these settings."""
 
     left: str
-    """name of the left wheel's joint; for a topic for each wheel, the field with the number"""
+    """name of the left wheel's joint; if each wheel has a topic, the field with the wheel's value"""
     right: str
-    """as left, of the right wheel"""
+    """name of the right wheel's joint; if each wheel has a topic, the field with the wheel's value"""
     rear_left: str | None = None
     """name of the rear left wheel's joint, if there are four wheels"""
     rear_right: str | None = None
-    """as rear_left, of the rear right wheel"""
+    """name of the rear right wheel's joint, if there are four wheels"""
     right_topic: str | None = None
     """topic of the right wheel, if each wheel has a topic"""
     unit: Literal["rad", "m"] | Annotated[float, Field(gt=0.0)] = "rad"
-    """unit of the wheels' values: angles, or distances; a number: radians per count of an encoder"""
+    """unit of the wheels' values: rad for angles, m for distances, or a number, the radians per encoder count"""
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """The names of the joints: left, right, and those behind."""
+        """The names of the joints of two, three or four wheels: left, right, rear left, rear right."""
         return tuple(name for name in (self.left, self.right, self.rear_left, self.rear_right) if name is not None)
 
 
 class JointRows:
-    """Collects the angles or angular velocities of the wheels' joints of a topic."""
+    """Collects the angles or angular velocities of the wheels from a topic of joints (JointState).
+
+    ``column``: the field of the message to read, ``position`` or ``velocity``.
+    """
 
     def __init__(self, bag: Bag, topic: str, wheels: WheelSettings, column: str) -> None:
         self._wheels, self._column = wheels, column
@@ -73,14 +77,17 @@ class JointRows:
             if self._wheels.left in names:
                 raise InputError(
                     f"{self.rows.source}:{item.row}: has {len(values)} numbers of {self._column} for {len(names)} joints, "
-                    "expected one for each; select the other with odometry.use"
+                    "expected one for each; odometry.use selects position (pose) or velocity (twist)"
                 )
             return
-        if set(self._wheels.joints) <= set(names):  # other messages contain other joints
+        if set(self._wheels.joints) <= set(names):  # a topic may have messages of other joints too
             self.rows.append(item, t_ns, [values[names.index(joint)] for joint in self._wheels.joints])
 
     def pairs(self, warnings: list[Notice]) -> tuple[Integers, Array]:
-        """Timestamps (N,), and the numbers (N, W) of the wheels. InputError if no message has all joints."""
+        """Return timestamps (N,) [ns] and the values (N, W) of W wheels in order of time.
+
+        Raises InputError if no message has all joints.
+        """
         joints = self._wheels.joints
         if not len(self.rows):
             wrong = next((joint for joint in joints if joint not in self._seen), self._wheels.left)
@@ -91,8 +98,11 @@ class JointRows:
 
 
 def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
-    """Timestamps (N,), and the left and the right number (N, 2) of two topics, in pairs with the nearest stamps. A pair has the
-    later one, when both are known. InputError if the topics have no time in common."""
+    """Pair the messages of the left and the right wheel that are nearest in time.
+
+    Returns timestamps (N,) [ns] and the values (N, 2), left and right. A pair has the later one of the two timestamps.
+    Raises InputError if no messages are near in time.
+    """
     l_ns, left = lefts.in_order(("wheel",), warnings)
     r_ns, right = rights.in_order(("wheel",), warnings)
     later = np.clip(np.searchsorted(r_ns, l_ns), 0, len(r_ns) - 1)
@@ -104,30 +114,31 @@ def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple
     if not len(t_ns):
         raise InputError(f"{lefts.source} and {rights.source}: no messages are near in time")
     if lost := len(l_ns) - len(keep):
-        sentence = "{source}: {messages} messages have none of the right wheel near in time"
+        sentence = "{source}: {messages} messages are skipped: no message of the right wheel is near in time"
         warnings.append(notice("unpaired_wheels", sentence, lefts.source, lost))
-    alone = np.append(np.diff(t_ns) > 0, True)  # the last one of equal stamps
-    return t_ns[alone], np.hstack((left[keep], right[near[keep]]))[alone]
+    is_last = np.append(np.diff(t_ns) > 0, True)  # of equal timestamps
+    return t_ns[is_last], np.hstack((left[keep], right[near[keep]]))[is_last]
 
 
 class OdometryTopic(PoseTopic):
     """A topic of odometry, of tf with two frames, or of wheel joints."""
 
     use: Literal["pose", "twist"] = "pose"
-    """the pose of odometry, as motion between messages, or its twist; for wheels, their angles or their angular rates"""
+    """what odometry messages are read for: pose, whose motion between messages is used, or twist, the velocity; for wheels, pose
+    reads their angles and twist their angular rates"""
     wheels: WheelSettings | None = None
-    """wheels of a topic of joints, or of two topics; topic is the one of the left wheel"""
+    """wheels of a topic of joints; or of two topics, where topic is that of the left wheel"""
 
 
 class ImuTopic(TopicSettings, Turned):
     """A topic of an IMU: its turn rate about the robot's z axis."""
 
     frame: str | None = None
-    """frame of the IMU, whose orientation is in tf_static; without it use axes and mounting"""
+    """frame of the IMU in tf_static, which gives its orientation; if tf_static lacks it, use axes and mounting instead"""
 
 
 class YawRates:
-    """The turn rate of an IMU."""
+    """Collects the angular velocities of an IMU topic, and computes the turn rate of the robot from them."""
 
     def __init__(self, bag: Bag, options: ImuTopic, frames: StaticFrames) -> None:
         topic = bag.topic(options.topic, IMU)
@@ -141,7 +152,7 @@ class YawRates:
         self.add = self._rows.add
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> YawRateStream:
-        """Turn rates about the robot's z axis; only the axes of the IMU that contribute must be finite."""
+        """Return the turn rates about the robot's z axis. Only the axes of the IMU that contribute must be finite."""
         turned = self._options.turned()
         if self._options.frame is not None:
             turned = self._frames.known(self._rows.source, self._options.frame)[:3, :3]
@@ -152,12 +163,17 @@ class YawRates:
 
 
 def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """Register the collectors of an odometry topic, by message type, and return its motion."""
+    """Register the collectors of an odometry topic, and return the function that computes the motion once the bag is read.
+
+    ``static`` has the static transforms of the bag. Raises InputError if the options do not fit the message type.
+    """
     bag, source = listeners.bag, f"{listeners.bag.path} {options.topic}"
     known = () if options.wheels else sorted({*POSES, *TWISTS, JOINTS, *TF})
     kind = bag.topic(options.topic, *known).type
     if kind not in TF and (options.parent is not None or options.child is not None):
-        raise InputError(f"{source}: odometry.parent or odometry.child is given, but this is {kind}, not tf: remove it")
+        raise InputError(
+            f"{source}: odometry.parent or odometry.child is given, but the type is {kind}, not tf: remove it"
+        )
     poses = kind in TF or (kind in POSES and not (kind == ODOMETRY and options.use == "twist"))
     if options.is_given() and not poses:
         raise InputError(f"{source}: axes or mounting is given, but the odometry is not read as poses: remove it")
@@ -165,7 +181,7 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
         raise InputError(f"{source}: odometry.wheels is missing: give left, right, radius and track in it")
     if options.wheels is not None and kind not in TF:
         if kind != JOINTS and options.wheels.right_topic is None:
-            raise InputError(f"{source}: odometry.wheels.right_topic is missing, as {kind} has no joints")
+            raise InputError(f"{source}: odometry.wheels.right_topic is missing, which {kind} needs: it has no joints")
         return _of_wheels(listeners, options, options.wheels)
     if poses:
         return _of_poses(listeners, options, static)
@@ -175,7 +191,7 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 
 
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """The motion between consecutive poses in the frame of odometry, or between transforms."""
+    """Return the function that computes the motion between consecutive poses of a topic of poses or tf."""
     made = poses_of_topic(listeners, options, static)
 
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
@@ -188,7 +204,7 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
 
 
 def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> Motion:
-    """The motion from the angles, distances or speeds of wheels: joints, or two wheels with a topic each."""
+    """Return the function that computes the motion from the angles, distances or speeds of wheels."""
     bag = listeners.bag
     if (wheels.base is not None or len(wheels.joints) == 3) and len(wheels.joints) != 4:
         raise InputError(
@@ -224,7 +240,7 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
 
 
 def _wheel(bag: Bag, topic: str, path: str) -> TopicRows:
-    """Collects the number of a wheel from each message of a topic."""
+    """Return a collector of the value of one wheel, the field ``path`` in each message of a topic."""
     source = f"{bag.path} {topic}"
     known = bag.topic(topic)
     check_path(bag.store(topic), known, path, f"{bag.path}: topic {topic}: wheel")

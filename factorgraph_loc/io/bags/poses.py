@@ -1,6 +1,7 @@
-"""Poses in a bag: of odometry, the reference and the start, and coordinate frames (tf).
+"""Reads poses and coordinate frames (tf) from a bag.
 
-Static transforms give the mounting of sensors; a chain of transforms gives a trajectory.
+Poses are those of odometry, the reference and the start. Static transforms give the mounting of sensors. A chain of transforms
+gives a trajectory.
 """
 
 from __future__ import annotations
@@ -27,33 +28,34 @@ from factors.se2 import Array, Integers
 SEVEN = ("x", "y", "z", "qx", "qy", "qz", "qw")
 POINT = "geometry_msgs/msg/PointStamped"
 WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSES = {  # the path of the pose by message type
+POSES = {  # path of the pose in a message, by message type
     "nav_msgs/msg/Odometry": "pose.pose",
     "geometry_msgs/msg/PoseStamped": "pose",
     WITH_COVARIANCE: "pose.pose",
     "geometry_msgs/msg/TransformStamped": "transform",
 }
 STATIC = "/tf_static"
-SAMPLE = 2000  # messages of a topic that are looked at
+SAMPLE = 2000  # number of messages of a topic that are read to propose a manifest
+# common names of frames of the robot, of its odometry and of the world
 ROBOT = ("base_link", "base_footprint", "base")
 ODOMETRY = ("odom", "odom_combined", "odometry")
-WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # measured frames first, then those of estimates
+WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # frames of measured poses first, then frames of estimates
 
 
 class PoseTopic(TopicSettings, Turned):
     """A topic of poses, or of tf with two frames."""
 
     parent: str | None = None
-    """frame of the poses, for tf"""
+    """frame in which the poses are given, if the topic is tf"""
     child: str | None = None
-    """frame of the robot, for tf"""
+    """frame of the robot, if the topic is tf"""
 
 
 class ReferenceTopic(PoseTopic):
     """The topic of the reference."""
 
     has_heading: bool = True
-    """whether the heading means anything"""
+    """true if the reference measures the heading; false if its headings are meaningless"""
 
 
 class StartTopic(TopicSettings, Turned):
@@ -61,13 +63,14 @@ class StartTopic(TopicSettings, Turned):
 
 
 class Start:
-    """Collects the first pose with covariance of a topic, the known start."""
+    """Collects the first pose with covariance of a topic. This pose is the known start of the log."""
 
     def __init__(self, bag: Bag, options: StartTopic) -> None:
         bag.topic(options.topic, WITH_COVARIANCE)
         self._turned = options
         self._source = f"{bag.path} {options.topic}"
-        self._found: tuple[int, Array, Array] | None = None  # timestamp [ns], pose (1, 7), variances (3,)
+        # timestamp [ns]; position [m] and quaternion (1, 7); variances (3,) of x, y [m^2] and heading [rad^2]
+        self._found: tuple[int, Array, Array] | None = None
 
     def add(self, item: Stamped, t_ns: int) -> None:
         if self._found is None:
@@ -76,7 +79,7 @@ class Start:
             self._found = (t_ns, np.array([seven(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
-        """The start; InputError if a variance of x, y or heading is not positive."""
+        """Return the start, at a time after ``t0_ns``. Raises InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
         t_ns, values, variances = self._found
         turns = checked_rotations(self._source, np.ones(1, dtype=np.int64), values)
@@ -88,21 +91,25 @@ class Start:
 
 
 def seven(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
-    """x, y, z [m] and the quaternion x, y, z, w of a pose or transform."""
+    """Return x, y, z [m] and the quaternion x, y, z, w of a message. ``position`` and ``orientation``: the names of its fields."""
     p, q = getattr(pose, position), getattr(pose, orientation)
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
 
 def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
-    """Rotations (N, 3, 3) of positions and quaternions (N, 7). InputError if a number is not finite, or a quaternion is not a unit
-    quaternion."""
+    """Return the rotations (N, 3, 3) of a ``table`` (N, 7) of positions x, y, z and quaternions x, y, z, w.
+
+    ``rows`` (N,): the row numbers for errors. Raises InputError if a number is not finite, or a quaternion has not length 1.
+    """
     checks.require_finite(source, rows, SEVEN, table)
     return rotations_of(source, rows, table[:, 3:])
 
 
 def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
-    """The poses of rows of positions and quaternions, or of positions alone; the last one of equal timestamps. InputError names the
-    invalid message."""
+    """Return the poses of collected rows: x, y, z and quaternion, or x, y, z if ``has_rotations`` is false.
+
+    Of rows with equal timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
+    """
     source, values = rows.source, rows.values
     if not has_rotations:
         values = np.column_stack((values, np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))))
@@ -112,7 +119,7 @@ def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = Tr
 
 
 def upward(parents: Mapping[str, str], frame: str) -> list[str]:
-    """``frame`` and the frames above it, nearest first, each once."""
+    """Return ``frame`` and all frames above it, nearest first. ``parents``: the parent of each frame. A cycle is cut."""
     chain = [frame]
     while (parent := parents.get(chain[-1], frame)) not in chain:
         chain.append(parent)
@@ -120,7 +127,10 @@ def upward(parents: Mapping[str, str], frame: str) -> list[str]:
 
 
 class StaticFrames:
-    """Collects static transforms: ``parents`` of frames, and their ``poses`` (4, 4) there. ``base``: the frame of the robot."""
+    """Collects static transforms.
+
+    ``base``: the frame of the robot. ``parents``: the parent of each frame. ``poses``: the pose (4, 4) of each frame in its parent.
+    """
 
     def __init__(self, base: str = ROBOT[0]) -> None:
         self.base = base
@@ -136,21 +146,24 @@ class StaticFrames:
             self.poses[child] = matrices(values[:, :3], rotations)[0]
 
     def pose(self, frame: str) -> Array | None:
-        """The pose (4, 4) of ``frame`` on the robot; None if no transforms connect them."""
+        """Return the pose (4, 4) of ``frame`` in the frame of the robot. Returns None if no transforms connect the two frames."""
         ours, theirs = self._up(plain(frame)), self._up(plain(self.base))
         common = next((name for name in ours if name in theirs), None)
         return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
 
     def known(self, source: str, frame: str) -> Array:
-        """As :meth:`pose`; InputError if no transforms connect the frames."""
+        """Return the pose (4, 4) of ``frame`` in the frame of the robot. Raises InputError if no transforms connect the two frames.
+
+        ``source`` names the topic that needs the pose.
+        """
         pose = self.pose(frame)
         if pose is None:
             frames = listed(sorted(self.parents)) or "none"
-            raise InputError(f"{source}: tf_static has no pose of {frame} on {self.base}; frames: {frames}")
+            raise InputError(f"{source}: tf_static has no pose of {frame} on {self.base}, only the frames: {frames}")
         return pose
 
     def _up(self, frame: str) -> dict[str, Array]:
-        """The poses of ``frame`` in itself and in all frames above it, nearest first."""
+        """Return the poses (4, 4) of ``frame`` in itself and in each frame above it, by the name of that frame."""
         out = {frame: np.eye(4)}
         for child, parent in pairwise(upward(self.parents, frame)):
             out[parent] = self.poses[child] @ out[child]
@@ -158,8 +171,10 @@ class StaticFrames:
 
 
 class FrameReference:
-    """Collects transforms, and composes the trajectory of the topic's ``child`` in its ``parent``. InputError if one of these two
-    frames is missing."""
+    """Collects the transforms of a tf topic, and composes the trajectory of one frame in another.
+
+    The settings ``topic`` name the two frames: ``child`` moves in ``parent``. Raises InputError if one of the two is not set.
+    """
 
     def __init__(self, bag: Bag, topic: PoseTopic, stamper: Stamper, static: StaticFrames) -> None:
         self._source = f"{bag.path} {topic.topic}"
@@ -167,7 +182,7 @@ class FrameReference:
             raise InputError(f"{self._source}: parent or child is missing: give two frames, such as map and base_link")
         self._parent, self._child = plain(topic.parent), plain(topic.child)
         self._stamper, self._static = stamper, static
-        self._edges: dict[str, TopicRows] = {}  # from each frame to its parent, in order of arrival
+        self._edges: dict[str, TopicRows] = {}  # by frame: its poses in its parent, in order of arrival
         self._parents: dict[str, str] = {}
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -179,14 +194,19 @@ class FrameReference:
             edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
 
     def path(self, warnings: list[Notice]) -> PosePath:
-        """The poses at the timestamps of the most frequent transform where all are known; the others are interpolated."""
+        """Return the trajectory, at the timestamps of the most frequent transform in the chain. Other transforms are interpolated.
+
+        Times at which a transform is unknown are left out. Raises InputError if no time remains, or nothing in the chain moves.
+        """
         edges = [
             path_of(self._edges[name], warnings) if name in self._edges else self._static.poses[name]
             for name in self._chain()
         ]
         moving = [edge for edge in edges if isinstance(edge, PosePath)]
         if not moving:
-            raise InputError(f"{self._source}: {self._child} does not move in {self._parent}, expected frames that do")
+            raise InputError(
+                f"{self._source}: {self._child} does not move in {self._parent}, expected two frames in relative motion"
+            )
         t_ns = max(moving, key=len).stamps()
         t_ns = t_ns[(t_ns >= max(m.stamps()[0] for m in moving)) & (t_ns <= min(m.stamps()[-1] for m in moving))]
         if not len(t_ns):
@@ -203,7 +223,7 @@ class FrameReference:
         return PosePath(self._source, poses[:, :3, 3], poses[:, :3, :3], t_ns)
 
     def _chain(self) -> list[str]:
-        """The frames from the child up to the parent, without the parent."""
+        """Return the frames from the child up to the parent, without the parent. Raises InputError if they are not connected."""
         parents = self._static.parents | self._parents
         chain = upward(parents, self._child)
         if self._parent in chain:
@@ -211,13 +231,15 @@ class FrameReference:
         known = sorted({*parents, *parents.values()})
         wrong = next((name for name in (self._parent, self._child) if name not in known), None)
         hint = (
-            f"there is no frame {quoted(wrong)}{nearest(wrong, known)}" if wrong else f"it ends at {quoted(chain[-1])}"
+            f"there is no frame {quoted(wrong)}{nearest(wrong, known)}"
+            if wrong
+            else f"the frames above {self._child} end at {quoted(chain[-1])}"
         )
         raise InputError(f"{self._source}: no transforms connect {self._child} to {self._parent}: {hint}")
 
 
 def static_frames(listeners: Listeners, base: str) -> StaticFrames:
-    """Register a collector for the static transforms of the bag, if it has any, and return it."""
+    """Return a collector of static transforms, and register it if the bag has any. ``base``: the frame of the robot."""
     bag, frames = listeners.bag, StaticFrames(base)
     if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
         listeners.add(STATIC, frames)
@@ -227,8 +249,10 @@ def static_frames(listeners: Listeners, base: str) -> StaticFrames:
 def poses_of_topic(
     listeners: Listeners, options: PoseTopic, frames: StaticFrames
 ) -> Callable[[list[Notice]], PosePath]:
-    """Register a collector for a topic of poses or points, or of tf with two frames. Returns the function that makes its path once
-    the bag is read, see :func:`path_of`."""
+    """Register a collector for a topic of poses or points, or of tf with two frames.
+
+    ``frames``: the static transforms of the bag. Returns the function that makes the :class:`PosePath` once the bag is read.
+    """
     bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
     kind = bag.topic(options.topic).type
     if kind in TF:
@@ -236,7 +260,7 @@ def poses_of_topic(
         listeners.add(options.topic, reference, stamper)
         return reference.path
     pose = POSES.get(bag.topic(options.topic, *sorted({*POSES, POINT})).type, "point")
-    # transforms have translation and rotation, poses position and orientation
+    # a transform has the fields translation and rotation, a pose has position and orientation
     position, rotation = ("translation", "rotation") if pose == "transform" else ("position", "orientation")
     paths = [f"{pose}.{position}.{axis}" for axis in "xyz"] + [f"{pose}.{rotation}.{axis}" for axis in "xyzw"]
     if kind == POINT:
@@ -247,12 +271,12 @@ def poses_of_topic(
 
 
 def plain(frame: str) -> str:
-    """A frame's name in ROS 2 notation, without the leading slash of some bags."""
+    """Return the name of a frame without the leading slash that some bags of ROS 1 have."""
     return frame.lstrip("/")
 
 
 def matrices(positions: Array, rotations: Array) -> Array:
-    """Poses (N, 4, 4) with positions (N, 3) and rotations (N, 3, 3)."""
+    """Return homogeneous matrices (N, 4, 4) of positions (N, 3) and rotations (N, 3, 3)."""
     out = np.tile(np.eye(4), (len(positions), 1, 1))
     out[:, :3, 3], out[:, :3, :3] = positions, rotations
     return out
@@ -260,25 +284,32 @@ def matrices(positions: Array, rotations: Array) -> Array:
 
 @dataclass(frozen=True)
 class Tree:
-    """``parents``: the parent of each frame; ``topic``: that of the moving frames, "" if none moves; ``moving``: these frames."""
+    """The tree of coordinate frames in a bag.
+
+    ``parents``: the parent of each frame. ``topic``: the topic with the moving frames, "" if no frame moves. ``moving``: the frames
+    that move in their parents.
+    """
 
     parents: Mapping[str, str]
     topic: str
     moving: frozenset[str]
 
     def robot(self) -> str | None:
-        """The frame of the robot, by its usual names."""
+        """Return the frame of the robot, recognised by common names. Returns None if the tree has no such frame."""
         return next((name for name in ROBOT if name in self.parents), None)
 
     def above(self, frame: str, names: tuple[str, ...]) -> str | None:
-        """The first of ``names`` that is above ``frame``, which moves in it."""
+        """Return the first of ``names`` that is above ``frame`` and in which ``frame`` moves. Returns None without such a frame."""
         chain = upward(self.parents, frame)
         first = next((i for i, name in enumerate(chain) if name in self.moving), len(chain))
         return next((name for name in names if name in chain[first + 1 :]), None)
 
 
 def tree_of(bag: Bag, remarks: list[str]) -> Tree:
-    """The frames in the transforms of a bag. A topic that cannot be read is reported in ``remarks``."""
+    """Return the tree of the frames in a bag, from the first messages of each tf topic.
+
+    A remark about each topic that cannot be read is appended to ``remarks``.
+    """
     parents: dict[str, str] = {}
     moving: set[str] = set()
     topic = ""

@@ -1,6 +1,6 @@
-"""The reader of ROS bags by a mapping of topics, which ``fgloc manifest BAG`` proposes.
+"""The reader of ROS bags. A manifest maps topics to sensors, and ``fgloc manifest BAG`` proposes one.
 
-The bag is read once; only the needed numbers of its messages are kept, and images are written to files.
+The bag is read once. Only the needed numbers of its messages are kept. Images are written to files.
 """
 
 import math
@@ -55,7 +55,10 @@ FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 
 
 def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSettings:
-    """The camera of a ``CameraInfo``. Without a mounting in tf_static it is at the robot's origin and points forward."""
+    """Return the settings of a camera from its CameraInfo, and its mounting from tf_static.
+
+    Without a mounting in tf_static, the camera is at the robot's origin and points forward. A note says so.
+    """
     pose = frames.pose(info.frame)
     if pose is None:
         notes.append(notice("unmounted", "tf_static has no mounting of {frame} on {base}", info.frame, frames.base))
@@ -69,7 +72,11 @@ def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSe
 def antennas_of(
     names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, notes: list[Notice]
 ) -> RfidSettings:
-    """Antennas with frames ``given``, or frames of their names; the frame's x axis is the boresight. Others are at the origin."""
+    """Return the settings of RFID antennas, mounted where tf_static has their frames.
+
+    ``given``: the frame of each antenna that is not named like its frame. The x axis of a frame is the boresight. An antenna
+    without a frame is at the robot's origin. Notes about the mountings are added to ``notes``.
+    """
     poses = {name: frames.pose(given.get(name, name)) for name in sorted(names)}
     for verb, known in (("has the", True), ("has no", False)):
         if which := [name for name, pose in poses.items() if (pose is not None) == known]:
@@ -99,9 +106,9 @@ class Options(FileModel):
     reference: ReferenceTopic | None = None
     start: StartTopic | None = None
     clock: Clock = "header"
-    """timestamps of message headers or of receipt; a topic may override it"""
+    """timestamps to use: header for those of message headers, receive for the time of receipt; a topic may override it"""
     base_frame: str = "base_link"
-    """frame of the robot, for mountings in tf_static"""
+    """frame of the robot, relative to which tf_static gives the mountings of sensors"""
 
 
 OTHERS = {
@@ -115,7 +122,10 @@ add_fields(
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The log in a bag; t = 0 at the first odometry. InputError names bag, topic, message and field of an invalid value."""
+    """Return the log in a bag. Its t = 0 is the first odometry message.
+
+    Raises InputError with the bag, topic, message and field of an invalid value.
+    """
     if path is None:
         raise InputError("rosbag: the path of the bag is missing")
     with open_bag(path) as bag, ExitStack() as stack:
@@ -147,7 +157,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
         has_heading = of_reference.has_heading and path.has_rotations
         t = checks.seconds(path.stamps(), t0_ns)
         reference = Trajectory(t, path.on_floor(warnings, of_reference), has_heading=has_heading)
-    notes: list[Notice] = []  # on the bag's own rig
+    notes: list[Notice] = []  # about the rig that is made from the bag
     rig = _rig(streams, info, options, frames, notes)
     name = bag.path.resolve().stem
     return Log(
@@ -166,13 +176,13 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
 
 
 def _left_out(bag: Bag, listeners: Listeners) -> str:
-    """The topics with messages that the manifest does not name, with their types."""
+    """Return the names and types of the topics that have messages but are not in the manifest, as one text."""
     unread = [topic for topic in bag.topics.values() if topic.count and topic.name not in (*listeners.topics, STATIC)]
     return ", ".join(f"{topic.name} ({topic.type})" for topic in unread)
 
 
 def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Any]:
-    """Register collectors for the sensors in the manifest except odometry, and return them by name of stream."""
+    """Register collectors for all sensors in the manifest except odometry. Returns them by the names of their streams."""
     bag = listeners.bag
     out: dict[str, Any] = {}
     if options.imu:
@@ -190,7 +200,7 @@ def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack
 
 
 def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Images:
-    """Register a collector for images, if they have to be read, and return it."""
+    """Return a collector of images. It is registered only if the images are not in the cache folder yet."""
     stamper = listeners.stamper(options.topic, options.clock)
     images = Images(listeners.bag, options.topic, stamper, stack)
     if images.known:
@@ -203,7 +213,7 @@ def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Ima
 def _rig(
     streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[Notice]
 ) -> Rig:
-    """The rig from the bag with the default noise; a rig in the manifest replaces it."""
+    """Return a rig with the camera and the antennas of the bag, and the default noise. A rig in the manifest replaces it."""
     camera = camera_of(info, frames, notes) if info else None
     reads = streams.get("rfid")
     rfid = None
@@ -214,21 +224,24 @@ def _rig(
 
 
 def read_trajectory(path: Path, topic: str) -> PosePath:
-    """The poses of ``topic`` in the bag ``path``, at the stamps of headers or, without headers, of the bag.
+    """Return the trajectory in the ``topic`` of the bag ``path``.
 
-    The topic has messages with poses or points, or is ``/tf:PARENT.CHILD``: the frame CHILD in the frame PARENT. InputError
-    names the invalid message.
+    The topic has messages with poses or points. ``/tf:PARENT.CHILD`` gives the poses of the frame CHILD in the frame PARENT.
+    Timestamps are those of headers, or the times of receipt for messages without a header. Raises InputError with the number of
+    an invalid message.
     """
     name, _, frames = topic.partition(FRAMES)
     with open_bag(path) as bag:
         if not name:
             known = [candidate.name for candidate in bag.topics.values() if candidate.type in (*POSES, POINT, *TF)]
             names = listed(known) or "none has poses"
-            raise InputError(f"{path}: is a bag, expected {path}:TOPIC, with one of its topics: {names}")
+            raise InputError(f"{path}: is a bag, expected {path}:TOPIC with one of its topics of poses: {names}")
         listeners, warnings = Listeners(bag, "header"), list[Notice]()
         parent, _, child = frames.partition(WITHIN)
         if bag.topic(name).type in TF and not (parent and child):
-            raise InputError(f"{path}: {name} holds transforms, expected two frames too: {path}:{name}:map.base_link")
+            raise InputError(
+                f"{path}: {name} holds transforms, expected two frames as well, such as {path}:{name}:map.base_link"
+            )
         static = static_frames(listeners, ROBOT[0])
         poses = poses_of_topic(listeners, PoseTopic(topic=name, parent=parent, child=child), static)
         listeners.run()

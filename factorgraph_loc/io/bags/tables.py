@@ -1,6 +1,7 @@
-"""Tables of sensors in a bag by a mapping of fields; a row is a message, or an element of a list in it.
+"""Reads tables of sensors from a bag. The manifest maps fields of messages to the columns of a table.
 
-RFID reads have inventory rounds. Landmarks may be poses or corners of detected markers.
+A row is a message, or an element of a list in a message. RFID reads are grouped into inventory rounds. Landmarks may be poses or
+corners of detected markers.
 """
 
 import math
@@ -38,7 +39,7 @@ CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: ce
 CORNER_FIELDS = ("detections[].family", "detections[].id", "detections[].corners[].x", "detections[].corners[].y")
 
 _POSE = "pose.position"
-# messages of marker detectors: the marker's name, and its position in the camera's optical frame
+# by message type of marker detectors: fields of the marker's name, and of its position in the optical frame of the camera
 DETECTIONS: dict[str, tuple[str, str]] = {
     "apriltag_ros/msg/AprilTagDetectionArray": ("detections[].id", f"detections[].pose.pose.{_POSE}"),
     "aruco_msgs/msg/MarkerArray": ("markers[].id", f"markers[].pose.{_POSE}"),
@@ -53,20 +54,22 @@ STAMP_OF_READ = replace(STAMP, name="stamp")
 
 
 class TableTopic(TopicSettings):
-    """A topic of rows of a table."""
+    """A topic with the rows of a sensor's table."""
 
     fields: dict[str, str] = Field(default_factory=dict)
-    """path of each column of the table, by default a field with its name"""
+    """path of the message field for each column of the table; by default the field with the name of the column"""
     units: dict[str, str | float] = Field(default_factory=dict)
-    """unit of each column, or a factor to ours"""
+    """unit of each column, or a factor that converts its values to the default unit"""
 
 
 class RowsOfTopic:
     """Collects the rows of a table from the messages of a topic.
 
-    ``fields``: where in a message the value of each column is; ``table``: the description of the columns; ``columns``: those to
-    collect, by default all but the first; ``units``: the unit of a column, or a factor. A missing number becomes NaN, an empty
-    name raises InputError.
+    ``fields``: the path of the message field for each column.
+    ``table``: the description of the table's columns.
+    ``columns``: the columns to collect, by default all columns except the first, which is the time.
+    ``units``: the unit of a column, or a factor that converts its values to the default unit.
+    A missing number becomes NaN. An empty name raises InputError.
     """
 
     def __init__(
@@ -86,7 +89,7 @@ class RowsOfTopic:
         self._rows = TopicRows(f"{bag.path} {topic}", len(self._numbered))
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Add the rows of a message."""
+        """Add the rows of a message, whose timestamp is ``t_ns``."""
         for values in self._fields.rows(item.message, item.row):
             row = dict(zip(self._fields.names, values, strict=True))
             stamp = self._stamp(row, t_ns, item.row)
@@ -95,23 +98,26 @@ class RowsOfTopic:
             self._rows.append(item, stamp, [row.get(name, math.nan) for name in self._numbered])
 
     def _stamp(self, values: Mapping[Any, Any], t_ns: int, row: int) -> int:
-        """The timestamp [ns] of a row with the values ``values`` by field, in a message that has ``t_ns``."""
+        """Return the timestamp [ns] of a row. ``values``: its values by field. ``t_ns``: the timestamp of its message."""
         return t_ns
 
     def _name(self, column: Column, values: Mapping[Any, Any], row: int) -> str:
-        """The name in ``column`` of a row with the values ``values`` by field; InputError if it is empty."""
+        """Return the name in ``column`` of a row with these ``values`` by field. Raises InputError if the name is empty.
+
+        ``row``: the number of the message.
+        """
         if text := as_text(values[column.name]):
             return text
         raise bad_field(self._rows.source, column.name, text, column.doc, row=row)
 
     def rows_of(self) -> TableRows:
-        """The collected rows; InputError for a number that is missing or out of bounds."""
+        """Return the collected rows. Raises InputError at a number that is missing or out of bounds."""
         cells = {**self._names, **dict(zip(self._numbered, self._rows.values.T, strict=True))}
         read = Cells(Path(self._rows.source), self._rows.rows, cells, units=self._units)
         return TableRows.of(read, self._columns, self._rows.t_ns)
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> Stream:
-        """The rows as a stream; problems are an InputError or a warning."""
+        """Return the rows as a stream, with times after ``t0_ns`` [ns]. An invalid row raises InputError or adds a warning."""
         channel, _ = native_tables()[self._table.name]
         if channel.assemble:
             return assemble(channel, {self._table.name: self.rows_of()}, Reading(DEFAULT_RIG, t0_ns, warnings))
@@ -119,22 +125,22 @@ class RowsOfTopic:
 
 
 class RfidTopic(TopicSettings, ReadNames):
-    """A topic of reads."""
+    """A topic of RFID reads."""
 
     fields: dict[ReadField, str]
     """paths of the EPC, the antenna and other values in a message"""
     units: dict[Literal["rssi", "phase", "frequency", "stamp"], str | float] = Field(default_factory=dict)
-    """units of rssi, phase, frequency and stamp, if not dBm, rad, Hz and us; or factors"""
+    """units of rssi, phase, frequency and stamp, or factors that convert to dBm, rad, Hz and us, the default units"""
     frames: dict[str, str] = Field(default_factory=dict)
-    """frames of antennas in tf_static, if named differently"""
+    """frame in tf_static of each antenna whose name differs from that of its frame"""
     rounds: Literal["gaps", "message"] = "gaps"
-    """message if a message holds the reads of one inventory round, gaps if rounds are separated by round_gap"""
+    """message if a message has the reads of one inventory round, gaps if rounds are separated by round_gap"""
     round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] = 0.05
     """gap between reads that ends an inventory round"""
 
 
 class Reads(RowsOfTopic):
-    """Collects the reads of a topic."""
+    """Collects the RFID reads of a topic."""
 
     def __init__(self, bag: Bag, options: RfidTopic) -> None:
         self._options = options
@@ -143,39 +149,41 @@ class Reads(RowsOfTopic):
             raise InputError(f"{source}: fields.epc is missing")
         if ("antenna" in options.fields) == (options.antenna is not None):
             raise InputError(
-                f"{source}: needs either fields.antenna, or antenna, the name of the only one; give one of them"
+                f"{source}: needs either fields.antenna, or antenna, the name of the only antenna: set one of the two"
             )
         super().__init__(bag, options.topic, options.fields, RFID, READ, options.units)
         self._stamp_unit = round(STAMP_OF_READ.in_unit(options.units.get("stamp", "us"), source)[1])
-        # the antenna of a message without reads
-        self._listening = None
+        self._antenna_of_message = None  # the field of the antenna, which names the antenna of a message without reads
         if options.antenna is None and LIST not in options.fields["antenna"]:
-            self._listening = Fields(bag, bag.topic(options.topic), {"antenna": options.fields["antenna"]})
-        self._number: list[int] = []
-        self._rounds: list[tuple[int, slice, str]] = []  # timestamp and reads of the message, antenna
+            self._antenna_of_message = Fields(bag, bag.topic(options.topic), {"antenna": options.fields["antenna"]})
+        self._number: list[int] = []  # by read: the index of its round
+        self._rounds: list[tuple[int, slice, str]] = []  # timestamp of the message [ns], rows of its reads, antenna
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Add the reads of a message, and its rounds if it holds whole ones."""
+        """Add the reads of a message, and also its inventory rounds if the option ``rounds`` is ``message``."""
         first = len(self._rows)
         super().add(item, t_ns)
         if self._options.rounds == "message":
             self._add_rounds(item, t_ns, slice(first, len(self._rows)))
 
     def _add_rounds(self, item: Stamped, t_ns: int, reads: slice) -> None:
-        """Add the rounds of a message: one for each antenna in it, or one of its own antenna if it has no reads."""
+        """Add the inventory rounds of a message, one for each antenna in its reads.
+
+        A message without reads is one round of the antenna that the message or the options name.
+        """
         of_reads = self._names["antenna"][reads]
         antennas = list(dict.fromkeys(of_reads))
         if not antennas and self._options.antenna:
             antennas = [self._options.antenna]
-        elif not antennas and self._listening is not None:
-            values = {"antenna": self._listening.rows(item.message, item.row)[0][0]}
+        elif not antennas and self._antenna_of_message is not None:
+            values = {"antenna": self._antenna_of_message.rows(item.message, item.row)[0][0]}
             antennas = [self._name(RFID["antenna"], values, item.row)]
         numbers = {name: len(self._rounds) + i for i, name in enumerate(antennas)}
         self._number += [numbers[name] for name in of_reads]
         self._rounds += [(t_ns, reads, name) for name in antennas]
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> RfidStream:
-        """All reads in their rounds. InputError names the invalid message."""
+        """Return all reads, grouped into inventory rounds. Raises InputError with the number of an invalid message."""
         table = self.rows_of()
         table = replace(table, names=table.names | {"epc": in_case(table.names["epc"], self._options.epc_case)})
         if self._options.rounds == "gaps":
@@ -208,19 +216,19 @@ class Reads(RowsOfTopic):
 
 
 class LandmarkTopic(TopicSettings, Turned):
-    """A topic of landmarks, such as those of common marker detectors."""
+    """A topic of landmarks, such as the messages of a marker detector."""
 
     fields: dict[LandmarkField, str] | None = None
-    """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; known for
-    common marker detectors"""
+    """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; not needed for
+    the messages of common marker detectors"""
     axes: Axes = "optical"
     """axes of the sensor that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
     frame: str | None = None
-    """frame of the sensor, whose pose is in tf_static; without it use axes and mounting"""
+    """frame of the sensor in tf_static, which gives its pose; if tf_static lacks it, use axes and mounting instead"""
 
 
 class Landmarks(RowsOfTopic):
-    """Collects ranges and bearings of a topic, or computes them from positions."""
+    """Collects the ranges and bearings of landmarks from a topic, or computes them from positions of landmarks."""
 
     def __init__(self, bag: Bag, options: LandmarkTopic, frames: StaticFrames) -> None:
         topic = bag.topic(options.topic)
@@ -230,7 +238,7 @@ class Landmarks(RowsOfTopic):
             if topic.type not in DETECTIONS:
                 known = ", ".join(DETECTIONS)
                 raise InputError(
-                    f"{bag.path}: topic {topic.name} is of type {topic.type}: give its fields; known without: {known}"
+                    f"{bag.path}: topic {topic.name} is of type {topic.type}: set fields; only these types need none: {known}"
                 )
             name, place = DETECTIONS[topic.type]
             fields = {"landmark": name} | {axis: f"{place}.{axis}" for axis in "xyz"}
@@ -243,7 +251,10 @@ class Landmarks(RowsOfTopic):
         super().__init__(bag, options.topic, fields, BEARING_RANGE, columns)
 
     def rows_of(self) -> TableRows:
-        """Ranges along the floor and bearings, in the robot frame if the sensor's pose is known."""
+        """Return the ranges along the floor [m] and the bearings [rad] of landmarks.
+
+        Ranges and bearings that are computed from positions are in the robot frame if tf_static has the frame of the sensor.
+        """
         rows = super().rows_of()
         if not self._places:
             return rows
@@ -259,8 +270,10 @@ class Landmarks(RowsOfTopic):
 
 
 class Corners(RowsOfTopic):
-    """Collects the corners of AprilTags as pixels of named points. The names are ``FAMILY-NUMBER/0`` to ``/3``, see
-    :func:`factorgraph_loc.maps.markers.corner_names`."""
+    """Collects the corners of detected AprilTags as pixels of named points.
+
+    The names are ``FAMILY-NUMBER/0`` to ``FAMILY-NUMBER/3``, see :func:`factorgraph_loc.maps.markers.corner_names`.
+    """
 
     def __init__(self, bag: Bag, name: str) -> None:
         topic = bag.topic(name, CORNERS)
@@ -270,7 +283,7 @@ class Corners(RowsOfTopic):
         super().__init__(bag, name, {}, SIGHTINGS)
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Add the pixels of a message."""
+        """Add the four corners of each detection of a message."""
         for detection in item.message.detections:
             names = corner_names(f"{detection.family}-{detection.id}")
             # apriltag starts at the lower left corner and continues with the lower right one
@@ -280,8 +293,11 @@ class Corners(RowsOfTopic):
 
 
 def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> RowsOfTopic:
-    """The collector of a topic of rows of the first of ``tables`` that knows the messages; of the first one otherwise. The corners
-    of AprilTags need no fields."""
+    """Return a collector for the topic of a table.
+
+    The table is the first of ``tables`` that has default fields for the message type, else the first of all. Corners of AprilTags
+    need no fields. Raises InputError if the fields do not fit the table.
+    """
     kind = bag.topic(options.topic).type
     if tables[0].name == SIGHTINGS.name and not options.fields and kind == CORNERS:
         return Corners(bag, options.topic)

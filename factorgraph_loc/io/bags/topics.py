@@ -1,7 +1,7 @@
-"""The topics of a bag: the fields and the timestamps of their messages, and the collectors that keep them.
+"""Reads the fields and the timestamps of the messages of a bag, and passes the messages to collectors.
 
 A field has a path: ``tag.epc``, or ``reads[].tag.epc`` for a list. Paths are checked against the message type before messages
-are read; errors list the available fields. Timestamps are those of headers (time of measurement) or of the recording.
+are read. Errors list the available fields. A timestamp is that of the header (time of measurement) or the time of receipt.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 LIST = "[]"
-ELEMENT = re.compile(r"\[(\d+)\]$")  # at the end of the path of one element of a list of numbers
+ELEMENT = re.compile(r"\[(\d+)\]$")  # matches the index at the end of a path such as covariance[0]
 BYTES = ("uint8", "byte", "char", "octet")  # a list of these is one value, such as an EPC
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 HEADER = "std_msgs/msg/Header"
-DEPTH = 6  # nesting levels of messages
+DEPTH = 6  # maximum nesting level of messages in which fields are listed
 
 Row = tuple[Any, ...]
 Clock = Literal["header", "receive"]
@@ -45,12 +45,14 @@ class TopicSettings(FileModel):
     topic: str
     """name of the topic"""
     clock: Clock | None = None
-    """timestamps of message headers or of receipt; by default as for the bag"""
+    """timestamps to use: header for those of message headers, receive for the time of receipt; by default as for the bag"""
 
 
 class Fields:
-    """Some fields of the messages of a topic. ``rows``: tuples of their values, in the order of ``names``, one for each element of
-    the lists in the paths, or one per message without lists."""
+    """Extracts the values of some fields from the messages of a topic.
+
+    ``paths``: the path of each field by its name. ``names``: the names of the fields. Raises InputError if a path is unknown.
+    """
 
     def __init__(self, bag: Bag, topic: Topic, paths: Mapping[Any, str]) -> None:
         self.names = tuple(paths)
@@ -61,7 +63,11 @@ class Fields:
         self._are_lists = [LIST in path for path in paths.values()]
 
     def rows(self, message: Any, row: int) -> list[Row]:
-        """The rows of message number ``row``; InputError if its lists have different lengths."""
+        """Return the values of message number ``row``, as tuples in the order of ``names``.
+
+        Without lists in the paths there is one tuple, else one for each element of the lists. Raises InputError if the lists have
+        different lengths.
+        """
         values = [get(message) for get in self._getters]
         if not any(self._are_lists):
             return [tuple(values)]
@@ -72,11 +78,14 @@ class Fields:
                 f"{self._where}: message {row} has lists of {counts} elements, expected lists of one length"
             )
         columns = (v if is_list else repeat(v) for v, is_list in zip(values, self._are_lists, strict=True))
-        return list(zip(*columns, strict=False))  # as many as the lists have elements
+        return list(zip(*columns, strict=False))  # ends with the lists, because repeat() is endless
 
 
 def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
-    """InputError with the available fields if the messages lack ``path``."""
+    """Raise InputError if the messages of a topic lack the field ``path``. The error lists the available fields.
+
+    ``store``: the message definitions. ``where``: the beginning of the error.
+    """
     known = leaves(store, topic.type)
     if path not in known and path + LIST not in known and ELEMENT.sub(LIST, path) not in known:
         raise InputError(f"{where} is {quoted(path)}, which {topic.type} lacks; its fields: {listed(known)}")
@@ -85,7 +94,10 @@ def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
 
 
 def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) -> list[str]:
-    """The paths of all numbers, texts, bytes and timestamps in a message type."""
+    """Return the paths of all numbers, texts, bytes and timestamps in the message type ``kind``.
+
+    ``store``: the message definitions. ``prefix``: put before each path. ``depth``: maximum nesting level.
+    """
     out: list[str] = []
     definition: Any = store.fielddefs[kind][1]
     for name, (form, detail) in definition:
@@ -102,13 +114,16 @@ def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) ->
 
 
 def has_header(bag: Bag, topic: Topic) -> bool:
-    """Whether the messages of a topic begin with a header."""
+    """True if the messages of a topic begin with a header."""
     fields: Any = bag.store(topic.name).fielddefs[topic.type][1]
     return bool(fields) and fields[0][0] == "header" and fields[0][1][1] == HEADER
 
 
 def as_text(value: Any) -> str:
-    """A name: text unchanged, bytes as hexadecimal digits (an EPC), a number in decimal digits."""
+    """Return a value as a name: text without spaces around it, bytes as hexadecimal digits (an EPC), a number in decimal digits.
+
+    The elements of a list are joined by hyphens.
+    """
     if isinstance(value, str):
         return value.strip()
     if isinstance(value, np.ndarray) and value.dtype == np.uint8:
@@ -121,7 +136,7 @@ def as_text(value: Any) -> str:
 
 
 def as_number(value: Any) -> float:
-    """A number, or NaN for another value."""
+    """Return the value as a number, or NaN if it is not a number."""
     try:
         return float(value)
     except (TypeError, ValueError):
@@ -129,7 +144,10 @@ def as_number(value: Any) -> float:
 
 
 def as_nanoseconds(value: Any, unit: int) -> int:
-    """A timestamp: a ROS time, or a number in units of ``unit`` nanoseconds. ValueError for another value."""
+    """Return a timestamp in nanoseconds.
+
+    ``value``: a ROS time, or a number in units of ``unit`` nanoseconds. Raises ValueError if it is a text without a number.
+    """
     if hasattr(value, "nanosec"):
         return int(value.sec) * 10**9 + int(value.nanosec)
     if isinstance(value, int):
@@ -138,7 +156,10 @@ def as_nanoseconds(value: Any, unit: int) -> int:
 
 
 def _getter(path: str) -> Callable[[Any], Any]:
-    """A getter of the field at a path, of an element of a list, or of that field of all elements."""
+    """Return a function that gets the field at ``path`` from a message.
+
+    The path ``list[2]`` gets one element of a list. The path ``list[].field`` gets the field of all elements as a list.
+    """
     if element := ELEMENT.search(path):
         of_list, i = attrgetter(path[: element.start()]), int(element[1])
         return lambda message: of_list(message)[i]
@@ -151,9 +172,10 @@ def _getter(path: str) -> Callable[[Any], Any]:
 
 
 class TopicRows:
-    """Collects N rows of numbers with timestamps, and the numbers of their messages, counted from 1 within the topic.
+    """Collects rows of numbers, each with a timestamp and the number of its message within the topic, counted from 1.
 
-    ``paths``: fields; each message has one row of these. Without paths, rows are appended. NaN replaces what is not a number.
+    ``source``: the bag and the topic, for errors. ``width``: how many numbers a row has. ``paths``: the fields that form the row of
+    a message. Without paths, the caller appends rows. A value that is not a number becomes NaN.
     """
 
     def __init__(self, source: str, width: int, paths: Sequence[str] = ()) -> None:
@@ -163,7 +185,7 @@ class TopicRows:
         self._row, self._t_ns, self._values = array("q"), array("q"), array("d")
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Add the row of a message."""
+        """Add the row of a message, whose timestamp is ``t_ns``."""
         assert self._get is not None
         values = self._get(item.message)
         self.append(item, t_ns, values if self._width > 1 else (values,))
@@ -186,18 +208,21 @@ class TopicRows:
 
     @property
     def values(self) -> Array:
-        """The numbers (N, width)."""
+        """The numbers (N, width) of all rows."""
         return np.array(self._values, dtype=float).reshape(-1, self._width)
 
     def in_order(self, names: Sequence[str], warnings: list[Notice]) -> tuple[Integers, Array]:
-        """Timestamps (M,) and numbers (M, width) in order of time, all finite; InputError names the invalid message."""
+        """Return timestamps (M,) [ns] and numbers (M, width) in order of time.
+
+        ``names``: the names of the columns. Raises InputError, with the number of the message, at a number that is not finite.
+        """
         checks.require_finite(self.source, self.rows, names, self.values)
         keep = checks.in_order(self.source, self.rows, self.t_ns, warnings)
         return self.t_ns[keep], self.values[keep]
 
 
 class Gatherer(Protocol):
-    """Collects the needed data from the messages of one topic; messages are not kept, so they are validated here."""
+    """Collects the needed data from the messages of one topic. ``add`` also checks a message, because messages are not kept."""
 
     def add(self, item: Stamped, t_ns: int) -> None: ...
 
@@ -206,7 +231,7 @@ G = TypeVar("G", bound=Gatherer)
 
 
 class Listeners:
-    """The collectors of each topic, with their clocks."""
+    """The collectors of the data of each topic of a bag. ``clock``: the timestamps to use for topics without a clock setting."""
 
     def __init__(self, bag: Bag, clock: Clock) -> None:
         self.bag, self.clock = bag, clock
@@ -214,27 +239,27 @@ class Listeners:
         self._of: dict[str, list[tuple[Stamper | None, Gatherer]]] = {}
 
     def stamper(self, topic: str, clock: Clock | None) -> Stamper:
-        """The timestamps of a topic, by its own clock or that of the bag."""
+        """Return the source of timestamps for a topic. ``clock``: the topic's setting, None for the clock of the bag."""
         return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
 
     def add(self, topic: str, gatherer: Gatherer, stamper: Stamper | None = None) -> None:
-        """Register a collector; without a ``stamper`` its messages have the time of receipt."""
+        """Register a collector for a topic. Without a ``stamper``, the timestamps are the times of receipt."""
         self._of.setdefault(topic, []).append((stamper, gatherer))
         if stamper is not None:
             self.stampers.append(stamper)
 
     def listen(self, options: TopicSettings, gatherer: G) -> G:
-        """Register a collector for a topic and return it."""
+        """Register a collector for the topic of these options, with the clock of the options, and return the collector."""
         self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
         return gatherer
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The topics that are read."""
+        """The names of the topics that have collectors."""
         return tuple(self._of)
 
     def run(self) -> None:
-        """Read the bag."""
+        """Read the bag once, and pass each message to the collectors of its topic. Raises InputError at an invalid message."""
         for item in self.bag.messages(list(self._of)):
             for stamper, gatherer in self._of[item.topic]:
                 try:
@@ -243,15 +268,18 @@ class Listeners:
                     kind = self.bag.topics[item.topic].type
                     where = f"{self.bag.path} {item.topic}:{item.row}"
                     raise InputError(
-                        f"{where}: {kind} is defined in the bag unlike in ROS: {error_text(error)}"
+                        f"{where}: the definition of {kind} in the bag differs from that of ROS: {error_text(error)}"
                     ) from error
         for stamper in self.stampers:
             stamper.check()
 
 
 class Stamper:
-    """Timestamps of the messages of one topic [ns], by a ``clock``; the time of receipt for messages without a header. For tf,
-    whose headers are nested, use :meth:`choose`."""
+    """Chooses the timestamps [ns] of the messages of one topic.
+
+    With the ``clock`` ``header`` they are those of headers, or the times of receipt for messages without a header. With ``receive``
+    they are the times of receipt. For tf, whose headers are nested, use :meth:`choose`.
+    """
 
     def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
         self.topic = topic
@@ -268,34 +296,39 @@ class Stamper:
         return self.choose(as_nanoseconds(item.message.header.stamp, 1), item.received)
 
     def choose(self, in_header: int, received: int) -> int:
-        """The timestamp of a header or the time of receipt [ns], by the clock."""
+        """Return one of two timestamps [ns], according to the clock: that of the header or the time of receipt."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
         return in_header if self.uses_header else received
 
     def check(self) -> None:
-        """InputError if headers are used but all their timestamps are 0."""
+        """Raise InputError if the timestamps of headers are used but all of them are 0."""
         if self.uses_header and len(self._delays) > 1 and not self._any_set:
-            raise InputError(f'{self._where}: the stamps of all headers are 0: set clock = "receive" in the manifest')
+            raise InputError(
+                f'{self._where}: the timestamps of all headers are 0: set clock = "receive" in the manifest'
+            )
 
     def delay(self) -> float | None:
-        """Median delay of receipt after the header's timestamp [s]; None without valid headers."""
+        """Return the median delay [s] from the header's timestamp to receipt. Returns None if no header has a timestamp."""
         if not self._any_set:
             return None
         return float(np.median(np.frombuffer(self._delays, dtype=np.int64))) / 1e9
 
 
 def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[Notice]]:
-    """A line on the clock used and the delays found, and warnings."""
+    """Return a text about the timestamps in use and the delays of receipt, and warnings about clocks that differ.
+
+    ``clock``: the clock setting of the bag.
+    """
     delays = {s.topic.name: delay for s in stampers if (delay := s.delay()) is not None}
-    line = "header stamps" if clock == "header" else "time of receipt"
+    line = "timestamps of headers" if clock == "header" else "time of receipt"
     if bare := sorted({s.topic.name for s in stampers if not s.has_header}):
-        line += f"; without headers, as received: {', '.join(bare)}" if clock == "header" else ""
+        line += f"; topics without headers have the time of receipt: {', '.join(bare)}" if clock == "header" else ""
     if delays:
-        line += "; received after the header's stamp (median): "
+        line += "; median delay of receipt after the header's timestamp: "
         line += ", ".join(f"{name} {delay:.3f} s" for name, delay in sorted(delays.items()))
     warnings = []
-    # the delay is 0 if the recorder sets both timestamps
+    # a topic that uses the time of receipt has no delay
     compared = {s.topic.name: s.delay() if s.uses_header else 0.0 for s in stampers}
     known = {name: delay for name, delay in compared.items() if delay is not None}
     if known and max(known.values()) - min(known.values()) > MAX_DELAY:

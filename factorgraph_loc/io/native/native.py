@@ -40,8 +40,11 @@ class Options(FileModel):
 
 
 class RunFile(FileModel):
-    """``run.toml``. ``rig`` and ``world``: a table, or a file name relative to the folder. ``has_heading``: False if the
-    reference's headings are meaningless."""
+    """The content of ``run.toml``.
+
+    ``rig``, ``world``: a table, or a file name relative to the folder. ``has_heading``: False if the headings of the reference are
+    meaningless.
+    """
 
     name: str | None = None
     rig: dict[str, Any] | str | None = None
@@ -52,7 +55,10 @@ class RunFile(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every reader takes options
-    """The log in the folder ``path``; t = 0 at the first timestamp of its tables. InputError names file, row and field."""
+    """Return the log in the folder ``path``. Its t = 0 is the first timestamp of the tables.
+
+    Raises InputError with file, row and field of an invalid value.
+    """
     if path is None or not (path / RUN_FILE).is_file():
         raise InputError(f"{path}: has no {RUN_FILE}, expected a folder in the native format")
     run_path = path / RUN_FILE
@@ -96,7 +102,7 @@ def world_of(run: RunFile, source: Path) -> World:
 
 
 def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
-    """The non-empty tables by name. A table of an unknown sensor gives a warning."""
+    """Return the non-empty tables in a folder by name. A table of an unknown sensor is skipped with a warning."""
     tables = {}
     stems = sorted(file.stem for file in folder.iterdir() if file.suffix in SUFFIXES)
     for name in dict.fromkeys((*native_tables(), *stems)):
@@ -125,7 +131,7 @@ def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
 
 
 def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, Stream]:
-    """The streams of all channels with tables."""
+    """Return the streams of all sensors that have ``tables``, by the name of the sensor."""
     rows: dict[str, dict[str, TableRows]] = {}
     for name, table in tables.items():
         if (known := native_table(name)) is not None:
@@ -144,11 +150,12 @@ def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[Not
 def write_native(
     log: Log, folder: str | Path, format: Literal["csv", "parquet"] = "csv", *, overwrite: bool = False
 ) -> None:
-    """Write a log as a new folder atomically; InputError if ``folder`` is not empty, unless it holds a log to ``overwrite``.
+    """Write a log atomically as a folder in the native format.
 
-    Timestamps are exact to the nanosecond, numbers to the last digit. Not written: covariances of the reference, and the smaller
-    one of a start's standard deviations in x and y. Images are copied. InputError for features of images, and for a log
-    without any measurements.
+    ``folder`` must be new or empty. With ``overwrite`` it may also contain a log in the native format, which is replaced.
+    Timestamps are exact to the nanosecond, numbers to the last digit. Images are copied. Two values are not written: covariances of
+    the reference, and the smaller of the start's standard deviations in x and y. Raises InputError for a log without measurements,
+    and for a log with features of images.
     """
     folder = Path(folder)
     if not log.streams:
@@ -157,7 +164,9 @@ def write_native(
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(folder) as temporary:
-            content = temporary / "log"  # with the permissions of a new folder; the temporary one is private
+            content = (
+                temporary / "log"
+            )  # has the permissions of a new folder, unlike the temporary folder, which is private
             content.mkdir()
             write_files(log, content, format)
             if overwrite and folder.exists():
@@ -166,9 +175,10 @@ def write_native(
 
 
 def require_new(folder: Path, *, overwrite: bool = False) -> None:
-    """InputError if ``folder`` is not empty or, with ``overwrite``, contains anything but a log in the native format.
+    """Raise InputError if a log cannot be written to ``folder``, because it is not empty.
 
-    Removes remains of earlier attempts to write it.
+    With ``overwrite``, the folder may contain a log in the native format, but nothing else. Temporary folders that remain from
+    interrupted writing are removed.
     """
     sweep(folder.parent)
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
@@ -179,7 +189,7 @@ def require_new(folder: Path, *, overwrite: bool = False) -> None:
         )
     if foreign := sorted(f.name for f in folder.iterdir() if f.suffix not in OF_LOGS and f.name != "camera"):
         raise InputError(
-            f"{folder}: contains {listed(foreign)}, not part of its log, which would be lost: expected only a log"
+            f"{folder}: contains {listed(foreign)}, which overwriting would delete: expected only the files of a log"
         )
 
 

@@ -1,4 +1,7 @@
-"""Rigs as files ``NAME.rig.toml`` and as text for people; the rig of a log without one, and the first rig of a robot."""
+"""Reads and writes rigs (descriptions of robots and their sensors) as files ``NAME.rig.toml``.
+
+Also makes the default rig of a log without one, and the first rig of a new robot.
+"""
 
 import json
 import math
@@ -16,7 +19,7 @@ from factorgraph_loc.model.sections import kind_of, several
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
 from factors import se2
 
-# for formats that do not describe the robot
+# the rig of logs in formats that do not describe the robot
 DEFAULT_RIG = Rig(
     name="default",
     bearing_range=BearingRangeSettings(range_sigma=0.2, range_sigma_relative=0.1, bearing_sigma=0.05),
@@ -25,18 +28,18 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 Drive = Literal["differential", "omnidirectional", "none"]
 RADIUS, HEIGHT = 0.25, 1.0  # m: distance of antennas from the robot's centre, height of antennas and camera
 FIELD_OF_VIEW = math.radians(60.0)
-# reads of antennas that nobody has calibrated: five in a row count as one, and few are read from behind
+# RFID settings of antennas that are not calibrated: five reads count as one, and few tags behind an antenna are read
 READS = {
     "tempering": 0.2,
     "models": {"default": {"kind": "beam", "behind": 0.05, "prior": {"range_scale": 0.3, "read_rate": 1.0}}},
     "uncertainty": {"yaw": 0.02, "antenna_yaw": 0.015, "time_offset": 0.02},
 }
-# standard deviations of the constants of wheels that nobody has calibrated
+# standard deviations of the constants of wheels that are not calibrated
 UNCALIBRATED = {"scale_distance": 0.03, "scale_rotation": 0.05, "heading_drift": 0.03}
 
 
 def default_rig(streams: Iterable[str]) -> Rig:
-    """The default rig for a log: several sensors of a kind have the same settings."""
+    """Return the default rig for a log with these ``streams``. Several sensors of one kind have the same settings."""
     named = [name for name in streams if kind_of(name) != name and DEFAULT_RIG.section(kind_of(name)) is not None]
     if not named:
         return DEFAULT_RIG
@@ -46,20 +49,26 @@ def default_rig(streams: Iterable[str]) -> Rig:
 
 
 def read_rig(path: str | Path) -> Rig:
-    """Read ``NAME.rig.toml``; InputError names file, key and expected value. Grids are read from the same folder."""
+    """Read a rig from ``NAME.rig.toml``, and files that it names from the same folder.
+
+    Raises InputError with the file, the key and the expected value.
+    """
     path = Path(path)
     return parse_model(Rig, read_toml(path), path).placed(path.parent)
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
-    """Write ``NAME.rig.toml``, and its grids to the same folder."""
+    """Write a rig to ``NAME.rig.toml``, and its grids (detection models of RFID as tables) to the same folder."""
     path = Path(path)
     rig.write_beside(path.parent)
     write_toml(path, rig.model_dump(mode="json", exclude_none=True))
 
 
 def rig_text(rig: Rig, remarks: Sequence[str] = ()) -> str:
-    """The content of a ``NAME.rig.toml``, with the meaning and the unit of each key as a comment; ``remarks`` come first."""
+    """Return the text of a file ``NAME.rig.toml``, with the meaning and the unit of each key as a comment.
+
+    ``remarks``: comments at the beginning of the file.
+    """
     meanings = {setting.key: setting for setting in settings_in(Rig)}
     lines = [f"# {remark}" for remark in remarks]
     lines += _lines(rig.model_dump(mode="json", exclude_none=True), (), (), meanings)
@@ -69,7 +78,11 @@ def rig_text(rig: Rig, remarks: Sequence[str] = ()) -> str:
 def _lines(
     table: Mapping[str, Any], path: tuple[str, ...], pattern: tuple[str, ...], meanings: Mapping[str, Setting]
 ) -> Iterator[str]:
-    """The lines of a table. ``pattern``: its path, with ``*`` for names of the user's own."""
+    """Yield the lines of a table of settings and of the tables below it.
+
+    ``path``: the keys that lead to the table. ``pattern``: the same keys, with ``*`` for names that the user chooses.
+    ``meanings``: the documentation of each setting by its pattern.
+    """
     tables = {key: value for key, value in table.items() if isinstance(value, Mapping)}
     own = {key: value for key, value in table.items() if key not in tables}
     if path and (own or not tables):
@@ -80,7 +93,7 @@ def _lines(
     for key, value in tables.items():
         known = any(name.startswith(".".join((*pattern, key))) for name in meanings)
         below = (*pattern, key if known else "*")
-        if not known and ".".join(path) in several():  # the name of one of several sensors
+        if not known and ".".join(path) in several():  # the key is the name of one of several sensors of a kind
             below = pattern
         yield from _lines(value, (*path, key), below, meanings)
 
@@ -97,11 +110,14 @@ def _comment(setting: Setting | None) -> str:
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """The sensors of a new robot.
+    """The sensors of a new robot, for :func:`new_rig`. None means that the robot lacks a sensor.
 
-    ``landmarks``: standard deviation of a range [m], by name for several sensors of landmarks. ``position``: standard deviation of
-    a measured x or y [m]. ``antennas``: names of RFID antennas. ``camera``: width and height of its images [px]. None stands for a
-    sensor that the robot lacks.
+    ``odometry``: the drive, ``none`` without odometry.
+    ``imu``: True if the robot has a gyro.
+    ``landmarks``: standard deviation of a measured range [m]; for several sensors of landmarks, that of each by name.
+    ``position``: standard deviation of a measured x or y [m].
+    ``antennas``: names of RFID antennas.
+    ``camera``: width and height of the images [px].
     """
 
     odometry: Drive = "differential"
@@ -113,12 +129,15 @@ class RobotOptions:
 
 
 def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
-    """A rig with these sensors, and remarks on guessed values. InputError if a value is out of bounds, or there is no sensor."""
+    """Return a rig with the sensors of a robot, and remarks on guessed values.
+
+    Raises InputError if a value is out of bounds, or if there is no sensor.
+    """
     sections: dict[str, Any] = {}
     remarks: list[str] = []
     if robot.odometry != "none":
         remarks.append(
-            "odometry: noise and uncertainty are those of unknown indoor wheels; `fgloc calibrate` learns them"
+            "odometry: noise and uncertainty are typical values of indoor robots; `fgloc calibrate` estimates them"
         )
         sections["odometry"] = {"uncertainty": UNCALIBRATED}
     if robot.odometry == "omnidirectional":
@@ -139,12 +158,13 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
     if robot.antennas:
         sections["rfid"] = {"antennas": _antennas(robot.antennas), **READS}
         remarks.append(
-            "rfid: names and places of the antennas are guesses: measure them; `fgloc calibrate` learns how they read"
+            "rfid: the positions and directions of the antennas are guesses: measure them; `fgloc calibrate` estimates the "
+            "detection model"
         )
     if robot.camera is not None:
         sections["camera"] = _camera(*robot.camera)
         remarks.append(
-            "camera: lens and mounting are guesses, 60 degrees wide, looking forward; calibrate the lens with OpenCV"
+            "camera: the lens (60 degrees wide) and the mounting (facing forward) are guesses; calibrate the lens with OpenCV"
         )
     if not sections:
         raise InputError("the new rig has no sensors, expected odometry, landmarks, positions, antennas or a camera")
@@ -152,7 +172,7 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
 
 
 def _nested(sections: Mapping[str, Any]) -> dict[str, Any]:
-    """The sections of a rig as its file has them: ``{"a": {"b": ...}}`` instead of ``{"a.b": ...}``."""
+    """Return the sections of a rig nested as in its file: ``{"a": {"b": ...}}`` instead of ``{"a.b": ...}``."""
     out: dict[str, Any] = {}
     for key, section in sections.items():
         kind, _, name = key.partition(".")
@@ -161,7 +181,10 @@ def _nested(sections: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _antennas(names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Antennas around the body, counter-clockwise from the front; two point to the left and to the right."""
+    """Return the settings of antennas that are evenly spaced around the robot, counter-clockwise from the front.
+
+    Two antennas face to the left and to the right.
+    """
     first = math.pi / 2.0 if len(names) == 2 else 0.0
     directions = [se2.wrap_scalar(first + 2.0 * math.pi * i / len(names)) for i in range(len(names))]
     return {

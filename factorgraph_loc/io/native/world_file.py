@@ -1,4 +1,4 @@
-"""Reading and writing of ``NAME.world.toml`` with its tables."""
+"""Reads and writes maps: files ``NAME.world.toml``, and the tables that they name."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,15 +20,16 @@ class _Markers(FileModel):
 
 
 def read_world(path: str | Path) -> World:
-    """Read ``NAME.world.toml``; InputError names file, key and expected value."""
+    """Read a map from ``NAME.world.toml``. Raises InputError with the file, the key and the expected value."""
     path = Path(path)
     return parse_world(read_toml(path), path, path.parent)
 
 
 def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> World:
-    """A map from the content of a file ``source``, with tables in ``folder``. InputError as in :func:`read_world`.
+    """Return a map from the ``content`` of a world file.
 
-    ``walls`` may name an occupancy map, a layer a table; corners of ``markers`` become points.
+    ``source``: the file to name in errors. ``folder``: the folder of the tables. ``walls`` may name an occupancy map, and a layer
+    such as ``tags`` may name a table. The corners of ``markers`` become points. Raises InputError as :func:`read_world`.
     """
     for name, layer in layers().items():
         if layer.read and name in content:
@@ -52,7 +53,7 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
 
 
 def write_world(world: World, path: str | Path) -> None:
-    """Write ``NAME.world.toml``, tables of layers such as ``NAME.tags.csv``, and points as ``NAME.points.parquet``."""
+    """Write a map to ``NAME.world.toml``, its layers to tables such as ``NAME.tags.csv``, its points to ``NAME.points.parquet``."""
     path = Path(path)
     content = world.model_dump(mode="json", exclude_none=True, exclude={"points"})
     base = path.name.removesuffix(".toml").removesuffix(".world")

@@ -1,4 +1,4 @@
-"""Readers of log formats, one module each, and ``load``, which selects the reader."""
+"""Readers of log formats, one module for each format, and ``load``, which selects the reader of a log."""
 
 from factorgraph_loc.io.readers.load import LogLike, RigLike, WorldLike, load, load_all, read_log, reader
 from factorgraph_loc.io.readers.manifests import Dataset, Manifest, describe, read_manifest, verify

@@ -1,4 +1,4 @@
-"""The logs of files in any format, each read by a module with a model of ``Options`` and a function ``read(path, options)``."""
+"""Loads logs in any format. Each format has a reader: a module with a model ``Options`` and a function ``read(path, options)``."""
 
 import itertools
 import math
@@ -30,13 +30,13 @@ from factorgraph_loc.text import listed, notice, quoted
 LogLike = Log | str | Path
 RigLike = Rig | str | Path
 WorldLike = World | str | Path
-MOST = 1000  # maximum number of logs from lists of options
+MOST = 1000  # maximum number of logs that lists of option values may give
 TABLES = (".csv", *JSON_SUFFIXES)
 T = TypeVar("T")
 
 
 def reader(name: str) -> Any:
-    """The module of a reader; InputError with the most similar name if it is unknown."""
+    """Return the module of the reader ``name``. Raises InputError with the most similar name if there is no such reader."""
     if name not in READERS:
         raise InputError(f"there is no reader {quoted(name)}{nearest(name, list(READERS))}")
     return READERS[name]
@@ -44,7 +44,11 @@ def reader(name: str) -> Any:
 
 @dataclass(frozen=True)
 class _Source:
-    """A reader, its input, the name of its log, None for that of the reader, and the manifest in ``file`` that describes it."""
+    """Where a log comes from.
+
+    ``reader``: name of the reader. ``path``: its input. ``name``: name of the log, None if the reader names it. ``manifest``: the
+    manifest that describes the log, if there is one. ``file``: the file of the manifest.
+    """
 
     reader: str
     path: Path | None
@@ -53,7 +57,7 @@ class _Source:
     file: Path = Path()
 
     def named(self, what: str, data_root: str | Path | None) -> Path | None:
-        """The file of the rig or world, as ``what`` says, that the manifest names."""
+        """Return the path of the rig or world file that the manifest names. ``what``: ``rig`` or ``world``. None without a name."""
         name = getattr(self.manifest, what, None)
         expected = f"{EXPECTED}; or `--{what} FILE` in its place"
         return None if name is None else named_path(self.file.parent, name, self.file, data_root, expected)
@@ -68,12 +72,14 @@ def load(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> list[Log]:
-    """The logs that ``log`` refers to.
+    """Return the logs that ``log`` refers to.
 
-    ``log``: a manifest, a folder in the native format or its ``run.toml``, a name in ``manifests()``, any path with ``reader``, or
-    a log. ``options``: of the reader, overriding those of a manifest; a list, or text with commas, gives one log per value. ``rig``
-    and ``world``, values or files, replace those of the log. ``data_root``: a folder that a manifest may lead to besides its own,
-    by default the environment's FGLOC_DATA. InputError describes what is invalid in one line.
+    ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a log. With
+    ``reader``, any path that the reader can read.
+    ``options``: options of the reader, which override those of a manifest. A list, or a text with commas, gives one log per value.
+    ``rig``, ``world``: values or files that replace the rig and the world of the log.
+    ``data_root``: the folder of data sets; by default the environment variable FGLOC_DATA.
+    Raises InputError with a message of one line about what is invalid.
     """
     if isinstance(log, Log):
         return [replace(log, rig=_value(rig, read_rig) or log.rig, world=_value(world, read_world) or log.world)]
@@ -83,13 +89,13 @@ def load(
     given = dict(options or {})
     described = source.manifest.options if source.manifest else {}
     choices = {key: _choices(value) for key, value in described.items()}
-    # lists are given as text with commas on the command line
+    # on the command line, a list is a text with commas
     choices |= {
         key: [part.strip() for part in value.split(",")] if isinstance(value, str) else _choices(value)
         for key, value in given.items()
     }
     if (count := math.prod(map(len, choices.values()))) > MOST:
-        raise InputError(f"{log}: its options give {count:,} logs, expected at most {MOST:,}")
+        raise InputError(f"{log}: the lists in its options give {count:,} logs, expected at most {MOST:,}")
     if empty := [key for key, values in choices.items() if not values]:
         raise InputError(f"{log}: option {empty[0]} is an empty list, expected a value or several")
     naming = [
@@ -106,7 +112,7 @@ def load(
 def load_all(
     logs: LogLike | Sequence[LogLike], rig: RigLike | None = None, world: WorldLike | None = None
 ) -> list[Log]:
-    """The logs that one or several values refer to, as in :func:`load`."""
+    """Return the logs that one or several ``logs`` refer to. ``rig`` and ``world`` replace those of the logs, see :func:`load`."""
     several = [logs] if isinstance(logs, (Log, str, Path)) else logs
     return [loaded for log in several for loaded in load(log, rig=rig, world=world)]
 
@@ -120,7 +126,7 @@ def read_log(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> Log:
-    """The log that ``log`` refers to, as in :func:`load`; InputError if there are several."""
+    """Return the one log that ``log`` refers to. Raises InputError if there are several. For the arguments see :func:`load`."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
     if len(logs) > 1:
         raise InputError(f"{log} refers to {len(logs)} logs, expected one: {listed(loaded.name for loaded in logs)}")
@@ -128,12 +134,12 @@ def read_log(
 
 
 def _value(given: T | str | Path | None, read: Callable[[str | Path], T]) -> T | None:
-    """A value, or that in a file."""
+    """Return ``given``, or the result of ``read`` if ``given`` is the name of a file."""
     return read(given) if isinstance(given, str | Path) else given
 
 
 def _choices(value: Any) -> list[Any]:
-    """The values of an option, which may be a list."""
+    """Return the values of an option as a list. An option that is not a list has one value."""
     return list(value) if isinstance(value, (list, tuple)) else [value]
 
 
@@ -159,7 +165,10 @@ def _find(log: str, data_root: str | Path | None, named: str | None) -> _Source:
         return _from_manifest(known[log], data_root)
     if path.is_dir():
         require_metadata(path)
-        raise InputError(f"{log}: has no {RUN_FILE}, so it is not in the native format; name the reader of its format")
+        raise InputError(
+            f"{log}: has no {RUN_FILE}, so it is not in the native format: write a manifest with `fgloc manifest {log}`, "
+            "or name the reader of its format"
+        )
     raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
 
 
@@ -172,16 +181,16 @@ def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
         return _Source("pyfg", path)
     if is_pose_file(path):
         raise InputError(
-            f"{log}: is a file of poses, expected a log: name it as odometry or reference in a manifest with the reader mapped, "
+            f'{log}: is a file of poses, expected a log: name it as odometry or reference in a manifest with reader = "mapped", '
             f"or compare it with a log: `fgloc score {log} LOG`"
         )
     if path.suffix.lower() in TABLES:
-        raise InputError(f"{log}: is a table: describe its columns in a manifest with the reader mapped")
-    raise InputError(f"{log}: is not a manifest (.toml); name the reader of this format")
+        raise InputError(f'{log}: is a table: describe its columns in a manifest with reader = "mapped"')
+    raise InputError(f"{log}: is not a manifest (.toml): name the reader of its format")
 
 
 def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
-    """The source that a manifest describes."""
+    """Return the source that the manifest in ``file`` describes. Raises InputError if its data do not exist."""
     manifest = read_manifest(file)
     path = None
     if manifest.path is not None:
@@ -194,8 +203,11 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
 
 
 def _read(source: _Source, rig: Rig | None, world: World | None, options: Mapping[str, Any], naming: list[str]) -> Log:
-    """One log, with ``rig`` and ``world`` instead of the reader's if given; ``naming``: options that are appended to its name to
-    make it unique."""
+    """Read and check one log.
+
+    ``rig``, ``world``: replace those of the reader if given. ``options``: one value per option. ``naming``: the options that are
+    appended to the name of the log to make it unique.
+    """
     chosen, manifest = reader(source.reader), source.manifest
     options = with_wheels_of(rig, options)
     log: Log = chosen.read(source.path, parse_model(chosen.Options, options, f"options of reader {source.reader}"))
@@ -224,7 +236,7 @@ def _read(source: _Source, rig: Rig | None, world: World | None, options: Mappin
         else:
             warnings.append(notice("unused_gyro", "the gyro is not used, because the rig's sensors do not include imu"))
     if log.rig.name == DEFAULT_RIG.name:
-        sentence = "no rig is given: the default rig does not have this robot's noise and mounting"
+        sentence = "no rig is given: the default rig lacks this robot's noise and the mounting of its sensors"
         warnings.append(notice("default_rig", sentence))
     log = replace(log, rig=with_wheels_in(log.rig, options))
     return replace(log, warnings=(*warnings, *look_over(log)))

@@ -1,4 +1,4 @@
-"""The shipped data sets, each described by a manifest ``NAME.toml``."""
+"""Manifests: files that describe a log, its reader, rig and map. Shipped data sets have manifests, too."""
 
 import hashlib
 import os
@@ -19,7 +19,7 @@ from factorgraph_loc.model.log import StartPose
 
 
 class StartSettings(FileModel):
-    """A known start: pose, standard deviations, and absolute time (by default t = 0 of the log)."""
+    """A known start: pose, standard deviations of position and heading, and absolute time, by default t = 0 of the log."""
 
     x: Coordinate
     y: Coordinate
@@ -29,15 +29,21 @@ class StartSettings(FileModel):
     t_ns: Annotated[int, Field(ge=-LATEST, le=LATEST), InUnit("ns")] | None = None
 
     def pose(self, t0_ns: int) -> StartPose:
-        """The start of a log whose t = 0 is at ``t0_ns``."""
+        """Return the start of a log. ``t0_ns``: the absolute time of the log's t = 0 [ns]."""
         t = 0.0 if self.t_ns is None else (self.t_ns - t0_ns) / 1e9
         sigmas = np.array((self.sigma_position, self.sigma_position, self.sigma_heading))
         return StartPose(t, np.array((self.x, self.y, self.heading)), sigmas)
 
 
 class Manifest(FileModel):
-    """A manifest. ``path``, ``rig``, ``world`` and the files of ``checksums`` (sha256) lie below its folder or the data folder.
-    ``options``: of the reader; a list of values gives several logs. ``markers``: detected in the log's images."""
+    """A manifest, the description of one or several logs.
+
+    ``reader``: name of the reader of the log. ``options``: its options; a list of values gives several logs.
+    ``path``, ``rig``, ``world``: the data, the rig and the map, below the folder of the manifest or the data folder.
+    ``start``: a known start of the log.
+    ``markers``: the family of the markers to detect in the images of the log.
+    ``checksums``: the sha256 of each file by name.
+    """
 
     title: str
     reader: str
@@ -54,7 +60,7 @@ class Manifest(FileModel):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A shipped data set; ``present``: whether its files exist."""
+    """A shipped data set. ``present``: True if its files exist."""
 
     name: str
     title: str
@@ -65,12 +71,12 @@ class Dataset:
 
 
 def read_manifest(file: Path) -> Manifest:
-    """Read a manifest; InputError names file, key and expected value."""
+    """Read a manifest. Raises InputError with the file, the key and the expected value."""
     return parse_model(Manifest, read_toml(file), file)
 
 
 def describe(data_root: str | Path | None = None) -> list[Dataset]:
-    """The shipped data sets, sorted by name; InputError if a given data root does not exist."""
+    """Return the shipped data sets, sorted by name. Raises InputError if the given ``data_root`` does not exist."""
     datasets = []
     for name, file in manifests().items():
         m = read_manifest(file)
@@ -89,7 +95,7 @@ def is_present(manifest: Manifest, file: Path, data_root: str | Path | None) -> 
 
 
 def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]:
-    """Missing or modified files of a manifest, one line each."""
+    """Return a line about each file in the checksums of a manifest that is missing or modified."""
     if not manifest.checksums:
         return []
     root = find_data_root(data_root, manifest.title)

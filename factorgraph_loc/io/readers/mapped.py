@@ -1,4 +1,4 @@
-"""The reader of folders of foreign tables, described by column mappings in a manifest."""
+"""The reader of folders with tables of other programs. The manifest maps the columns of each table to fields."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -45,70 +45,72 @@ ODOMETRY = (
     *(("t", *wheels) for left in WHEELS for wheels in (motions.wheels_of(left, 2), motions.wheels_of(left, 4))),
     *POSES,
 )
-LEAST_AROUND = 300.0  # rad between rows, which no robot can rotate
+LEAST_AROUND = 300.0  # change of heading between rows above which the heading is assumed to wrap at 360, in degrees
 COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, WHEEL_COLUMNS, POSE_COLUMNS) for c in table.columns}
 COLUMNS |= {f"rear_{name}": column for name, column in COLUMNS.items() if name.startswith(("left", "right"))}
 RATES = ("wx", "wy", "wz")
 FILE_NAME = named("file_name", "a name in the table of the sensor")
 MAP_NAME = named("name", "a name in the map")
-RATE = replace(IMU["w"], may_lack=True)  # about one of three axes; some may be missing
+RATE = replace(IMU["w"], may_lack=True)  # turn rate about one of three axes, which may be missing in a row
 
 
 class PosesFile(TimedMapping, Turned):
     """A file with poses."""
 
     format: Literal["columns", "tum", "kitti", "euroc"] = "columns"
-    """columns by a mapping, a TUM or EuRoC file, or a KITTI file with its times"""
+    """format of the file: columns for a table with a mapping of columns, or a common format of trajectories"""
     columns: dict[str, str] = Field(default_factory=dict)
     """column of the file for each field, if the format is columns"""
     times: str | None = None
-    """file of the times of a KITTI file"""
+    """file with the timestamps of a KITTI file"""
 
     def is_in_format(self) -> bool:
-        """Whether the file is in the format of another program."""
+        """True if the file is in TUM, KITTI or EuRoC format, not a table with mapped columns."""
         return self.format != "columns" or self.times is not None
 
 
 class OdometryFile(PosesFile, motions.WheelSizes):
-    """``columns``: t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the previous row); x, y, heading or a
-    quaternion (poses; only their relative motion is used); left, right (distances of the wheels), left_speed, right_speed
-    (their speeds), left_angle, right_angle (their angles), left_rate, right_rate (their angular rates). Of four wheels also
-    rear_left, rear_right (rear_left_speed, ...). ``radius`` and ``track`` of the rig ([odometry.wheels]) have precedence over
-    these settings."""
+    """The table of odometry. ``columns`` maps t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the previous
+    row); x, y, and heading or a quaternion (poses, of which only the relative motion is used); left, right (distances of the
+    wheels); left_speed, right_speed (speeds); left_angle, right_angle (angles); left_rate, right_rate (angular rates).
+    Four wheels also need rear_left, rear_right (rear_left_speed, ...). ``radius`` and ``track`` of the rig ([odometry.wheels]) have
+    precedence over these settings."""
 
 
 class ReferenceFile(PosesFile):
     """The reference."""
 
     has_heading: bool = True
-    """whether the headings mean anything"""
+    """true if the reference measures the heading; false if its headings are meaningless"""
 
 
 class NamesFile(ColumnMapping):
-    """A table of names. ``columns``: ``file_name``, a name in the table of the sensor, and ``name``, that in the map."""
+    """A table that translates names. ``columns`` maps ``file_name``, a name in the table of a sensor, and ``name``, the name in the
+    map."""
 
 
 class NamedFile(TimedMapping):
-    """A table of a sensor that names things of the map."""
+    """A table of a sensor whose rows name an object of the map, such as a landmark."""
 
     names: NamesFile | None = None
-    """table of the names in the map by those in the file; rows with other names are skipped"""
+    """table that translates the names in the file to those in the map; rows with names that it lacks are skipped"""
 
 
 class ImuFile(TimedMapping, Turned):
-    """``columns``: t and w, the turn rate about the vertical axis; or wx, wy and wz, about axes whose orientation is given by
-    ``axes`` and ``mounting``."""
+    """The table of an IMU. ``columns`` maps t and w, the turn rate about the vertical axis; or t, wx, wy and wz, the angular
+    velocity in the frame of the IMU, whose orientation is given by ``axes`` and ``mounting``."""
 
 
 class ImageFile(TimedMapping):
     """The table of images."""
 
     folder: str = "."
-    """folder of the images, by default that of the log"""
+    """folder of the images, by default the folder of the log"""
 
 
 class Options(FileModel):
-    """The tables of a log. ``readers`` has several RFID readers by any names, instead of ``rfid``."""
+    """The tables of a log. ``rfid`` describes the reads of one RFID reader. ``readers`` replaces it for several RFID readers, each
+    with a name that the user chooses."""
 
     odometry: OdometryFile | None = None
     imu: ImuFile | None = None
@@ -119,7 +121,7 @@ class Options(FileModel):
     camera: ImageFile | None = None
     reference: ReferenceFile | None = None
     world: dict[str, Any] = Field(default_factory=dict)
-    """the map as in a world file, whose files are in the folder of the log"""
+    """the map, with the same keys as a world file; the files that it names are in the folder of the log"""
 
 
 def _has_names(tables: Sequence[Table]) -> bool:
@@ -127,12 +129,12 @@ def _has_names(tables: Sequence[Table]) -> bool:
 
 
 def _type_of(name: str) -> Any:
-    """The type of the mapping of a table."""
+    """Return the type of the setting that describes the table ``name``."""
     kind = NamedFile if _has_names(native_tables()[name][1]) else TimedMapping
     return one_or_several(kind) if name in several() else kind | None
 
 
-OTHERS = [name for name in native_tables() if name not in Options.model_fields]  # tables that need a mapping only
+OTHERS = [name for name in native_tables() if name not in Options.model_fields]  # tables without options of their own
 add_fields(
     Options,
     {name: (_type_of(name), None) for name in OTHERS},
@@ -141,13 +143,18 @@ add_fields(
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The log in the folder ``path``; t = 0 at its first timestamp. InputError names file, row and column."""
+    """Return the log in the folder ``path``. Its t = 0 is the first timestamp of the sensors.
+
+    Raises InputError with file, row and column of an invalid value.
+    """
     if path is None:
         raise InputError("mapped: path is missing in the manifest: name the folder of the log's files")
     if not path.is_dir():
         raise InputError(f"{path}: is not a folder: path in the manifest names the folder of the log's files")
     if options.odometry is None:
-        raise InputError(f"{path}: odometry is missing in [options], which every estimator needs")
+        raise InputError(
+            f"{path}: [options] has no odometry, which every estimator needs: describe its table in [options.odometry]"
+        )
     folder = TableFolder(path)
     warnings = folder.warnings
     odometry_t_ns, moves = _odometry(folder, options.odometry)
@@ -171,8 +178,8 @@ def read(path: Path | None, options: Options) -> Log:
         reference = read_reference(folder, of_reference, t0_ns)
         if reference.t[0] > (stamps[0][-1] - t0_ns) / 1e9 or reference.t[-1] < (stamps[0][0] - t0_ns) / 1e9:
             sentence = (
-                "{source}: the reference and the odometry do not overlap: t = {reference:.3f} s and {odometry:.3f} s begin them; "
-                "check units.t and clock_offset"
+                "{source}: the reference and the odometry do not overlap in time: they begin at t = {reference:.3f} s and "
+                "{odometry:.3f} s; check units.t and clock_offset"
             )
             begins = reference.t[0], (stamps[0][0] - t0_ns) / 1e9
             warnings.append(notice("no_overlap", sentence, of_reference.file, *begins))
@@ -189,7 +196,7 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) -> TableRows:
-    """A file in ``folder`` as one of ``tables`` of the native format."""
+    """Read a file in ``folder`` as a table of the native format, the first of ``tables`` whose fields ``mapping`` maps."""
     shapes = tuple(_fields(table, mapping) for table in tables)
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):
@@ -200,10 +207,10 @@ def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) 
     unknown = {name: np.full(len(rows.rows), np.nan) for name, column in columns.items() if column.may_lack}
     numbers = unknown | rows.numbers
     for column in known:
-        if column.units is STAMPS:  # another time, by the same clock
+        if column.units is STAMPS:  # a second time of the row, such as the end of an interval, has the same clock
             numbers[column.name] = numbers[column.name] + 1e9 * mapping.clock_offset
         if column.units is ANGLE:
-            numbers[column.name] = se2.wrap(numbers[column.name])  # others count from 0 to 2 pi
+            numbers[column.name] = se2.wrap(numbers[column.name])  # the file may count from 0 to 2 pi
     if isinstance(mapping, ImuFile):
         numbers = {"w": _about_z(rows, mapping, numbers)}
     rows = replace(rows, numbers=numbers)
@@ -213,22 +220,25 @@ def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) 
 
 
 def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRows:
-    """The rows of a table with the names of the map, without the rows whose names the table of names lacks."""
+    """Return the rows of a table with names translated to those of the map.
+
+    ``naming`` describes the table of the translations. Rows with a name that it lacks are skipped with a warning.
+    """
     path = folder.file(naming.file)
     known = _names(path, naming)
     ((column, names),) = table.names.items()
     kept = np.flatnonzero([name in known for name in names])
     if not len(kept):
-        raise InputError(f"{table.path}: no row has a {column} that {path.name} names, such as {listed(known)}")
+        raise InputError(f"{table.path}: no row has a {column} that is listed in {path.name}, such as {listed(known)}")
     if skipped := len(names) - len(kept):
-        sentence = "{source}: {rows} rows have a {column} that is not among the names taken from {names}: skipped"
+        sentence = "{source}: {rows} rows are skipped: their {column} is not listed in {names}"
         folder.warnings.append(notice("unknown_names", sentence, table.path, skipped, column, path.name))
     selected = table.rows_at(kept)
     return replace(selected, names={column: [known[name] for name in selected.names[column]]})
 
 
 def _names(path: Path, naming: NamesFile) -> dict[str, str]:
-    """The names in the map by those in the table of a sensor; InputError if one occurs twice."""
+    """Return the name in the map for each name in the table of a sensor. Raises InputError if a name is listed twice."""
     mapped = read_mapped(path, naming, (("file_name", "name"),))
     known: dict[str, str] = {}
     pairs = zip(mapped.names("file_name", FILE_NAME), mapped.names("name", MAP_NAME), strict=True)
@@ -240,7 +250,7 @@ def _names(path: Path, naming: NamesFile) -> dict[str, str]:
 
 
 def _fields(table: Table, mapping: TimedMapping) -> tuple[str, ...]:
-    """The fields of a table that have to be mapped, and those of the others that are."""
+    """Return the fields to read: those that a table requires, and optional ones that ``mapping`` maps."""
     return "t", *(c.name for c in table.columns[1:] if not c.may_lack or c.name in mapping.columns)
 
 
@@ -270,7 +280,7 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
     if (mapping := options.inventories) is not None:
         if gaps:
             raise InputError(
-                f"{path}: round_gap has no effect, as inventories define the rounds: remove one of the two"
+                f"{path}: round_gap has no effect, because inventories define the rounds: remove one of the two"
             )
         antennas = {name: given for file in files for name, given in file.antennas.items()}
         inventories = _table(folder, native_tables()["inventories"][1], mapping)
@@ -284,7 +294,10 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
 
 
 def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Array]:
-    """Timestamps (N,), and velocities (N, 2) or increments (N, 3). InputError names file and row."""
+    """Return the timestamps (N,) [ns] of the odometry, and its velocities (N, 2) or increments (N, 3).
+
+    Raises InputError with the file and the row of an invalid value.
+    """
     path, warnings = folder.file(options.file), folder.warnings
     if options.is_in_format():
         if options.has_sizes():
@@ -296,8 +309,8 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
     wheel_names = motions.wheels_of(side, 4 if f"rear_{side}" in mapped.columns else 2) if side else ()
     if side is None and options.has_sizes():
         raise InputError(
-            f"{path}: track, radius or base is given, but no columns of wheels are mapped, such as left and right; map them, or "
-            "remove it"
+            f"{path}: track, radius or base is given, but columns maps no wheels, such as left and right: map them, or remove "
+            "track, radius and base"
         )
     if options.base is not None and len(wheel_names) == 2:
         raise InputError(f"{path}: base is given, but only two wheels are mapped: map rear_{side} too, or remove base")
@@ -324,7 +337,10 @@ def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Arr
 
 
 def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
-    """The reference in seconds after ``t0_ns``; InputError names file and row of an invalid value."""
+    """Return the reference trajectory, with times in seconds after ``t0_ns`` [ns].
+
+    Raises InputError with the file and the row of an invalid value.
+    """
     path, warnings = folder.file(options.file), folder.warnings
     if options.is_in_format():
         t_ns, poses = _in_format(folder, options)
@@ -332,7 +348,7 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
     mapped = folder.read(options, (*POSES, ("t", "x", "y")))
     if "heading" not in mapped.columns and "qw" not in mapped.columns and options.has_heading:
         raise InputError(
-            f"{path}: [options.reference] columns names neither heading nor qx, qy, qz, qw: add one of them, or set "
+            f"{path}: columns in [options.reference] maps neither heading nor qx, qy, qz, qw: map one of them, or set "
             "has_heading = false"
         )
     t_ns, columns = _columns(mapped, options.clock_offset)
@@ -342,12 +358,12 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
 
 
 def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array]:
-    """Timestamps (N,) and planar poses (N, 3) of a file in the format of another program."""
+    """Return the timestamps (N,) [ns] and the planar poses (N, 3) of a file in TUM, KITTI or EuRoC format."""
     path = folder.file(options.file)
     if options.columns or options.units:
         raise InputError(f"{path}: format {options.format} names its own columns and units: remove columns and units")
     if options.format == "kitti" and options.times is None:
-        raise InputError(f"{path}: format is kitti, but times is missing: name the file of the stamps")
+        raise InputError(f"{path}: format is kitti, but times is missing: set it to the file with the timestamps")
     if options.format != "kitti" and options.times is not None:
         raise InputError(f"{path}: times is given, but format is {options.format}, not kitti: remove times")
     turned: Turned = options

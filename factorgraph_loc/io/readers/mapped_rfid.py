@@ -1,5 +1,7 @@
-"""RFID reads from mapped CSV or JSON lines of readers and their tools, with presets; also from tables with a column of strengths
-per tag or per antenna."""
+"""Reads RFID reads from CSV or JSON lines of other programs, by a mapping of columns. Presets know the files of common tools.
+
+A table may also have a column of signal strengths for each tag or each antenna.
+"""
 
 import base64
 import re
@@ -31,33 +33,34 @@ from factorgraph_loc.sensors.rfid.tables import SIGNALS
 from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.se2 import Array
 
-NAME = "the * of "  # and the pattern: the column of the names
+NAME = "the * of "  # followed by the pattern: the label of what * stands for, in errors
 EPCS = ("epc", "epc_base64")
 OPTIONAL = (*SIGNALS, *EPCS, "channel", "last", "count")
 CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")
 COUNT = Column("count", "number", PURE, 0.0, 1e9, True, "number of reads in the row")
 REQUIRED = tuple(tuple(("t", epc, *antenna) for epc in EPCS) for antenna in (("antenna",), ()))
-STANDARD = str.maketrans("-_", "+/")  # from the alphabet of base64 for addresses
+STANDARD = str.maketrans("-_", "+/")  # converts URL-safe base64 to standard base64
 
 
 def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
-    """The reads of a table whose columns of strengths are a pattern, ``rssi_*``, with a row for each cell that is not empty.
+    """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as ``rssi_*``.
 
-    What ``*`` stands for in a column's name is its antenna, or its tag if ``columns`` maps the antenna or ``antenna``, the only
-    one, is given. InputError names file, row and column.
+    Each cell that is not empty is a read. The text in place of ``*`` is the name of the antenna. It is the EPC of the tag instead
+    if ``columns`` maps the antenna, or if ``antenna``, the name of the only antenna, is given. Raises InputError with file, row and
+    column of an invalid value.
     """
     pattern = mapping.columns["rssi"]
     fixed = {field: column for field, column in mapping.columns.items() if field != "rssi"}
     missing = "epc" if "antenna" in fixed or antenna is not None else "antenna"
     if set(fixed) | {missing} != {"t", "epc", *(() if antenna is not None else ("antenna",))} or missing in fixed:
         expected = "t and one of epc, antenna" if antenna is None else "t"
-        raise InputError(f"{path}: with rssi = {quoted(pattern)} columns maps {listed(fixed)}, expected {expected}")
+        raise InputError(f"{path}: columns with rssi = {quoted(pattern)} maps {listed(fixed)}, expected {expected}")
     units = {field: unit for field, unit in mapping.units.items() if field != "rssi"}
     narrow = read_mapped(path, mapping.model_copy(update={"columns": fixed, "units": units}), (tuple(fixed),))
     named = re.compile("(.+)".join(map(re.escape, pattern.split("*", 1))), re.DOTALL)
     names = {column: match[1] for column in narrow.left_out if (match := named.fullmatch(column))}
     if not names:
-        raise InputError(f"{path}: has no column {quoted(pattern)}, it has {listed(narrow.left_out)}")
+        raise InputError(f"{path}: has no column that matches {quoted(pattern)}, only {listed(narrow.left_out)}")
     strengths = {f"{NAME}{column}": column for column in names}
     wide_mapping = mapping.model_copy(update={"columns": fixed | strengths, "units": units})
     wide = read_mapped(path, wide_mapping, (tuple(fixed),), tuple(strengths))
@@ -73,29 +76,32 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
 
 
 class Channels(FileModel):
-    """Evenly spaced channels."""
+    """The carrier frequencies of evenly spaced channels."""
 
     first: Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")]
     """frequency of channel 1"""
     step: Annotated[float, Field(gt=0.0, lt=100.0), InUnit("MHz")]
-    """frequency from one channel to the next"""
+    """difference in frequency between neighbouring channels"""
 
 
 @cache
 def presets() -> dict[str, dict[str, dict[str, str]]]:
-    """The columns and units of the files of known tools, by name."""
+    """Return the ``columns`` and ``units`` of the files of known RFID tools, by the name of the preset."""
     content: dict[str, dict[str, dict[str, str]]] = read_toml(shipped.readers()["mapped"])
     return content
 
 
 class RfidFile(TimedMapping, ReadNames):
-    """``columns``: t (or the first of several reads), epc or epc_base64, antenna, rssi (with ``*``: a column per tag or antenna),
-    phase, frequency or channel. Rows that summarize several reads have ``last`` and ``count``, too."""
+    """A table of RFID reads. ``columns`` maps t, epc or epc_base64, antenna, rssi, phase, and frequency or channel.
+
+    A ``*`` in the column of rssi matches several columns, one for each tag or antenna. If a row summarizes several reads, t is the
+    time of the first one, ``last`` is the time of the last one, and ``count`` is their number.
+    """
 
     columns: dict[str, str] = Field(default_factory=dict)
-    """column of the file for each field, besides those of the preset"""
+    """column of the file for each field, in addition to those of the preset"""
     preset: Literal["impinj_itemtest", "impinj_iot", "sllurp_log", "sllurp_reports"] | None = None
-    """columns and units of a known tool, which those given here override"""
+    """known tool, whose columns and units are used unless they are given here"""
     channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")], ...] | Channels | None = None
     """frequencies of channels 1, 2, ..."""
     round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] | None = None
@@ -104,7 +110,7 @@ class RfidFile(TimedMapping, ReadNames):
     @model_validator(mode="before")
     @classmethod
     def _of_preset(cls, content: Any) -> Any:
-        """Merge the preset with the given mapping, which has precedence."""
+        """Merge the columns and units of the preset with the given ones, which have precedence."""
         name = content.get("preset") if isinstance(content, dict) else None
         preset = presets().get(name) if isinstance(name, str) else None
         if preset is None or not all(isinstance(content.get(part, {}), dict) for part in preset):
@@ -119,11 +125,11 @@ class RfidFile(TimedMapping, ReadNames):
 
 
 def read_all_reads(folder: TableFolder, options: RfidFile) -> TableRows:
-    """The reads of the file in ``folder``, or of all files that match a name with ``*``."""
+    """Return the reads of the file in ``folder`` that the options name. A name with ``*`` stands for all files that match it."""
     if "*" not in options.file:
         return read_reads(folder, folder.file(options.file), options)
     folder.file(options.file.replace("*", "x"))
-    with bounded.foreign(folder.path, f"rfid.file is {options.file[:80]!r}"):  # patterns that pathlib rejects
+    with bounded.foreign(folder.path, f"rfid.file is {options.file[:80]!r}"):  # pathlib may reject the pattern
         files = sorted(file for file in folder.path.glob(options.file) if file.is_file())
     if not files:
         raise InputError(f"{folder.path}: rfid.file is {quoted(options.file)}, expected the names of existing files")
@@ -132,7 +138,10 @@ def read_all_reads(folder: TableFolder, options: RfidFile) -> TableRows:
 
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
-    """The reads of several tables, named ``path``, sorted by time, because readers report in batches in any order."""
+    """Join tables of reads to one that is sorted by time, because readers report in batches in any order.
+
+    ``path``: the name of the joined table in errors.
+    """
     reads = _concatenated(path, tables)
     return reads.rows_at(np.argsort(reads.t_ns, kind="stable"))
 
@@ -148,14 +157,15 @@ def _concatenated(path: Path, tables: Sequence[TableRows]) -> TableRows:
 
 
 def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
-    """The reads of one file as the table ``rfid`` of the native format. InputError names file, row and column.
+    """Return the reads of one file as the table ``rfid`` of the native format, sorted by time.
 
-    A row that summarizes several reads gives two, the first one with the measured values; the times of the others are unknown.
+    A row that summarizes several reads gives two reads, the first and the last one. The measured values belong to the first one.
+    Raises InputError with file, row and column of an invalid value.
     """
     wide = "*" in options.columns.get("rssi", "")
     if not wide and ("antenna" in options.columns) == (options.antenna is not None):
         raise InputError(
-            f"{path}: needs either columns.antenna, or antenna, the name of the only one; give one of them"
+            f"{path}: needs either columns.antenna, or antenna, the name of the only antenna: set one of the two"
         )
     if "channel" in options.columns and options.channels is None:
         raise InputError(f"{path}: columns maps channel, but channels is missing: give the frequencies [MHz]")
@@ -186,7 +196,10 @@ def _signal(mapped: Cells, name: str) -> Array:
 
 
 def _epcs(mapped: Cells, case: EpcCase) -> list[str]:
-    """EPCs in the notation of the map: hexadecimal, without the Python bytes marks of some sllurp versions."""
+    """Return the EPC of each row in the notation of the map, hexadecimal digits in the letter case ``case``.
+
+    Some versions of sllurp write EPCs as Python bytes, ``b'...'``. These marks are removed.
+    """
     texts = mapped.texts("epc") if "epc" in mapped.columns else [""] * len(mapped.rows)
     if "epc_base64" in mapped.columns:
         coded = mapped.texts("epc_base64")
@@ -199,7 +212,7 @@ def _epcs(mapped: Cells, case: EpcCase) -> list[str]:
 
 
 def _from_base64(mapped: Cells, i: int, text: str) -> str:
-    """The EPC in row ``i`` in hexadecimal, in upper case as Impinj's readers write it."""
+    """Return the EPC in row ``i`` as upper-case hexadecimal digits, the notation of Impinj's readers. ``text``: its base64 code."""
     try:
         return base64.b64decode(text.translate(STANDARD) + "=" * (-len(text) % 4), validate=True).hex().upper()
     except ValueError:
@@ -207,7 +220,10 @@ def _from_base64(mapped: Cells, i: int, text: str) -> str:
 
 
 def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -> Array:
-    """The frequencies (N,) [Hz] of channels, which are numbered from 1."""
+    """Return the carrier frequencies (N,) [Hz] of the reads from the numbers of their channels, which start at 1.
+
+    ``channels``: the frequencies of the channels [MHz].
+    """
     number = mapped.numbers("channel", replace(CHANNEL, high=len(channels)) if isinstance(channels, tuple) else CHANNEL)
     if isinstance(channels, Channels):
         return np.asarray((channels.first + (number - 1.0) * channels.step) * 1e6)
@@ -216,10 +232,13 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 
 
 def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[Notice]) -> TableRows:
-    """Add a second read, with a time only, for each row that summarizes several."""
+    """Return the table with a second read for each row that summarizes several reads. The second read has a time, but no signal.
+
+    Warns about the reads between the first and the last one of a row, which are skipped.
+    """
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
-            sentence = "{source}: {rows} rows summarize several reads with one timestamp, which count as one read each"
+            sentence = "{source}: {rows} rows summarize several reads with one timestamp: each counts as one read"
             warnings.append(notice("summarized_reads", sentence, table.path, many))
         return table
     last_ns = mapped.stamps("last", options.clock_offset)

@@ -1,4 +1,6 @@
-"""UTIAS MRCLAM (Leung, Halpern, Barfoot, Liu, IJRR 30(8), 2011): one robot of a folder of ``.dat`` files.
+"""The reader of the UTIAS MRCLAM data set: the log of one robot from a folder of ``.dat`` files.
+
+Data set: Leung, Halpern, Barfoot, Liu, IJRR 30(8), 2011.
 
 The tables are described in ``datasets/mrclam.reader.toml``, a manifest of the reader ``mapped``.
 """
@@ -19,11 +21,11 @@ class Options(FileModel):
     """The options of the reader."""
 
     robot: Annotated[int, Field(ge=1, le=5)]
-    """subject number of the robot"""
+    """number of the robot in the data set"""
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The run of one robot. InputError names file and row."""
+    """Return the log of one robot from the folder ``path``. Raises InputError with file and row of an invalid value."""
     file = shipped.readers()["mrclam"]
     text = read_text(file, bounded.SETTINGS).replace("{robot}", str(options.robot))
     manifest = parse_model(Manifest, parse_toml(text, file), file)

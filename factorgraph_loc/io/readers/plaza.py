@@ -1,4 +1,7 @@
-"""The Plaza logs (Djugash, Hamner, Roth, JFR 26(9), 2009) from the gtsam wheel: odometry and ranges to beacons."""
+"""The reader of the Plaza logs in the gtsam wheel: odometry and ranges to radio beacons.
+
+Data set: Djugash, Hamner, Roth, JFR 26(9), 2009.
+"""
 
 import io
 import math
@@ -26,11 +29,12 @@ from factorgraph_loc.text import Notice, listed, notice
 from factors import se2
 from factors.se2 import Array
 
-FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}  # columns
+# number of columns by array of the file: odometry (DR), ranges (TD), ground truth (GT) and beacons (TL)
+FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}
 
-# added to the reference's heading, so that positive distances are forward
+# by run: rad added to the heading of the reference, so that positive distances are forward
 HEADING_OFFSET = {1: 0.0, 2: math.pi}
-# the reference heading of the first run is integrated from its odometry
+# by run: the reference of run 1 has no measured heading, because its heading is integrated from the odometry
 HAS_HEADING = {1: False, 2: True}
 
 
@@ -42,8 +46,10 @@ class Options(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """The run in the file ``path``, by default that of the gtsam wheel; t = 0 at the first row of its ground truth. InputError
-    names file, field and row (counted from 1 within the field)."""
+    """Return the log of a run from the file ``path``, by default the file in the gtsam wheel.
+
+    Its t = 0 is the first row of the ground truth. Raises InputError with file, array and row (counted from 1 within the array).
+    """
     file = path or shipped(options.run)
     fields, unread = read_matlab(file, FIELDS)
     warnings: list[Notice] = []
@@ -72,10 +78,10 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def read_matlab(path: Path, fields: Mapping[str, int]) -> tuple[dict[str, Array], list[str]]:
-    """The arrays (N, K) of ``fields`` (name -> K) in a MATLAB file of version 5 to 7, and the names of all others.
+    """Return some arrays of a MATLAB file (version 5 to 7) by name, and the names of all other arrays in the file.
 
-    The sizes that the file declares are checked before it is unpacked. InputError names file and field of a missing or invalid
-    array.
+    ``fields``: the number of columns of each array to read. The sizes that the file declares are checked before it is unpacked.
+    Raises InputError with the file and the name of a missing or invalid array.
     """
     from scipy.io import loadmat, whosmat  # noqa: PLC0415 - slow to import
 
@@ -96,17 +102,20 @@ def read_matlab(path: Path, fields: Mapping[str, int]) -> tuple[dict[str, Array]
 
 
 def shipped(run: int) -> Path:
-    """The file of a run in the gtsam wheel."""
+    """Return the path of a run's file in the gtsam wheel. Raises InputError if the installed gtsam lacks it."""
     import gtsam  # noqa: PLC0415 - slow to import, and needed here only
 
     try:
         return Path(gtsam.findExampleDataFile(f"Plaza{run}_.mat"))  # type: ignore[no-untyped-call]
     except RuntimeError as error:
-        raise InputError(f"Plaza{run}_.mat: is not in the installed gtsam, give the path of the file") from error
+        raise InputError(f"Plaza{run}_.mat: is not in the installed gtsam: give the path of the file") from error
 
 
 def _rows(source: str, table: Array, columns: str) -> TableRows:
-    """The rows of a table (N, K) of finite numbers, whose first column is the time [s]."""
+    """Return the rows of ``table`` (N, K), whose first column is the time [s]. Raises InputError if a number is not finite.
+
+    ``columns``: the names of the K columns, separated by spaces.
+    """
     rows = np.arange(1, len(table) + 1, dtype=np.int64)
     names = columns.split()
     checks.require_finite(source, rows, names, table)
@@ -124,7 +133,7 @@ def beacons(source: str, table: Array) -> World:
 
 
 def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> IncrementStream:
-    """The odometry, preceded by a row without motion at ``t0_ns``, which defines the duration of the first one."""
+    """Return the odometry as increments. The first row, at ``t0_ns``, has no motion, so that the first motion has a duration."""
     moves = np.column_stack((driven.numbers["dx"], np.zeros(len(driven.rows)), driven.numbers["dtheta"]))
     t_ns, moves = checks.increments_in_order(driven.path, driven.rows, driven.t_ns, moves, warnings)
     if t_ns[0] > t0_ns:
@@ -134,11 +143,11 @@ def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> Increme
 
 
 def ranges(observed: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """The ranges sorted by time: the file joins overlapping recordings, so its order is not that of arrival."""
+    """Return the ranges sorted by time. The file joins overlapping recordings, so its order is not the order of arrival."""
     distance = observed.numbers["range"]
     require(distance > 0.0, observed.path, observed.rows, "range", distance, "more than 0")
     if moved := int(np.count_nonzero(observed.t_ns < np.maximum.accumulate(observed.t_ns))):
-        sentence = "{source}: {rows} rows are older than one before them: sorted by time"
+        sentence = "{source}: {rows} rows are older than an earlier row: the rows are sorted by time"
         warnings.append(notice("sorted_rows", sentence, observed.path, moved))
     names = {"landmark": [f"{number:g}" for number in observed.numbers["beacon"]]}
     numbers = {"range": distance, "bearing": np.full(len(distance), np.nan)}

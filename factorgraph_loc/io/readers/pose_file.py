@@ -1,6 +1,6 @@
-"""Files of poses in TUM, EuRoC or KITTI format, recognized by their first row.
+"""Reads trajectories from files in TUM, EuRoC or KITTI format, which is recognized by the first row.
 
-Poses are quaternions in TUM and EuRoC files, and 3x4 matrices in KITTI files.
+TUM and EuRoC files have positions and quaternions. KITTI files have matrices (3, 4) of rotation and position.
 """
 
 import io
@@ -23,10 +23,10 @@ from factorgraph_loc.text import Notice, notice
 from factors.camera import model as reprojection
 from factors.se2 import Array, Integers
 
-ORTHONORMAL = 2e-3  # tolerance of rotation matrices: KITTI's have seven digits
+ORTHONORMAL = 2e-3  # tolerance of the products of rows of a rotation matrix, because KITTI files have few digits
 MATRIX = tuple(f"{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 ENTRY = within("entry", PURE, FARTHEST, "of the matrix of a pose")
-# the columns of these formats; velocities and biases of EuRoC's are not used
+# the columns of these formats; a EuRoC file may have further columns, velocities and biases, which are not used
 EUROC = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
 TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 Format = Literal["tum", "kitti", "euroc"]
@@ -39,10 +39,11 @@ EXPECTED = "{tum}, {kitti}, or {euroc}".format(**FORMATS)
 
 
 def read_kitti(path: Path, times: Path) -> PosePath:
-    """The poses of a KITTI odometry file, whose timestamps are the lines of ``times``.
+    """Return the poses of a KITTI odometry file. ``times``: the file with a timestamp per line.
 
-    The poses are of a camera with z forward and y down, in the frame of the first one. They are converted to x forward and z up.
-    InputError names file and row. Format: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012.
+    The file has poses of a camera with z forward and y down, in the frame of its first pose. They are converted to axes with
+    x forward and z up. Raises InputError with file and row of an invalid value. Format: Geiger, Lenz, Urtasun, "Are we ready for
+    autonomous driving?", CVPR 2012.
     """
     matrices = read_matrices(path)
     t_ns = read_times(times)
@@ -55,7 +56,10 @@ def read_kitti(path: Path, times: Path) -> PosePath:
 
 
 def read_matrices(path: Path) -> Array:
-    """The poses (N, 3, 4), rotation and position, of a file in KITTI's format, unchanged. InputError names file and row."""
+    """Return the poses (N, 3, 4), rotation and position, of a file in KITTI format, with the axes of the file.
+
+    Raises InputError with file and row of an invalid value.
+    """
     cells = _read(path, MATRIX, " ")
     matrices = np.column_stack([cells.numbers(field, ENTRY) for field in MATRIX]).reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
@@ -66,15 +70,15 @@ def read_matrices(path: Path) -> Array:
 
 
 def read_times(path: Path) -> Integers:
-    """The timestamps (N,) [ns] of a file with one per line, in seconds; InputError if they do not increase."""
+    """Return the timestamps (N,) [ns] of a file with one timestamp [s] per line. Raises InputError if they do not increase."""
     cells = _read(path, ("t",), " ", "s")
     t_ns = cells.stamps("t")
-    require(np.diff(t_ns) > 0, path, cells.rows[1:], "time", t_ns[1:], "nanoseconds after those of the row before")
+    require(np.diff(t_ns) > 0, path, cells.rows[1:], "time", t_ns[1:], "more nanoseconds than in the row before")
     return t_ns
 
 
 def _read(path: Path, columns: Sequence[str], separator: Literal[" ", ","], unit: str | None = None) -> Cells:
-    """The cells of a file without header, with at least these columns; ``unit``: of the timestamps."""
+    """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the timestamps."""
     numbered = {name: str(i) for i, name in enumerate(columns, start=1)}
     units: dict[str, str | float] = {} if unit is None else {"t": unit}
     mapping = ColumnMapping(file=path.name, columns=numbered, units=units, separator=separator, header=False)
@@ -82,8 +86,11 @@ def _read(path: Path, columns: Sequence[str], separator: Literal[" ", ","], unit
 
 
 def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
-    """The poses in a file of TUM, KITTI or EuRoC format, by default the one that its first row has; the last one of equal
-    timestamps. InputError names file and row."""
+    """Return the poses of a file in TUM, KITTI or EuRoC format.
+
+    ``kind``: the expected format, by default any. The first row determines the format. Of poses with equal timestamps, the last is
+    kept. Poses of a KITTI file have no timestamps. Raises InputError with file and row of an invalid value.
+    """
     row, first = _first_row(path)
     detected = _format(first)
     if detected is None or kind not in (None, detected):
@@ -95,10 +102,10 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
     unit = "s" if detected == "tum" else "ns"
     if detected == "tum" and (larger := _unit(first)) not in (None, "s"):
         unit = str(larger)
-        sentence = "{source}: the stamps are read in {unit}, by their size, not in seconds"
+        sentence = "{source}: the timestamps are too large for seconds and are read in {unit}"
         warnings.append(notice("unit_of_stamps", sentence, path.name, unit))
     cells = _read(path, TUM, " ", unit) if detected == "tum" else _read(path, EUROC, ",", unit)
-    cells = replace(cells, labels={})  # names of columns say more than numbers
+    cells = replace(cells, labels={})  # errors then name columns instead of numbering them
     table = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[1:]])
     t_ns = cells.stamps("t")
     rotations = rotations_of(path, cells.rows, table[:, 3:])
@@ -107,7 +114,7 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
 
 
 def _unit(first: str) -> str | None:
-    """The unit of the timestamp of a row, by its size; None if it is no time since 1970."""
+    """Return the unit of the timestamp in the row ``first``, by its size. Returns None if it is not a time since 1970."""
     try:
         return unit_since_1970(float(first.split(maxsplit=1)[0]))
     except ValueError:
@@ -115,7 +122,7 @@ def _unit(first: str) -> str | None:
 
 
 def is_pose_file(path: Path) -> bool:
-    """Whether the first row of a file has numbers alone, as many as one of the formats has."""
+    """True if the first row of a file has only numbers, as many as TUM, KITTI or EuRoC format has."""
     try:
         _, first = _first_row(path)
         return _format(first) is not None and bool([float(part) for part in first.replace(",", " ").split()])
@@ -124,7 +131,7 @@ def is_pose_file(path: Path) -> bool:
 
 
 def _format(first: str) -> Format | None:
-    """The format of a file whose first row this is."""
+    """Return the format of a file by its first row. Returns None if no format has such a row."""
     if "," in first:
         return "euroc" if first.count(",") + 1 >= len(EUROC) else None
     count = len(first.split())

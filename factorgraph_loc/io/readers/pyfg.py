@@ -1,7 +1,8 @@
-"""PyFG files of planar range-aided SLAM: one robot's odometry, its ranges to landmarks, and the true poses and positions.
+"""The reader of PyFG files, the format of data sets of planar range-aided SLAM.
 
-A range belongs to the time of its pose. The covariances of the file become the noise of a rig. Format: Papalia and others,
-"Certifiably correct range-aided SLAM", IEEE Transactions on Robotics 40, 2024.
+A file has the odometry of one robot, its ranges to landmarks, and the true poses and landmarks. A range has the time of its pose.
+The covariances in the file become the noise of the rig. Format: Papalia and others, "Certifiably correct range-aided SLAM", IEEE
+Transactions on Robotics 40, 2024.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,14 +28,16 @@ from factors import se2
 from factors.se2 import Array, Integers
 
 SUFFIX = ".pyfg"
-# the columns of each kind of row after its first word; names of variables are in capital letters
+# by the first word of a row: its columns; those in capital letters have names of variables, the others have numbers
 ROWS = {
     "VERTEX_SE2": "t POSE x y theta",
     "VERTEX_XY": "LANDMARK x y",
     "EDGE_SE2": "t FROM TO x y theta cxx cxy cxt cyy cyt ctt",
     "EDGE_RANGE": "t POSE LANDMARK range variance",
 }
-DIFFERENT = 1.5  # ratio of variances above which a median does not describe them
+DIFFERENT = (
+    1.5  # ratio of the largest to the smallest variance above which a warning says that the rig has their median
+)
 
 
 class Options(FileModel):
@@ -42,8 +45,10 @@ class Options(FileModel):
 
 
 def read(path: Path | None, _options: Options) -> Log:
-    """The log of a file, with t = 0 at its first pose. InputError names file and row of what is invalid, and of rows that are not
-    of one robot in the plane."""
+    """Return the log of a file. Its t = 0 is the first pose.
+
+    Raises InputError with file and row of an invalid value, and of a row that does not belong to one robot in the plane.
+    """
     if path is None:
         raise InputError("the reader pyfg needs the path of a file")
     kinds = _parsed(path)
@@ -86,7 +91,7 @@ def read(path: Path | None, _options: Options) -> Log:
 
 
 def _parsed(path: Path) -> dict[str, TableRows]:
-    """The rows of each kind. InputError at a row of another kind, or with another number of values."""
+    """Return the rows of each kind in :data:`ROWS`. Raises InputError at a row of another kind, or with too few or many values."""
     lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in ROWS}
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         kind, *values = line.split() or [""]
@@ -96,7 +101,7 @@ def _parsed(path: Path) -> dict[str, TableRows]:
             lines[kind].append((row, values))
         elif kind and not kind.startswith("#"):
             raise bad_field(
-                path, "row", kind, f"one of {listed(ROWS)}: other variables and factors are not read", row=row
+                path, "row", kind, f"one of {listed(ROWS)}: other variables and factors are not supported", row=row
             )
     return {kind: _rows(path, ROWS[kind].split(), cells) for kind, cells in lines.items()}
 
@@ -122,12 +127,15 @@ def _number(path: Path, row: int, name: str, cell: str) -> float:
 
 
 def _table(rows: TableRows, columns: str) -> Array:
-    """Columns (N, K) of numbers."""
+    """Return the numbers (N, K) of K columns. ``columns``: their names, separated by spaces."""
     return np.column_stack([rows.numbers[name] for name in columns.split()])
 
 
 def _numbered(poses: TableRows) -> dict[str, int]:
-    """The number of each pose. InputError for a second robot, whose poses begin with another letter, or a repeated name."""
+    """Return the index of each pose by its name.
+
+    Raises InputError at a repeated name, and at a pose of a second robot, whose name begins with another letter.
+    """
     numbers: dict[str, int] = {}
     robot = poses.names["POSE"][0][:1]
     for i, name in enumerate(poses.names["POSE"]):
@@ -140,7 +148,7 @@ def _numbered(poses: TableRows) -> dict[str, int]:
 
 
 def _require_chain(moves: TableRows, poses: Sequence[str]) -> None:
-    """InputError unless the motions lead from each pose to the next one."""
+    """Raise InputError unless ``moves`` has exactly one motion from each pose to the next one, in order."""
     expected = list(pairwise(poses))
     pairs = zip(moves.rows.tolist(), moves.names["FROM"], moves.names["TO"], strict=True)
     for i, (row, *pair) in enumerate(pairs):
@@ -153,7 +161,11 @@ def _require_chain(moves: TableRows, poses: Sequence[str]) -> None:
 
 
 def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, Landmark], t_ns: Integers) -> TableRows:
-    """The ranges as rows of a table, in order of their poses. InputError at one to or from an unknown variable."""
+    """Return the ranges as rows of a table, in order of their poses.
+
+    ``numbers``: the index of each pose by name. ``marks``: the landmarks by name. ``t_ns``: the timestamp of each pose. Raises
+    InputError at a range from an unknown pose or to an unknown landmark.
+    """
     names = zip(ranged.rows.tolist(), ranged.names["POSE"], ranged.names["LANDMARK"], strict=True)
     for row, pose, mark in names:
         if pose not in numbers:
@@ -168,7 +180,10 @@ def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, L
 
 
 def _rig(moves: TableRows, ranged: TableRows, durations: Array, warnings: list[Notice]) -> Rig:
-    """The noise of the file: the medians of its variances, those of motions per second."""
+    """Return a rig with the noise of the file: the medians of the standard deviations of motions and of the variances of ranges.
+
+    ``durations``: the durations of the motions [s], because the noise of odometry is stated per square root of a second.
+    """
     per_time = {}
     for name, column in {"along": "cxx", "lateral": "cyy", "heading": "ctt"}.items():
         variance = _positive(moves, column)
@@ -189,5 +204,7 @@ def _positive(rows: TableRows, column: str) -> Array:
 def _warn_of_different(path: Path, column: str, variances: Array, warnings: list[Notice]) -> None:
     if variances.max() > DIFFERENT * variances.min():
         median = float(np.median(variances))
-        sentence = "{file}: {column} is {least:g} to {most:g}: the rig has {median:g}"
+        sentence = (
+            "{file}: {column} differs between rows, from {least:g} to {most:g}: the rig has the median {median:g}"
+        )
         warnings.append(notice("different_variances", sentence, path, column, variances.min(), variances.max(), median))
