@@ -38,7 +38,7 @@ def test_the_tutorial(hall, fgloc, monkeypatch):
     assert compared.exit_code == 0
     error = {row["estimator"]: row["final.position_rmse"] for row in json.loads(compared.stdout)["runs"]}
     assert (
-        f"smoother is {error['smoother']:.2f} m, that of odometry alone {error['dead_reckoning']:.1f} m"
+        f"smoother is {error['smoother']:.2f} m, the error of odometry alone {error['dead_reckoning']:.1f} m"
         in PAGE.replace("\n", " ")
     )
     assert fgloc("convert", "monday.toml", "copy").exit_code == 0
