@@ -1,9 +1,10 @@
 """The interface between sensors and estimators.
 
-A sensor that is bound to a run turns a measurement and a view of the estimate into observations. The estimator applies each
-before it asks for the next, and lets the sensor judge each correction first. An observation depends on the pose at one time and
-on named blocks (constants of a sensor, positions of landmarks). It can be linearised, as a factor of a graph or a correction of a
-Gaussian, and evaluated as a likelihood over poses. Neither side depends on the other's implementation."""
+A sensor turns a measurement into observations. It sees the current estimate through a view. The estimator applies each
+observation before it requests the next one. An observation depends on the pose at one time and on named blocks. A block is a
+part of the state other than the pose, such as constants of a sensor or the position of a landmark. An observation is used as a
+factor of a graph, as a correction of a Gaussian, or as a likelihood over poses. Sensors do not depend on estimators, nor
+estimators on sensors."""
 
 from __future__ import annotations
 
@@ -26,13 +27,14 @@ from factors.se2 import Array
 from factors.sighting import Marginalized, SightingFactor
 from factors.update import CONVERGED, Correction, update_state
 
-Blocks = Mapping[str, Array]  # values of blocks by name, or their covariances
-Columns = Mapping[str, slice]  # columns of blocks in an error state
+Blocks = Mapping[str, Array]  # values of blocks by the name of the block, or their covariances
+Columns = Mapping[str, slice]  # the components of an error state that belong to each block, by the name of the block
 
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of a graph with ``rows`` residuals, and the names of the ``blocks`` of its values after the pose, in their order."""
+    """A factor of a graph. Its values are the pose and then the ``blocks``, in this order. ``rows``: number of its
+    residuals."""
 
     factor: Factor
     blocks: tuple[str, ...]
@@ -40,10 +42,10 @@ class Term:
 
 
 class Observation(Protocol):
-    """The information of a measurement, or a part of it, on the pose at one time and on named blocks. Immutable.
+    """The information of a measurement, or of a part of it, on the pose at one time and on named blocks. Immutable.
 
-    ``t`` [s]: time of the measurement; ``found``: number of detections, 0 if there are none. ``is_judged``: whether the sensor
-    judges the correction. ``iterations``: number of linearisations, None if the estimator decides.
+    ``t``: time of the measurement [s]. ``found``: number of detections, possibly 0. ``is_judged``: True if :meth:`Sensor.judge`
+    must be called. ``iterations``: number of linearisations, or None if the estimator decides.
     """
 
     @property
@@ -56,11 +58,11 @@ class Observation(Protocol):
     def found(self) -> int: ...
     @property
     def work(self) -> int:
-        """The approximate number of elements that enter the likelihood of one pose."""
+        """The approximate cost of the likelihood of one pose, in units of that of one RFID tag."""
 
     @property
     def things(self) -> frozenset[Hashable]:
-        """Identifiers of the detected things."""
+        """Identifiers of the detected elements of the map, such as landmarks or tags."""
 
     @property
     def terms(self) -> Sequence[Term]:
@@ -73,31 +75,31 @@ class Observation(Protocol):
     def correct(
         self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = 1
     ) -> Correction:
-        """The correction of a Gaussian with mean ``pose`` (3,) and ``values`` of the blocks by name.
+        """Return the correction of a Gaussian with mean ``pose`` (3,) and ``values`` of the blocks.
 
-        ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the pose;
-        ``columns``: those of each block; others are corrected by their correlation. ``iterations``: number of linearisations.
+        ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the pose.
+        ``columns``: the components of each block. All other components are corrected through their correlation.
         """
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
-        """Log-likelihood (N,) up to a constant for ``poses`` (N, 3) and block ``values`` (N, P); other blocks have the rig's
-        values."""
+        """Return the log-likelihood (N,), up to a constant, of ``poses`` (N, 3) with ``values`` (N, P) of each block. A
+        sensor's constants have the rig's values if their block is missing."""
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Observation:
-        """The observation as a function of the pose only, with the blocks fixed at ``values``; their covariances ``spreads`` are
-        added to the noise."""
+        """Return the observation as a function of the pose only. Blocks are fixed at ``values``, and their covariances
+        ``spreads`` are added to the noise."""
 
     def at_its_time(self) -> Observation | None:
-        """The observation on the pose at its own time, independent of poses at other times; None if that is impossible."""
+        """Return the observation on the pose at the time of the measurement, or None if it depends on blocks or other poses."""
 
 
 @dataclass(frozen=True)
 class NewVariable:
-    """A new block: the position of a landmark that is seen for the first time, or a variable with a prior.
+    """A new block of the state: the position of a landmark that is seen for the first time, or a variable with a prior.
 
-    ``mean`` (d,): initial estimate; ``by_pose`` (d, 3) and ``by_block`` (d, P) by name: its Jacobians; ``noise`` (d, d):
-    covariance from the measurement alone. ``sightings``: the observations used, each with the time of its pose. A block with a
-    prior has none; ``mean`` and ``noise`` are the prior then.
+    ``mean`` (d,): initial estimate. ``by_pose`` (d, 3) and ``by_block`` (d, P): its Jacobians by the pose and by other blocks.
+    ``noise`` (d, d): the covariance that results from measurement noise alone. ``sightings``: the observations that the
+    estimate consists of, each with the time [s] of its pose. Without sightings, ``mean`` and ``noise`` are a prior.
     """
 
     name: str
@@ -108,8 +110,9 @@ class NewVariable:
     sightings: tuple[tuple[float, Observation], ...]
 
     def joint(self, covariance: Array, columns: Columns) -> tuple[Array, Array]:
-        """Its covariance (d, S) with an error state of ``covariance`` (S, S), and its own covariance (d, d). ``columns``:
-        components of each block in the error state; missing blocks are exact."""
+        """Return the cross-covariance (d, S) of the block with an error state of ``covariance`` (S, S), and the covariance
+        (d, d) of the block. ``columns``: the components of each block in the error state. Missing blocks are treated as
+        exact."""
         jacobian = np.zeros((len(self.mean), len(covariance)))
         jacobian[:, :3] = self.by_pose
         for name, block in self.by_block.items():
@@ -121,8 +124,8 @@ class NewVariable:
 
 @dataclass(frozen=True)
 class EarlierPose:
-    """A pose of an earlier time that an estimator still has: its time ``t`` [s], and the motion from it to the time in question,
-    None if these are equal."""
+    """A pose variable of an estimator at or before a requested time. ``t``: its time [s]. ``offset``: the motion from ``t`` to
+    the requested time, or None if the times are equal."""
 
     t: float
     offset: Increment | None
@@ -130,8 +133,8 @@ class EarlierPose:
 
 @dataclass(frozen=True)
 class Link:
-    """A factor on two poses: that which a measurement at ``t`` [s] refers to, its first value, and the one at ``earlier`` [s], its
-    second. ``rows``: number of residuals. Only where the view has the earlier pose."""
+    """A factor on two poses. Its first value is the pose that a measurement at ``t`` [s] refers to. Its second value is the
+    pose at ``earlier`` [s], which :meth:`View.earlier` returned. ``rows``: number of its residuals."""
 
     t: float
     earlier: float
@@ -141,11 +144,11 @@ class Link:
 
 @dataclass(frozen=True)
 class Binding:
-    """The context of a sensor: a run, the robot's ``motion`` and the diagnostics.
+    """The arguments that bind a sensor to a run.
 
-    ``name``: of one of several sensors, the only one of its kind in the setup; "" for the modality. ``use``: how landmarks of the
-    map are used, ``points``: how points are used that one measurement does not locate; ``calibration``: which uncertain constants
-    the estimator learns.
+    ``setup``: rig, map and sensors of the run, with at most one sensor of the kind. ``motion``: the odometry.
+    ``use``: how landmarks of the map are used. ``points``: how points are used that one measurement does not locate.
+    ``calibration``: which uncertain constants the estimator learns. ``name``: that of one of several sensors, otherwise "".
     """
 
     setup: Setup
@@ -158,11 +161,11 @@ class Binding:
 
 
 class View(Protocol):
-    """The current estimate as shown to a sensor, including all observations applied so far.
+    """The current estimate as a sensor sees it, after all observations applied so far.
 
-    ``t`` [s]: time of the pose that observations refer to; ``offset``: the motion from there to the measurement, None if the
-    times are equal. ``pose`` (3,) with body-frame ``covariance`` (3, 3): predicted at ``t``. ``newest``: whether there is no
-    later pose; ``localized``: whether the robot is localized.
+    ``t``: time [s] of the pose that new observations depend on. ``offset``: the motion from ``t`` to the measurement, None if
+    the times are equal. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate at ``t``. ``newest``: True if the
+    estimator has no later pose. ``localized``: True if the robot is localized.
     """
 
     @property
@@ -178,25 +181,26 @@ class View(Protocol):
     @property
     def covariance(self) -> Array: ...
     def value(self, name: str) -> Array | None:
-        """The estimate (d,) of a block, or None if there is no such block."""
+        """Return the estimate (d,) of a block, or None if the estimator has no such block."""
 
     def block_covariance(self, name: str) -> Array:
-        """The covariance (d, d) of an existing block."""
+        """Return the covariance (d, d) of a block that exists."""
 
     def joint(self) -> tuple[Array, Columns]:
-        """The covariance (S, S) of the error state, and the columns of its blocks."""
+        """Return the covariance (S, S) of the error state, and the components of each block in it."""
 
     def poses_at(self, times: Array) -> Array:
-        """Poses (R, 3) at times (R,) relative to the pose at ``t``."""
+        """Return poses (R, 3) by odometry at ``times`` (R,) [s], in the frame of the pose at ``t``."""
 
     def earlier(self, t: float) -> EarlierPose | None:
-        """The pose at or before ``t`` that a :class:`Link` may depend on; None if the estimator has none, as filters have."""
+        """Return the pose at or before ``t`` [s] that a :class:`Link` may depend on. Returns None if there is none, as in
+        filters."""
 
 
 class Finder(Protocol):
     """Finds the pose from the measurements of one sensor without a prediction: at an unknown start or after a kidnapping.
 
-    ``start``: the known start position if only the heading is sought. ``at_once``: whether one measurement may be enough.
+    ``start``: the known start position if only the heading is sought. ``at_once``: True if one measurement may be enough.
     """
 
     start: KnownPosition | None
@@ -206,131 +210,123 @@ class Finder(Protocol):
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry state at the last informative measurement."""
+        """The odometry state at the last informative measurement, or None."""
 
     @property
     def hypotheses(self) -> Sequence[Mode]:
-        """Hypotheses of the pose at that time, most likely first."""
+        """Hypotheses of the pose at the last informative measurement, most likely first."""
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose if it is unambiguous, else None."""
+        """The pose at the last informative measurement if it is unambiguous, otherwise None."""
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process a measurement while the robot is not localized; False if it is uninformative."""
+        """Process a measurement while the robot is not localized. Returns False if the measurement is uninformative."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at that time, sampled from the hypotheses."""
+        """Return poses (N, 3) at the last informative measurement, sampled from the hypotheses."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        """Record an observation that is about to be applied to a track; ``view`` shows the prediction."""
+        """Record an observation before it is applied to the track. ``view`` shows the prediction."""
 
     def refuted_since(self, m: Any, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """The time since which the track must have been wrong, checked after a measurement was applied; None if it is not
-        refuted.
+        """Return the time [s] since which the track must have been wrong, or None. Call this after a measurement was applied.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the measurement; ``best`` returns the pose found
-        instead.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the measurement. If the track is wrong, ``best`` is
+        the correct pose.
         """
 
     def clear(self) -> None:
-        """Discard the history: a new track starts, or the current one is trusted."""
+        """Discard the history, because a new track starts or the current track is trusted."""
 
 
 class Sensor:
-    """A sensor of the robot's surroundings, bound to one run. The defaults are those of a sensor without the feature in question.
+    """A sensor of the robot's surroundings, bound to one run. Sensors derive from this class and override what they need.
 
-    ``modality``: of its measurements; ``name``: of this sensor, by default the modality. ``constants``: those that are
-    estimated, as a block with this name; ``follows_constants``: whether their covariance is needed during the run.
-    ``finder``: localizes without a prediction. ``bounds`` (2, 2) [m]: lower and upper corner of the area where the robot may
-    be, if the sensor can only weigh poses. ``work``: approximate cost of adding a measurement to a graph, where a tag costs
-    1. ``evidence_every`` [s]: interval of informative measurements in a search. ``lost``: reason why a track is given up.
-
-    For graphs: ``keyframe_every`` [s]: interval between keyframes; ``gathers``: whether the observations on a pose are merged
-    when the next pose begins; ``solve_every`` [s]: longest delay of a solver update; ``links``: whether its factors are on two
-    poses (:class:`Link`); many of these may be false.
+    ``name``: the name of the sensor, by default its modality. It is also the name of the block of its estimated constants.
     """
 
-    modality: ClassVar[str]
-    lost: ClassVar[str] = ""
-    constants: Estimated = NOTHING
-    follows_constants: ClassVar[bool] = False
-    keyframe_every: ClassVar[float] = 0.09
-    gathers: ClassVar[bool] = False
-    links: ClassVar[bool] = False
-    evidence_every: ClassVar[float] = 1.0
-    work: int = 10
-    solve_every: float = 0.0
-    finder: Finder | None = None
-    bounds: Array | None = None
+    modality: ClassVar[str]  # the modality of its measurements
+    lost: ClassVar[str] = ""  # message: the reason for which the sensor gives up a track
+    constants: Estimated = NOTHING  # the constants of the sensor that are estimated
+    follows_constants: ClassVar[bool] = False  # True if `observe` needs the covariance of the constants
+    keyframe_every: ClassVar[float] = 0.09  # s between the keyframes of a graph
+    gathers: ClassVar[bool] = False  # True if a graph must merge the observations of a keyframe by `gathered`
+    links: ClassVar[bool] = False  # True if its observations are links between two poses, of which many may be false
+    evidence_every: ClassVar[float] = 1.0  # s between the measurements that a search of the pose uses
+    work: int = 10  # approximate cost to add a measurement to a graph, in units of one RFID tag
+    solve_every: float = 0.0  # s; longest delay of a solver update of a graph
+    finder: Finder | None = None  # localizes the robot without a prediction
+    bounds: Array | None = None  # (2, 2) [m]: corners of the area where the robot may be; for a sensor without finder
 
     def __init__(self, name: str = "") -> None:
         self.name = name or self.modality
 
     def observe(self, m: Any, view: View) -> Iterator[Observation | NewVariable | Link]:
-        """The observations of a measurement; each is applied before the next is requested."""
+        """Yield the observations of a measurement. The estimator applies each before it requests the next."""
         raise NotImplementedError
 
     def judge(self, observation: Any, correction: Correction, view: View) -> bool:
-        """Report the innovation, with the prediction in ``view``; False if the observation must not be applied."""
+        """Record the innovation. ``view`` shows the prediction. Returns False if the observation must not be applied."""
         return True
 
     def evidence(self, m: Any) -> Observation | None:
-        """The information of a measurement on the pose without a prediction; nothing is counted. None if it has none."""
+        """Return the observation on the pose without a prediction, or None if the measurement has no information."""
         return None
 
     @property
     def suspicious_since(self) -> float | None:
-        """Time [s] since which the track does not explain the measurements; None if it does."""
+        """The time [s] since which the track does not explain the measurements, or None if it explains them."""
         return None
 
     @property
     def silent(self) -> bool:
-        """Whether nothing is detected although something should be."""
+        """True if nothing is detected although detections are expected."""
         return False
 
     @property
     def doubts_model(self) -> bool:
-        """Whether detections contradict the sensor's model, so that covariances are too small."""
+        """True if detections contradict the sensor's model. Covariances are too small then."""
         return False
 
     def accept(self) -> None:
-        """Accept the track although it was suspicious: the model or the map is wrong instead."""
+        """Stop the suspicion, because a search has confirmed the track. The model or the map is wrong instead."""
 
     def gathered(self, observations: Sequence[Any]) -> list[Term]:
-        """Merge the observations on one pose into few factors."""
+        """Merge the observations on one pose into few factors of a graph."""
         return [term for observation in observations for term in observation.terms]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """A factor for the final solution, its loss ``width`` times as wide; None leaves it out while ``width`` is above 1."""
+        """Return a factor for the final solution, whose robust loss is ``width`` times as wide. None omits the factor if
+        ``width`` is above 1."""
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
-        """How many times as wide the loss of a link's factor must be to be convex at ``values``, at least 1."""
+        """Return the factor, at least 1, by which the loss of a link must be widened to be convex at ``values``."""
         return 1.0
 
     def rewind(self, t: float) -> None:
-        """Forget what came after ``t``; it will be processed again."""
+        """Undo the effects of measurements after ``t`` [s], which will be processed again."""
 
     def restart(self, t: float) -> None:
-        """Start a new track at ``t``; later measurements will be processed again."""
+        """Prepare for a new track at ``t`` [s]. Measurements after ``t`` will be processed again."""
 
 
-WORK = 20  # for a residual: its robust loss takes as long as so many tags
+WORK = 20  # cost of one residual and its robust loss, in units of one RFID tag
 
 
 @dataclass(frozen=True)
 class ResidualObservation:
-    """An observation made of residual factors (:class:`~factors.sighting.SightingFactor`) of one sensor.
+    """An observation that consists of residual factors (:class:`~factors.sighting.SightingFactor`) of one sensor.
 
-    Its log-likelihood is evaluated pose by pose; sensors that need speed with particles override it.
+    The log-likelihood is evaluated pose by pose. A sensor that must be fast with particles overrides it.
     """
 
     t: float
     terms: tuple[Term, ...]
     is_judged: ClassVar[bool] = True
     iterations: ClassVar[int | None] = None
-    settled: ClassVar[float] = CONVERGED  # m, rad: convergence limit of a step
+    settled: ClassVar[float] = CONVERGED  # m, rad: iterations end if the step is smaller
 
     @property
     def found(self) -> int:

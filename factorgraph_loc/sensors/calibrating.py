@@ -1,4 +1,4 @@
-"""The interface of sensor packages to :mod:`factorgraph_loc.calibration`."""
+"""Base classes of the calibration of sensors, which :mod:`factorgraph_loc.calibration` runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,15 +25,15 @@ from factorgraph_loc.sensors.smoothed import Traced, pooled_constants
 from factorgraph_loc.text import Notice
 from factors.se2 import Array
 
-BLOCK = 20.0  # s; errors within a block may be correlated
+BLOCK = 20.0  # s; errors in the same block of time may be correlated, errors in different blocks are independent
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of a log for the report.
+    """Residuals of a sensor in one log, for plots of the calibration report.
 
-    ``errors`` (K, D) and their standard deviations ``sigmas`` (K, D), NaN if not measured; timestamps ``t`` (K,) [s] and the
-    ``distance`` (K,) [m] that errors may depend on. ``units``: by the names of the D columns.
+    ``errors`` (K, D) with standard deviations ``sigmas`` (K, D): NaN if not measured. ``t`` (K,): timestamps [s].
+    ``distance`` (K,): a distance [m] that errors may depend on. ``units``: the name and the unit of each of the D columns.
     """
 
     log: str
@@ -46,11 +46,16 @@ class Residuals:
 
 @dataclass(frozen=True)
 class SensorKnowledge:
-    """The result for a sensor.
+    """The result of the calibration of a sensor.
 
-    ``sections`` of the rig; the ``constants``; ``notes``: warnings; ``figures``: plain values for the report;
-    ``residuals``: of each log; ``details``: the data that its pictures show; ``correlations``: see
-    :meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`.
+    ``sections``: the new sections of the rig by name.
+    ``constants``: the fitted constants.
+    ``notes``: warnings.
+    ``figures``: plain values for the report, by name.
+    ``residuals``: those of each log.
+    ``details``: data for :meth:`Calibrator.pictures`.
+    ``correlations``: pairs of strongly correlated constants
+    (:meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`).
     """
 
     sections: Mapping[str, Any] = field(default_factory=dict)
@@ -65,9 +70,10 @@ class SensorKnowledge:
 class Calibrator:
     """The calibration of one sensor.
 
-    ``section``: of the rig; ``channel``: the stream that a log must have; ``senses``: whether the robot can be localized by it;
-    ``first``: settings of an unknown sensor. The ``uncertainty`` of a section has the constants that an estimator can learn on
-    each run.
+    ``section``: the section of the rig that is calibrated.
+    ``channel``: the stream that a log must have.
+    ``senses``: True if the sensor can localize the robot.
+    ``first``: initial settings if the rig has no such section.
     """
 
     section: str
@@ -78,17 +84,20 @@ class Calibrator:
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Learn from logs along their trajectories, from the values of ``rig``.
+        """Estimate the sensor's constants and noise from logs with trajectories.
 
-        ``first``: the rig before all turns of smoothing and learning, the same as ``rig`` where logs have references; ``grids``:
-        path and name prefix of files that may be written; ``like``: the result from all logs if these are some of them, whose
-        choices are kept. InputError if a log is too short.
+        ``traced``: the logs. ``rig``: initial values.
+        ``first``: the rig of the user. It differs from ``rig`` if logs without references are smoothed and calibrated
+        repeatedly. ``grids``: path with name prefix of files that may be written, None to write none.
+        ``like``: a result whose discrete choices are kept. It is given if ``traced`` is only a part of the logs of that result.
+        Raises InputError if a log is too short.
         """
         raise NotImplementedError
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
-        """The rig with the uncertainties of the ``first`` one. Learnt ones are for later runs: in the next turn they would hold
-        constants near the values of the last."""
+        """Return ``rig`` with the uncertainties of constants from ``first``, for another repetition of smoothing and
+        calibration. Learnt uncertainties are smaller. With them the constants would stay near the values of the previous
+        repetition."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return rig
         uncertainty = first.section(self.section).uncertainty
@@ -96,20 +105,20 @@ class Calibrator:
         return rig.model_copy(update={self.section: settings})
 
     def settings(self, rig: Rig) -> Any:
-        """The section of a rig, or the initial one."""
+        """Return the sensor's section of a rig, or the initial settings if the rig has none."""
         return rig.section(self.section) or self.first
 
     def is_complete(self, rig: Rig) -> bool:
-        """Whether a rig has everything that the sensor needs."""
+        """True if the rig has the sensor's section, or does not use the sensor."""
         return self.channel not in rig.sensors or rig.section(self.section) is not None
 
     def pictures(self, _knowledge: SensorKnowledge) -> Sequence[Part]:
-        """Further pictures of the report."""
+        """Return additional plots of the sensor for the calibration report."""
         return ()
 
 
 class OneOfSeveral(Calibrator):
-    """The calibration of one of several sensors of a kind, ``name``, as if it was the only one."""
+    """The calibration of the sensor ``name`` of a rig with several sensors of its kind, as if it was the only one."""
 
     def __init__(self, calibrator: Calibrator, name: str) -> None:
         self._calibrator = calibrator
@@ -142,25 +151,28 @@ class OneOfSeveral(Calibrator):
 
 
 class ConstantsCalibrator(Calibrator):
-    """Base class for constants with least squares. The data of a log have timestamps ``t`` (K,), and ``residuals(settings)`` (K, D)
-    in standard deviations. Constants and noise are estimated in ``rounds``, in turn."""
+    """Base class of calibrations by least squares. Constants and noise are estimated alternately, ``rounds`` times.
+
+    The data of a log, which :meth:`part` returns, have timestamps ``t`` (K,) [s] and a method ``residuals(settings)``. It
+    returns residuals (K, D) in standard deviations.
+    """
 
     rounds: ClassVar[int] = 2
 
     def part(self, log: Log) -> Any:
-        """The data of a log; InputError if there are too few."""
+        """Return the data of a log. Raises InputError if there are too few."""
         raise NotImplementedError
 
     def parameters(self, parts: Sequence[Any], settings: Any) -> Sequence[Parameter]:
-        """The constants, with priors about the rig's values."""
+        """Return the constants to estimate, with priors around the values of ``settings``."""
         raise NotImplementedError
 
     def with_noise(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any]:
-        """Data and settings with the noise that the residuals have with these constants."""
+        """Return data and settings with the noise that the residuals show at the constants of ``settings``."""
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Complete the result for a rig that has the constants."""
+        """Return the completed result. ``_rig``: the rig with the estimated constants."""
         return knowledge
 
     def learn(
@@ -184,7 +196,8 @@ class ConstantsCalibrator(Calibrator):
         return self.finished(parts, rig.model_copy(update=dict(knowledge.sections)), knowledge)
 
     def estimated(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any, Posterior | None]:
-        """Data and settings with constants and noise of maximal posterior density."""
+        """Return data, settings and posterior with the constants and the noise of maximal posterior density. The posterior is
+        None if there are no constants to estimate."""
         parameters = self.parameters(parts, settings)
         start = {p.name: p.mean for p in parameters}
         posterior = None
@@ -207,7 +220,8 @@ class ConstantsCalibrator(Calibrator):
     def _constants(
         self, parts: Sequence[Any], settings: Any, initial: Any, posterior: Posterior
     ) -> list[FittedConstant]:
-        """The constants, with their differences between logs if there are several."""
+        """Return the fitted constants. With several logs, each log is also fitted alone, and the differences between logs give
+        the uncertainty of each constant."""
         values = posterior.as_dict()
         own = centred(posterior.parameters, values)
         alone = [
@@ -227,7 +241,7 @@ class ConstantsCalibrator(Calibrator):
         return out
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
-        """The means of what the smoother estimated in each log."""
+        """Return the result for smoothed logs: means of the constants that the smoother estimated in each log."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""

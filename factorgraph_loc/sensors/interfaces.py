@@ -1,5 +1,8 @@
-"""Arguments and results of the functions of sensors: the use of a sensor in a run, its summary for ``fgloc info``, its drawings,
-simulated drives, and the expected information along a planned path."""
+"""Argument and result types of the functions that a sensor registers.
+
+They cover checks before a run, the review after a run, summaries for ``fgloc info``, drawings, simulated drives, and the
+expected information along planned paths.
+"""
 
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,24 +26,28 @@ from factorgraph_loc.sensors.registry import channels, functions, sensor_of
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array
 
-STEP = 0.05  # s between compared times and between shifts
-FARTHEST = 2.5  # s; largest shift
-SHIFTS = np.arange(-round(FARTHEST / STEP), round(FARTHEST / STEP) + 1)  # in steps
-LARGE = 0.15  # s; smallest shift that is reported
-BETTER = 0.7  # largest ratio of the residual at a reported shift to that without a shift
-FEWEST = 200  # minimum number of times and sightings
-SLOWEST = 1.0  # s; longest interval between reference poses that still gives rates
+# the search for an offset between the clocks of two signals
+STEP = 0.05  # s between compared times, and between tried time shifts
+FARTHEST = 2.5  # s; largest time shift
+SHIFTS = np.arange(-round(FARTHEST / STEP), round(FARTHEST / STEP) + 1)  # time shifts as multiples of STEP
+LARGE = 0.15  # s; smallest time shift that is reported
+BETTER = 0.7  # a time shift is reported if it reduces the residual to less than this fraction
+FEWEST = 200  # minimum number of compared times or sightings
+SLOWEST = 1.0  # s; with longer intervals between reference poses nothing is compared
 Array32 = NDArray[np.float32]
 Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Use:
-    """A run of a log by an estimator.
+    """A planned run of a log by an estimator.
 
-    ``sensors``: names of the channels that can be used; ``estimator``: its name, with its ``settings``; ``given``: names of the
-    settings that the user has set; ``modalities``: those of the measurements that the estimator uses; ``estimates_points``: whether
-    the estimator can estimate points that are not in the map; ``warnings``: about the settings."""
+    ``sensors``: names of the channels that the run may use.
+    ``estimator``: the name of the estimator. ``settings``: its settings. ``given``: names of the settings that the user has
+    set. ``modalities``: modalities of the measurements that the estimator uses.
+    ``estimates_points``: True if the estimator can estimate image points that are not in the map.
+    ``warnings``: warnings about the settings.
+    """
 
     log: Log
     sensors: tuple[str, ...]
@@ -54,8 +61,11 @@ class Use:
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of a run: ``diagnostics`` of the estimator and ``final_diagnostics`` of the ``final`` trajectory; what was
-    ``learnt``."""
+    """The results of a finished run.
+
+    ``diagnostics``: those of the causal estimates. ``final_diagnostics``: those of the ``final`` trajectory, which uses all
+    measurements. ``learnt``: estimated constants and landmarks.
+    """
 
     diagnostics: Diagnostics
     final_diagnostics: Diagnostics
@@ -65,14 +75,16 @@ class Ending:
 
 @dataclass(frozen=True)
 class Review:
-    """The review of a finished run by a sensor: ``warnings`` and the ``reliability`` of its model."""
+    """A sensor's judgement of a finished run: ``warnings``, and the ``reliability`` of the sensor's model or None."""
 
     warnings: tuple[Notice, ...] = ()
     reliability: Reliability | None = None
 
 
 def lacking_section(rig: Rig, sensor: str) -> str:
-    """The section that a sensor requires, because its settings have no defaults, if the rig lacks it, else ""."""
+    """Return the name of the section of the rig that a sensor requires but the rig lacks. Returns "" if nothing is missing. A
+    section whose settings all have defaults is required only for one of several sensors, such as
+    ``bearing_range.front``."""
     kind = kind_of(sensor)
     known = channels().get(kind)
     if known is None or not known.section:
@@ -86,7 +98,7 @@ def lacking_section(rig: Rig, sensor: str) -> str:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """A line, and a table below it if it has a ``header``: cells (R, C) of text."""
+    """A line of text. If ``header`` has C titles, a table with ``rows`` (R, C) of text follows."""
 
     line: str
     header: tuple[str, ...] = ()
@@ -95,10 +107,11 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Summary:
-    """The summary of one sensor in a log.
+    """The summary of one sensor in a log, for ``fgloc info``.
 
-    ``found``: entries of ``fgloc info --json``; ``in_map``: number of detectable elements by map layer; ``problems``: warnings, one
-    line each; ``text``: printed paragraphs. ``undetected``: problems that are none if another sensor of the kind lacks them.
+    ``found``: entries of the output of ``fgloc info --json``. ``in_map``: number of detectable elements of each map layer.
+    ``problems``: warnings. ``text``: printed paragraphs. ``undetected``: warnings about elements that the sensor never detects.
+    One of these warnings is omitted if another sensor of the same kind detects the element.
     """
 
     found: Mapping[str, Any] = field(default_factory=dict)
@@ -109,9 +122,11 @@ class Summary:
 
 
 def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
-    """The warning that ``name`` is stamped ``shift`` [s] later than ``than``, with the ``time_offset`` [s] that corrects it.
+    """Return the warning that the timestamps of ``name`` are ``shift`` [s] later than those of ``than``.
 
-    A shift at the end of the search may be larger."""
+    ``setting``: the section of the rig whose ``time_offset`` the warning proposes to set to ``offset`` [s]. If the shift is at
+    the limit of the search, the true one may be larger, and the warning proposes to correct the manifest.
+    """
     if abs(shift) > FARTHEST - STEP:
         sentence = "{name} is stamped {shift:.1f} s or more apart from {other}: correct clock_offset in the manifest"
         return notice("clocks_apart", sentence, name, FARTHEST, than)
@@ -121,7 +136,7 @@ def line(name: str, shift: float, than: str, setting: str, offset: float) -> Not
 
 
 def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
-    """The ``names`` that the map has only with other capital letters."""
+    """Return the ``names`` that are in the map only with another upper or lower case."""
     mapped = set(in_map)
     known = {name.casefold() for name in mapped}
     return [name for name in names if name not in mapped and name.casefold() in known]
@@ -129,10 +144,11 @@ def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """A ``layer`` of the map: ``names`` (K) of its elements and ``positions`` (K, 3) [m].
+    """What plots and viewers show of one ``layer`` of the map.
 
-    ``t`` (N,) [s of the log], ``seen`` (N) names: detections. ``marker``, ``size``, ``order``: matplotlib style, lowest order
-    first. ``dense``: whether there are too many elements to label.
+    ``names`` (K) and ``positions`` (K, 3) [m]: the elements of the layer. ``t`` (N,) and ``seen`` (N): time [s of the log] and
+    element name of each detection. ``marker``, ``size``: matplotlib style. ``order``: layers with a higher order are drawn on
+    top. ``dense``: True if there are too many elements to label.
     """
 
     layer: str
@@ -147,7 +163,7 @@ class Marks:
 
 
 def marks(log: Log) -> list[Marks]:
-    """The marks of all sensors for a log and its map, one of each layer."""
+    """Return the drawings of all map layers of a log. Detections by several sensors in one layer are merged."""
     layers: dict[str, Marks] = {}
     for name, draw in functions("draw", log.rig):
         new: Marks = draw(log.alone(name))
@@ -159,10 +175,11 @@ def marks(log: Log) -> list[Marks]:
 
 @dataclass(frozen=True, eq=False)
 class Ride:
-    """A drive through a world: the ``truth`` from t = 0, the ``rig`` given to estimators, and the true ``world``.
+    """A simulated drive through a world.
 
-    ``settings``: of the simulation, with the sections of the sensors. ``rng``, ``rng_of_world``: random generators by name, from
-    the seeds of the log and of the world.
+    ``settings``: those of the simulation, with the sections of the sensors. ``rig``: the rig that estimators will use.
+    ``world``: the true world. ``truth``: the true trajectory, from t = 0.
+    ``rng``, ``rng_of_world``: return a random generator by name, from the seed of the log or of the world.
     """
 
     settings: Any
@@ -173,14 +190,17 @@ class Ride:
     rng_of_world: Callable[[str], np.random.Generator]
 
     def times(self, rate: float) -> Array:
-        """Times (N,) of a sensor with ``rate`` [Hz], starting after one period."""
+        """Return the measurement times (N,) [s] of a sensor with ``rate`` [Hz], from one period after the start."""
         return times(rate, self.truth)
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """The streams of a sensor's channels. ``layers``: of the surveyed world, if it differs from the true one; ``metadata`` of
-    the log."""
+    """The simulated measurements of a sensor.
+
+    ``streams``: by channel. ``layers``: map layers as surveyed, if they differ from the true world. ``metadata``: entries for
+    the metadata of the log.
+    """
 
     streams: Mapping[str, Stream] = field(default_factory=dict)
     layers: Mapping[str, Any] = field(default_factory=dict)
@@ -188,36 +208,45 @@ class Simulated:
 
 
 class LiveSensor(Protocol):
-    """A simulated sensor of an active robot with ``rate`` [Hz]. ``decides``: whether the robot checks after each measurement if it
-    is localized."""
+    """A simulated sensor on a robot that chooses its path (active localization).
+
+    ``rate``: measurements per second. ``decides``: True if the robot checks after each measurement whether it is localized.
+    """
 
     channel: str
     rate: float
     decides: bool
 
     def measure(self, t: float, pose: Array) -> Measurement:
-        """The measurement at ``t`` [s] from pose (3,)."""
+        """Return a simulated measurement at ``t`` [s] from the robot's ``pose`` (3,)."""
 
 
 def times(rate: float, truth: Trajectory) -> Array:
-    """Times (N,) of a sensor on a drive, starting after one period."""
+    """Return the measurement times (N,) [s] of a sensor with ``rate`` [Hz] on a drive, from one period after the start."""
     count = int(float(truth.t[-1]) * rate + 1e-9)
     return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))
 
 
 class Forecast(Protocol):
-    """The forecast of one sensor in a world whose map is exact. ``goals`` (K, 2) [m]: positions near which it is most
-    informative; empty for a sensor with long range."""
+    """Predicts what a sensor will measure on candidate paths, in a world whose map is exact.
+
+    ``goals`` (K, 2): positions [m] near which the sensor is most informative. K is 0 for a sensor with long range.
+    """
 
     goals: Array
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Expected Fisher information (N, 3, 3) on the body-frame perturbation of poses (N, 3). ``ways`` (N,) [m]: distance
-        travelled at each pose; turns count by their duration."""
+        """Return the expected Fisher information (N, 3, 3) on the body-frame perturbation of ``poses`` (N, 3) along a path.
+
+        ``ways`` (N,): the length [m] of the part of the path at each pose. The duration of a turn counts as the distance that
+        the robot travels in that time.
+        """
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Add the log-likelihoods (M,) of measurements that the first J particles might make on a path to ``out`` (J, M).
+        """Simulate measurements from each of the first J particles along a path. Add to ``out[j, m]`` the log-likelihood of
+        particle m, given the measurements from particle j.
 
-        ``poses`` (S, M, 3): where particles measure; ``metres``: length of the path, with turns by their duration; ``stops``
-        (M,): number of measurements of each particle. Random draws are the same for all paths with one ``seed``.
+        ``poses`` (S, M, 3): the poses of M particles at S stops on the path. ``metres``: length of the path, with turns as in
+        :meth:`information`. ``stops`` (M,): number of stops at which each particle measures. ``out`` (J, M).
+        Random draws are the same for all paths with the same ``seed``.
         """

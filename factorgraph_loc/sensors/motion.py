@@ -1,4 +1,4 @@
-"""The motion of the robot by wheel odometry and gyro: of a run, of a whole log, and the noise model of a rig."""
+"""Computes the motion of the robot from wheel odometry and gyro, during a run and for a whole log."""
 
 from __future__ import annotations
 
@@ -31,17 +31,18 @@ from factors.odometry.model import (
 )
 from factors.se2 import Array
 
-MOTION = "motion"  # the block of the constants of odometry
-# m, rad, s: over which the error of a constant accumulates before other sensors correct it
+MOTION = "motion"  # name of the state block with the odometry's constants
+# distance [m], rotation [rad] and time [s] over which the error of a constant accumulates before other sensors correct it
 WAY, TURN, TIME = 4.0, 4.0, 8.0
-HORIZON = 5.0  # s of odometry that are kept
+HORIZON = 5.0  # s; older odometry is discarded during a run
 
 
 def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
-    """The motion model; with ``use_gyro`` the heading's noise and bias are those of the gyro.
+    """Return the odometry model of a rig.
 
-    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants: their errors are part of the noise,
-    as a random walk that reaches the variance of the constant's effect after :data:`WAY`, :data:`TURN` or :data:`TIME`.
+    ``use_gyro``: bias and noise of the heading are those of the gyro.
+    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants. Their errors are added to the noise
+    as a random walk. It reaches the variance of a constant's effect after :data:`WAY`, :data:`TURN` or :data:`TIME`.
     """
     s = rig.of(OdometrySettings)
     along, heading = s.noise.along.model(), s.noise.heading.model()
@@ -75,10 +76,10 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
 
 
 class Motion(OdometryChain):
-    """Collects rows of wheel odometry and gyro, and gives the relative motion between any two recent times.
+    """Collects rows of wheel odometry and gyro, and computes the relative motion between any two recent times.
 
-    A gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``constants``: the P calibration constants that are
-    estimated, none without ``self_calibration``; their errors are part of the noise then. ``horizon`` [s]: how long rows are kept.
+    The gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``constants``: the P calibration constants that
+    are estimated. Without ``self_calibration`` there are none, and their errors are part of the noise.
     """
 
     def __init__(
@@ -91,8 +92,8 @@ class Motion(OdometryChain):
         self._diagnostics = diagnostics
 
     def add(self, m: Measurement) -> None:
-        """Add a row, or :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are counted as ignored, those
-        older than the kept rows as late."""
+        """Add one row, or several as :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are counted as
+        ignored. Rows that are too old are counted as late."""
         kept: int
         match m:
             case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
@@ -110,20 +111,21 @@ class Motion(OdometryChain):
             self._diagnostics.drop_late("odometry", m.count - kept)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
-        """Corrected ``delta`` (3,) of an increment for ``constants`` (P,), and its Jacobian (3, P) in the tangent space."""
+        """Return the logarithm (3,) of an increment's motion, corrected for ``constants`` (P,), and its Jacobian (3, P) by
+        them."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
-        """An increment corrected for ``constants`` (P,)."""
+        """Return the increment corrected for ``constants`` (P,)."""
         if not self.constants.names:
             return increment
         delta = kernels.recalibrated(increment.delta, increment.moving, constants, self._indices)
         return Increment(delta, increment.covariance, increment.duration, increment.still)
 
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
-        """Poses (R, 3) at times (R,) relative to the pose at ``start``, for ``constants`` (P,), linearised as in
-        :func:`factors.odometry.kernels.recalibrate`."""
+        """Return poses (R, 3) at times ``t`` (R,) [s], in the frame of the pose at ``start``. They are corrected for
+        ``constants`` (P,) with the linearisation of :func:`factors.odometry.kernels.recalibrate`."""
         states = self.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:
@@ -135,12 +137,13 @@ class Motion(OdometryChain):
         return np.asarray(se2.exp(moved))
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
-        """The additional covariance (3, 3) of an increment if wheels slip, and minus the log-probability of that."""
+        """Return the additional covariance (3, 3) of an increment if the wheels slip, and the negative log-probability of
+        slip."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
 
 
 def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
-    """The motion between any two times of a log, from the odometry and gyro among ``sensors``."""
+    """Return the motion of a whole log, from the odometry and the gyro if ``sensors`` include them."""
     motion = Motion(log.rig, tuple(sensors), Diagnostics())
     motion.horizon = math.inf
     for m in log.measurements(sensors):
@@ -150,21 +153,21 @@ def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
 
 
 def odometry_of(log: Log) -> VelocityStream | IncrementStream:
-    """The odometry stream."""
+    """Return the odometry stream of a log that has one."""
     stream = log.streams["odometry"]
     assert isinstance(stream, VelocityStream | IncrementStream)
     return stream
 
 
 def overlap(log: Log) -> tuple[float, float]:
-    """The first and the last time [s] that have both odometry and reference."""
+    """Return the first and the last time [s] for which a log has both odometry and reference."""
     assert log.reference is not None
     t = odometry_of(log).t + log.rig.time_offset("odometry")
     return max(float(t[0]), float(log.reference.t[0])), min(float(t[-1]), float(log.reference.t[-1]))
 
 
 def integrated(log: Log, model: OdometryModel) -> OdometryChain:
-    """The integrated odometry of a log."""
+    """Return the odometry of a log, integrated from its first to its last row."""
     chain = OdometryChain(model, horizon=np.inf)
     stream = odometry_of(log)
     t = stream.t + log.rig.time_offset("odometry")

@@ -1,9 +1,9 @@
 """The registry of sensors and their channels.
 
-A sensor is a package whose ``__init__`` defines a :class:`SensorType`. It refers to classes and functions of its modules by place,
-``package.module:name``, so that they are imported only when needed (:func:`factorgraph_loc.plugins.load`). Built-in sensors are
-listed in :mod:`factorgraph_loc.builtin`; other packages register the place of their :class:`SensorType` as an entry point of the
-group ``factorgraph_loc.sensors``.
+A sensor is a package whose ``__init__`` defines a :class:`SensorType`. It names classes and functions of its modules by strings
+``package.module:name``. :func:`factorgraph_loc.plugins.load` imports them when they are needed. Built-in sensors are listed in
+:mod:`factorgraph_loc.builtin`. Another package registers the string of its :class:`SensorType` as an entry point of the group
+``factorgraph_loc.sensors``.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Channel:
-    """A name in ``--sensors`` and of a log's streams.
+    """A kind of measurement of a sensor. Its ``name`` is used in the option ``--sensors`` and as the name of a log's stream.
 
-    ``section``: the rig's section with the ``time_offset``. ``tables``: the descriptions
-    (:class:`~factorgraph_loc.files.columns.Table`) of its tables in a log; ``described``: of further tables, for measurements that
-    differ from those. An optional column of the sensor's first channel has none, as ``rssi`` and ``phase`` of ``rfid``.
-
-    If stream fields are not columns: ``assemble``: ``(rows by table, reading) ->
-    stream`` and ``disassemble``: ``(stream, writing) -> columns by table``, see :mod:`factorgraph_loc.sensors.tables`. For pushed
-    measurements whose fields are not columns: ``check``: ``(measurement, where) -> validated fields``. ``intake``: the class of an
-    :class:`~factorgraph_loc.sensors.tables.Intake`, made of (rig, world).
+    ``section``: the section of the rig with the channel's ``time_offset``.
+    ``tables``: descriptions (:class:`~factorgraph_loc.files.columns.Table`) of the channel's tables in a log. A channel without
+    tables is an optional column of the sensor's first channel, such as ``rssi`` of ``rfid``.
+    ``described``: descriptions of further tables, whose columns are the fields of measurements but not of files.
+    ``assemble``: ``(rows by table, reading) -> stream``, if the fields of the stream are not columns of a table.
+    ``disassemble``: ``(stream, writing) -> columns by table``, likewise.
+    ``check``: ``(measurement, where) -> validated fields``, for pushed measurements whose fields are not columns of a table.
+    ``intake``: a subclass of :class:`~factorgraph_loc.sensors.tables.Intake`, which is constructed from rig and world.
     """
 
     name: str
@@ -50,34 +50,38 @@ class Channel:
 
     @property
     def streams(self) -> list[type[Any]]:
-        """The classes of its streams, whose ``kind`` is the class of their measurements."""
+        """The classes of the channel's streams. The attribute ``kind`` of a stream class is the class of its measurements."""
         tables = [load(place) for place in (*self.tables, *self.described)]
         return [load(table.stream) for table in tables if table.stream]
 
 
 @dataclass(frozen=True)
 class SensorType:
-    """A sensor: its ``channels``, its ``settings`` (sections of the rig), its ``layers`` of the world, and the places of its
-    functions, "" for none. :func:`functions` returns those of all sensors.
+    """The description of a sensor: names, sections, and functions as strings ``package.module:name``, "" for none.
 
-    ``detects``: the layer of the world whose elements it detects, "" for none. ``locates``: whether it localizes the robot without
-    a map.
-
-    ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``; ``draw``: ``(log) ->``
-    :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers. ``bind``: ``(binding) ->``
-    :class:`~factorgraph_loc.sensors.base.Sensor`, or None if a run does not use it.
-
-    For runs (:class:`~factorgraph_loc.sensors.interfaces.Use`): ``check``: ``(use) -> use``, with the settings that the log
-    requires, or InputError if log and settings do not fit; ``review``: ``(use, ending) ->``
-    :class:`~factorgraph_loc.sensors.interfaces.Review`, from an :class:`~factorgraph_loc.sensors.interfaces.Ending`.
-
-    For simulated logs, whose settings have the sections ``simulation``: ``simulate``: ``(ride) ->``
-    :class:`~factorgraph_loc.sensors.interfaces.Simulated`, from a :class:`~factorgraph_loc.sensors.interfaces.Ride`; ``looks``:
-    ``(settings)``, the measurement rate [Hz] by plural of the detected things; ValueError if the settings are inconsistent. For
-    active robots: ``on_robot``: ``(world, rig, settings, rng) ->`` :class:`~factorgraph_loc.sensors.interfaces.LiveSensor` or None;
-    ``forecast``: ``(world, rig, speed, settings) ->`` :class:`~factorgraph_loc.sensors.interfaces.Forecast` or None.
-
-    ``calibrator``: a :class:`~factorgraph_loc.sensors.calibrating.Calibrator`.
+    - ``channels``: kinds of measurements. ``settings``: sections of the rig. ``layers``: layers of the world.
+    - ``detects``: the layer of the world whose elements the sensor detects, "" for none. ``locates``: True if the sensor
+    localizes
+      the robot without a map.
+    - ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor` of a run, or None if the run does not use the
+    sensor.
+    - ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``.
+    - ``draw``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
+    - ``check``: ``(use) -> use``, before a run. It may change settings as the log requires. It raises InputError if log and
+    settings
+      are incompatible.
+    - ``review``: ``(use, ending) ->`` :class:`~factorgraph_loc.sensors.interfaces.Review`, after a run.
+    - ``simulation``: sections of the settings of simulated logs.
+    - ``simulate``: ``(ride) ->`` :class:`~factorgraph_loc.sensors.interfaces.Simulated`, for simulated logs.
+    - ``looks``: ``(settings) ->`` expected detections per second by the plural of the detected elements. It raises ValueError
+    if
+      settings of a simulation are inconsistent.
+    - ``on_robot``: ``(world, rig, settings, rng) ->`` :class:`~factorgraph_loc.sensors.interfaces.LiveSensor` or None, for
+    active
+      localization.
+    - ``forecast``: ``(world, rig, speed, settings) ->`` :class:`~factorgraph_loc.sensors.interfaces.Forecast` or None, for
+    planning.
+    - ``calibrator``: a :class:`~factorgraph_loc.sensors.calibrating.Calibrator`.
     """
 
     name: str
@@ -100,12 +104,13 @@ class SensorType:
 
 
 def sensors() -> Mapping[str, SensorType]:
-    """All sensors by name, built-in ones first. InputError if one cannot be loaded or two share a name."""
+    """Return all sensors by name, built-in ones first. Raises InputError if a sensor cannot be loaded, or if two have the same
+    name."""
     return registered()
 
 
 def sensor(name: str) -> SensorType:
-    """A sensor by its name or that of one of its channels; InputError if it is unknown."""
+    """Return the sensor with this name, or with a channel of this name. Raises InputError if there is none."""
     if name in sensors():
         return sensors()[name]
     if name in channels():
@@ -114,25 +119,27 @@ def sensor(name: str) -> SensorType:
 
 
 def sections_of(sensor: SensorType) -> dict[str, list[Setting]]:
-    """The settings in each of a sensor's sections of the rig."""
+    """Return the settings in each section of the rig that belongs to the sensor."""
     return {name: settings_in(load(section.kind)) for name, section in sensor.settings.items()}
 
 
 def about(name: str) -> str:
-    """The first sentence of the docstring of a sensor's package."""
+    """Return the first sentence of the docstring of a sensor's package."""
     return first_sentence(load(SENSORS.place(name).partition(":")[0]))
 
 
 @cache
 def channels() -> Mapping[str, Channel]:
-    """All channels by name, as used in ``--sensors``."""
+    """Return all channels by name. The option ``--sensors`` uses these names."""
     return {channel.name: channel for sensor in sensors().values() for channel in sensor.channels}
 
 
 @cache
 def sensor_of(channel: str) -> SensorType:
-    """The sensor of a channel; ``channel`` may be the ``sensor`` of a measurement or the name of a stream, also of one of several
-    sensors. InputError if it is unknown."""
+    """Return the sensor that a channel belongs to. Raises InputError if the channel is unknown.
+
+    ``channel``: the name of a channel or stream, possibly of one of several sensors, such as ``bearing_range.front``.
+    """
     kind = kind_of(channel)
     for sensor in sensors().values():
         if any(own.name == kind for own in sensor.channels) and (kind == channel or kind in several()):
@@ -141,20 +148,20 @@ def sensor_of(channel: str) -> SensorType:
 
 
 def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
-    """The channels among ``names`` that measure motion on the floor; with ``rank``
-    :data:`~factorgraph_loc.model.measurement.TURN` also those that measure rotation alone."""
+    """Return the channels among ``names`` that measure motion on the floor. With ``rank``
+    :data:`~factorgraph_loc.model.measurement.TURN` include channels that measure only rotation."""
     streams = {name: channels()[kind_of(name)].streams for name in names if kind_of(name) in channels()}
     return tuple(name for name, kinds in streams.items() if kinds and kinds[0].rank <= rank)
 
 
 def parent_of(channel: str) -> str:
-    """The channel with ``channel`` as an optional column, or ""."""
+    """Return the channel whose tables have ``channel`` as an optional column, or "" if ``channel`` has its own tables."""
     known = channels().get(channel)
     return "" if known is None or known.tables else sensor_of(channel).channels[0].name
 
 
 def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
-    """The sensors with a channel among ``names`` that can localize the robot in a ``world``."""
+    """Return the sensors with a channel among ``names`` that can localize the robot in ``world``."""
     return [
         sensor
         for sensor in sensors().values()
@@ -164,15 +171,17 @@ def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
 
 
 def channel(name: str) -> Channel:
-    """A channel by name, also that of one of several sensors; InputError if it is unknown."""
+    """Return the channel with this name. It may be the name of one of several sensors, such as ``bearing_range.front``. Raises
+    InputError if it is unknown."""
     return next(own for own in sensor_of(name).channels if own.name == kind_of(name))
 
 
 def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
-    """Names and functions of one kind, a field of :class:`SensorType`, of the sensors that have it.
+    """Yield the name and the function of each sensor that registers a function ``kind``, a field of :class:`SensorType`.
 
-    Of several sensors of a kind in the ``rig``, each has its name, such as ``bearing_range.front``. Its function expects a rig or a
-    log where it is the only one of its kind (:meth:`~factorgraph_loc.model.rig.Rig.alone`).
+    If the ``rig`` has several sensors of one type, each is yielded by its own name, such as ``bearing_range.front``. The
+    function then expects a rig or log in which the sensor is the only one of its type
+    (:meth:`~factorgraph_loc.model.rig.Rig.alone`).
     """
     for name, sensor in sensors().items():
         if place := getattr(sensor, kind):
@@ -182,7 +191,7 @@ def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
 
 
 def bound_sensors(binding: Binding) -> dict[str, Sensor]:
-    """The exteroceptive sensors of a run by name."""
+    """Return the sensors of the robot's surroundings that a run uses, by name."""
     named = [("" if kind_of(name) == name else name, bind) for name, bind in functions("bind", binding.setup.rig)]
     sensors = [bind(replace(binding, setup=binding.setup.alone(name), name=name)) for name, bind in named]
     return {sensor.name: sensor for sensor in sensors if sensor is not None}

@@ -1,8 +1,8 @@
-"""Trajectories along which sensors are calibrated: those of references, or of an estimator that has smoothed logs without any.
+"""Trajectories for the calibration of sensors: references, or trajectories that a smoother estimated in logs without reference.
 
-Each smoothed log has constants of its own, which scatter about those of the installation. An estimator finds each as a correction
-of the rig's value, with a standard deviation. Their mean over the logs becomes the rig's value, and their scatter its uncertainty
-(empirical Bayes: Efron and Morris, "Data analysis using Stein's estimator and its generalizations", JASA 70, 1975).
+In each log the smoother estimates the sensors' constants as corrections of the rig's values, with standard deviations. The mean
+of a correction over the logs updates the rig's value. The scatter of a correction between logs is the uncertainty of the
+constant (empirical Bayes: Efron and Morris, "Data analysis using Stein's estimator and its generalizations", JASA 70, 1975).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,17 +17,17 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import moving
 from factors.se2 import Array
 
-WORTH = 2.0  # logs that the uncertainty of the input rig counts as: the scatter of few logs is uncertain
+WORTH = 2.0  # the uncertainty of the input rig has the weight of this many logs, because the scatter of few logs is uncertain
 REFERENCE_GAP = 0.35  # s; longest interpolated gap between reference poses
 
 
 @dataclass(frozen=True)
 class Traced:
-    """A log with the trajectory along which is learnt, as its reference.
+    """A log for calibration, whose reference is a measured or a smoothed trajectory.
 
-    ``constants``: None for a reference proper. For a smoothed trajectory, which has covariances, the constants that were estimated,
-    by their names in :class:`~factorgraph_loc.model.belief.Learnt`, each the correction of the rig's value with its standard
-    deviation. ``doubted``: names of things that are probably not where the map has them.
+    ``constants``: None for a measured reference. For a smoothed trajectory: the estimated constants by their names in
+    :class:`~factorgraph_loc.model.belief.Learnt`. Each value is a correction of the rig's value, and its standard deviation.
+    ``doubted``: names of elements that are probably not at their position in the map.
     """
 
     log: Log
@@ -36,13 +36,14 @@ class Traced:
 
 
 def recordings(logs: Sequence[Log]) -> list[int]:
-    """The number of the recording of each log. Logs that differ in their odometry only are not independent: they are one."""
+    """Return the number of the recording that each log belongs to, which is the index of its first log. Logs that differ only
+    in their odometry belong to the same recording, because they are not independent."""
     keys = [_exteroceptive(log) or i for i, log in enumerate(logs)]
     return [keys.index(key) for key in keys]
 
 
 def _exteroceptive(log: Log) -> bytes:
-    """The arrays of all streams but those of the motion."""
+    """Return the bytes of all arrays of a log's streams, except streams that measure motion."""
     streams = [log.streams[name] for name in sorted(set(log.streams) - set(moving(log.streams)))]
     arrays = [array for stream in streams for array in vars(stream).values() if isinstance(array, np.ndarray)]
     return b"".join(array.tobytes() for array in arrays)
@@ -50,7 +51,7 @@ def _exteroceptive(log: Log) -> bytes:
 
 @dataclass(frozen=True)
 class Corrections:
-    """Corrections ``each`` (N,) of one constant in N logs: their ``mean``, and their ``scatter`` (standard deviation)."""
+    """Corrections of one constant in N logs: ``each`` (N,), their ``mean``, and their standard deviation ``scatter``."""
 
     each: Array
     mean: float
@@ -58,15 +59,15 @@ class Corrections:
 
     @property
     def error(self) -> float:
-        """Standard error of the mean."""
+        """The standard error of the mean."""
         return self.scatter / float(np.sqrt(len(self.each)))
 
 
 def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Corrections:
-    """The mean and the scatter of corrections, each with a standard deviation; ``known``: the scatter according to the input rig.
+    """Return mean and scatter of ``corrections``, each given with its standard deviation.
 
-    The scatter is that of the corrections, less the part that their own errors explain, by moments. The known scatter is averaged
-    with it as if it came from :data:`WORTH` logs. The scatter of the corrections includes the errors of the mean.
+    The variance between logs is the variance of the corrections minus the part that their own errors explain. It is averaged
+    with the variance ``known`` squared of the input rig, which has the weight of :data:`WORTH` logs.
     """
     each, errors = np.array(corrections).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))
@@ -75,7 +76,8 @@ def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Correcti
 
 
 def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, float]]:
-    """The correction of a constant in each log, with its standard deviation; empty if it was not estimated in all logs."""
+    """Return the correction of a constant and its standard deviation in each log. Returns [] if it was not estimated in all
+    logs."""
     corrections = [trace.constants[name] for trace in traced if trace.constants and name in trace.constants]
     return corrections if len(corrections) == len(traced) else []
 
@@ -83,10 +85,11 @@ def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, flo
 def pooled_constants(
     section: str, prefix: str, settings: Any, first: Any, traced: Sequence[Traced]
 ) -> tuple[Any, list[FittedConstant]]:
-    """The ``settings`` of a section with those of its uncertain constants that were estimated in all logs, and these constants.
-    ``first``: the settings before anything was learnt.
+    """Update the constants of a section that were estimated in all logs. Returns the new settings and the fitted constants.
 
-    Scales are corrected by factors, others by sums. The uncertainty is written if there are several logs.
+    ``prefix``: the prefix of the constants' names in the logs. ``settings``: the settings that the logs were smoothed with.
+    ``first``: the settings before the first repetition of smoothing and calibration. Corrections of scales are relative, others
+    are absolute. With several logs, the uncertainties of the constants are updated as well.
     """
     values: dict[str, float] = {}
     uncertainties: dict[str, float] = {}
@@ -109,11 +112,11 @@ def pooled_constants(
 
 
 def possible_poses(trajectory: Trajectory, t: Array) -> Array:
-    """A pose (N, 3) at each time (N,) of a trajectory with covariances, drawn from the six cubature points of its distribution:
-    so means over many times are also means over what the trajectory leaves open. NaN outside and in gaps longer than
-    :data:`REFERENCE_GAP`.
+    """Return one random pose (N, 3) at each time ``t`` (N,) [s] of a trajectory with covariances.
 
-    Cubature: Arasaratnam and Haykin, "Cubature Kalman filters", IEEE TAC 54(6), 2009. Always the same draws.
+    Each pose is drawn from the six cubature points of the pose's distribution. A mean over many times is therefore also a mean
+    over the errors of the trajectory. Poses are NaN outside of the trajectory and in gaps longer than :data:`REFERENCE_GAP`.
+    The random draws are the same at each call. Source: Arasaratnam and Haykin, "Cubature Kalman filters", IEEE TAC 54(6), 2009.
     """
     poses = trajectory.at(t, max_gap=REFERENCE_GAP)
     covariances = np.nan_to_num(trajectory.covariances_at(t, max_gap=REFERENCE_GAP)) + 1e-12 * np.eye(3)

@@ -1,7 +1,7 @@
-"""Conversion between tables and streams by the descriptions of their columns.
+"""Converts tables of files into streams and back, and validates pushed measurements, by the descriptions of their columns.
 
-A sensor whose stream fields are columns needs only a description, a :class:`~factorgraph_loc.files.columns.Table`; others define
-``assemble`` and ``disassemble`` of their channels.
+A channel whose stream has one field per column only needs a :class:`~factorgraph_loc.files.columns.Table`. Other channels
+define the functions ``assemble`` and ``disassemble``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """The context of reading rows: the ``rig``, the absolute time of t = 0, and the list of warnings."""
+    """The context in which rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list to append
+    to."""
 
     rig: Rig
     t0_ns: int
@@ -45,7 +46,8 @@ class Reading:
 
 @dataclass(frozen=True)
 class Writing:
-    """The context of writing a stream: the name of its log, the absolute time of t = 0, and the ``folder`` of the tables."""
+    """The context in which a stream is written. ``log``: the name of its log. ``t0_ns``: the absolute time of t = 0 [ns].
+    ``folder``: the folder of the tables."""
 
     log: str
     t0_ns: int
@@ -54,13 +56,13 @@ class Writing:
 
 @cache
 def tables_of(channel: Channel) -> tuple[Table, ...]:
-    """The tables of a channel in a log; several of one name are alternatives."""
+    """Return the descriptions of a channel's tables in a log. Several descriptions with the same name are alternatives."""
     return tuple(load(place) for place in channel.tables)
 
 
 @cache
 def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
-    """The channel and the descriptions of each table of a log, by table name."""
+    """Return the tables of the native format by name: the channel of each table, and its alternative descriptions."""
     return {
         table.name: (channel, tuple(candidate for candidate in tables_of(channel) if candidate.name == table.name))
         for channel in channels().values()
@@ -69,8 +71,8 @@ def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
 
 
 def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
-    """The name of the channel with a table of a log, such as ``bearing_range.front`` of one of several sensors, and the
-    descriptions of the table; None if there is none."""
+    """Return the channel name and the alternative descriptions of the table ``name`` of the native format. Returns None if
+    there is no such table. The table of one of several sensors has a name such as ``bearing_range.front``."""
     kind, _, own = name.partition(".")
     if kind not in native_tables() or (kind != name and not (kind in several() and is_name(own))):
         return None
@@ -79,7 +81,8 @@ def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
 
 
 def all_tables(*chosen: SensorType) -> Iterator[Table]:
-    """The descriptions of the tables of sensors, by default of all: of the channels of each, then of its layers of the map."""
+    """Yield the descriptions of the tables of the ``chosen`` sensors, by default of all sensors. For each sensor, tables of
+    measurements come before tables of map layers."""
     for sensor in chosen or sensors().values():
         for channel in sensor.channels:
             yield from (load(place) for place in (*channel.tables, *channel.described))
@@ -87,7 +90,8 @@ def all_tables(*chosen: SensorType) -> Iterator[Table]:
 
 
 def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """The stream of a channel from the ``rows`` of its tables; problems are an InputError or a warning."""
+    """Return the stream of a channel from the ``rows`` of its tables, by table name. Raises InputError for invalid rows, and
+    appends to ``reading.warnings`` for rows that are skipped."""
     if channel.assemble:
         made: Stream = load(channel.assemble)(rows, reading)
         return made
@@ -100,10 +104,11 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
 
 
 def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """The stream of a table's rows.
+    """Return the stream of a table's rows. Of repeated rows the last one is kept.
 
-    If the rows of one timestamp form a measurement, the last row of each name is kept, otherwise the last row of each timestamp.
-    InputError names file, row and column of values out of bounds, decreasing timestamps, and rows without any value.
+    Rows are repeated if they have the same timestamp. If the rows of one timestamp form one measurement, repeated rows also
+    have the same name. Raises InputError with file, row and column for values out of bounds, decreasing timestamps, and rows
+    without values.
     """
     values: dict[str, Any] = dict(rows.names)
     measured = [column for column in table.columns if column.name in rows.numbers]
@@ -133,12 +138,12 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice])
 
 
 def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
-    """Whether each row (N,) has no number in any column."""
+    """Return a mask (N,) that is True for rows without a number in any of the ``columns``, each (N,)."""
     return np.asarray(np.isnan(columns).all(axis=0))
 
 
 def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> Array:
-    """The numbers (N,) of a column, with those below its ``left_out_below`` removed."""
+    """Return the numbers (N,) of a column. Numbers below the column's ``left_out_below`` become NaN, with a warning."""
     values = rows.numbers[column.name]
     small = np.flatnonzero(values < column.left_out_below)
     if not len(small):
@@ -150,8 +155,8 @@ def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> A
 
 
 def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """The columns of a stream's tables by table name; referenced files are copied into the folder. InputError if a stream has no
-    table."""
+    """Return the columns of a stream's tables, by table name. Files that the stream refers to are copied into the folder.
+    Raises InputError if the native format has no table for the stream."""
     if channel.disassemble:
         made: dict[str, Columns] = load(channel.disassemble)(stream, writing)
         return made
@@ -163,7 +168,7 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
 
 
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
-    """The columns that describe a stream's numbers, named by its fields."""
+    """Yield the descriptions of a stream's numeric fields. Their names are those of the fields."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):
         if table.stream and load(table.stream) is type(stream):
             measured = [column.measured for column in table.columns if column.kind == "number"]
@@ -174,24 +179,24 @@ M = TypeVar("M", bound=Measurement)
 
 
 class Intake:
-    """A channel's processing of measurements that a program pushes one by one."""
+    """Processes the measurements of a channel that a program pushes one by one. The default accepts them unchanged."""
 
     def measured(self, m: Measurement) -> Measurement:
-        """The measurement that estimators take, such as the features of an image. Called in any thread."""
+        """Return the measurement for the estimators, such as the features of an image. This may be called in any thread."""
         return m
 
     def require(self, m: Measurement) -> None:
-        """InputError if a measurement does not fit the previous ones."""
+        """Raise InputError if a measurement is inconsistent with the previous ones."""
 
 
 @cache
 def kinds() -> Mapping[type[Any], Channel]:
-    """The measurement classes, each with its channel."""
+    """Return the channel of each class of measurements."""
     return {stream.kind: channel for channel in channels().values() for stream in channel.streams}
 
 
 def channel_of(kind: type[Any]) -> Channel:
-    """The channel of a measurement's class; InputError if it is not one."""
+    """Return the channel of a class of measurements. Raises InputError if ``kind`` is no such class."""
     if kind not in kinds():
         known = ", ".join(each.__name__ for each in kinds())
         raise InputError(f"{kind.__name__} is not a measurement, expected one of {known}")
@@ -199,8 +204,8 @@ def channel_of(kind: type[Any]) -> Channel:
 
 
 def checked(m: M) -> M:
-    """A validated copy of a measurement, or itself if it consists of valid floats, which nobody can change; InputError names the
-    first invalid field, its value and the expected values."""
+    """Return a validated copy of a measurement, or the measurement itself if it only consists of valid floats, which are
+    immutable. Raises InputError with the first invalid field, its value and the expected values."""
     if (floats := _floats_of(type(m))) is not None:
         for name, low, high in floats:
             value = getattr(m, name)
@@ -220,8 +225,8 @@ def checked(m: M) -> M:
 
 @cache
 def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] | None:
-    """Name and inclusive bounds of each field of a class with numbers only, as rows of odometry have; None for others.
-    InputError if it is no class of measurements."""
+    """Return name and inclusive bounds of each field of a class of measurements, such as those of odometry. Returns None if not
+    all fields are single numbers. Raises InputError if ``kind`` is no class of measurements."""
     channel = channel_of(kind)
     if channel.check:
         return None
@@ -233,7 +238,8 @@ def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] 
 
 
 def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[str, Any]]:
-    """The fields of a measurement that match the columns of a table: numbers, or names and arrays (K,) if it has several rows."""
+    """Yield name and validated value of each field of a measurement. Fields correspond to the columns of a table. Values are
+    numbers, or names and arrays (K,) if a measurement consists of K rows."""
     table = _table_of(type(m), channel)
     count: int | None = None
     for column in table.columns[1:]:

@@ -192,7 +192,7 @@ def test_clocks_that_go_back_or_are_others_are_refused(log):
     localizer = started(log, "ekf")
     localizer.push(IncrementOdometry(5.0, 0.1, 0.0, 0.0))
     with pytest.raises(
-        InputError, match=r"IncrementOdometry at 4.900 s: follows one at 5.000 s, expected increments in order"
+        InputError, match=r"IncrementOdometry at 4.900 s: follows an increment at 5.000 s, expected increments in order"
     ):
         localizer.push(IncrementOdometry(4.9, 0.1, 0.0, 0.0))
     with pytest.raises(InputError, match=r"IncrementOdometry at 1700000000.000 s: is 1699999995 s ahead of all others"):

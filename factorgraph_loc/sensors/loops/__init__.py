@@ -1,4 +1,4 @@
-"""Loops found by another program: places that are met again; some may be false."""
+"""Loop closures found by another program: places that the robot visits again. Some may be false."""
 
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType

@@ -1,4 +1,7 @@
-"""Measurements of loops, their stream, and their tables: with the age of the earlier pose, or with its own timestamp."""
+"""Measurements of loop closures, their stream, settings and tables.
+
+A table gives the earlier pose of a loop by its age, or by its timestamp.
+"""
 
 from __future__ import annotations
 
@@ -36,16 +39,18 @@ if TYPE_CHECKING:
 
 
 class LoopSettings(SensorSettings):
-    """Loops found by another program. A loop of score s has standard deviations 1/s times as large as these, and is given up at
-    sqrt(s) times the distance; a rig without the section has the defaults."""
+    """Noise of loop closures that another program found. A rig without this section has the defaults.
+
+    The standard deviations are those of a loop of score 1. A loop of score s has standard deviations that are 1/s times as
+    large. The robust loss rejects it at sqrt(s) times the distance.
+    """
 
     sigma_position: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")] = 0.1
     """standard deviation of a relative position, in each coordinate"""
     sigma_heading: Annotated[float, Field(ge=1e-4, le=3.0), InUnit("rad")] = 0.05
     """standard deviation of a relative heading"""
     sigma_place: Annotated[float, Field(ge=1e-3, le=100.0), InUnit("m")] = 0.5
-    """standard deviation, in each coordinate, of the distance between two poses at one place, for loops without a relative
-    pose"""
+    """standard deviation, in each coordinate, of the distance between the two poses of a loop without a relative pose"""
     least_score: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """loops with a lower score are not used"""
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 3.0
@@ -59,7 +64,7 @@ _TOLD = (
         for name in "xy"
     ),
     number("heading", ANGLE, -FULL_TURN, FULL_TURN, "heading in the frame of the earlier pose", may_lack=True),
-    number("score", PURE, 0.0, 1.0, "how sure the other program is; 1 if it is empty", may_lack=True),
+    number("score", PURE, 0.0, 1.0, "confidence of the other program; 1 if empty", may_lack=True),
 )
 _OPTIONAL = (("x", "y", "heading"), ("score",))
 
@@ -80,10 +85,10 @@ LOOPS_BY_STAMP = Table(
 
 @dataclass(frozen=True, slots=True)
 class Loops:
-    """Places of earlier times that are met again at one time.
+    """K loop closures at the time ``t`` [s]: the robot is at places that it has visited before.
 
-    ``age`` (K,) [s]: time since the earlier pose. ``x``, ``y`` (K,) [m] and ``heading`` (K,) [rad]: the pose in the frame of the
-    earlier one, NaN if only the place is known to be the same. ``score`` (K,): 0 to 1, NaN if there is none.
+    ``age`` (K,): time [s] since the earlier visit. ``x``, ``y`` (K,) [m] and ``heading`` (K,) [rad]: the current pose in the
+    frame of the earlier pose, NaN if the loop has no relative pose. ``score`` (K,): confidence from 0 to 1, NaN if unknown.
     """
 
     sensor: ClassVar[str] = "loops"
@@ -99,13 +104,14 @@ class Loops:
 
     @property
     def count(self) -> int:
-        """Number of loops."""
+        """The number of loops."""
         return len(self.age)
 
 
 @dataclass(frozen=True)
 class LoopStream(ScanStream):
-    """Rows of loops: age [s], relative pose [m, m, rad] and score, NaN if not given. Rows of one timestamp form one measurement."""
+    """All loop closures of a log, one per row. Rows of one timestamp form one measurement. For the fields see
+    :class:`Loops`."""
 
     kind: ClassVar[type[Any]] = Loops
     age: Array
@@ -119,7 +125,8 @@ POSE = ("x", "y", "heading")
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """The loops of a log. InputError for an earlier pose that is not earlier, and for a part of a relative pose."""
+    """Return the stream of loops of a log. Raises InputError if the time of an earlier pose is not before that of its row, or
+    if a relative pose is incomplete."""
     (table,) = rows.values()
     columns = dict(table.numbers)
     if "before_ns" in columns:
@@ -141,10 +148,13 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
 
 
 def check(m: Loops, where: str) -> dict[str, Any]:
-    """The validated fields of a pushed measurement, copied; InputError names the first invalid one."""
+    """Return copies of the validated fields of a pushed measurement. Raises InputError with the first invalid field. ``where``:
+    the measurement's name in messages."""
     count = numbers(where, "age", m.age).size
     values = {name: within(where, LOOPS[name], getattr(m, name), (count,)) for name in ("age", *POSE, "score")}
     known = np.isfinite([values[name] for name in POSE])
     if (known.any(axis=0) & ~known.all(axis=0)).any():
-        raise InputError(f"{where}: a loop has a part of a relative pose, expected x, y and heading, or none of them")
+        raise InputError(
+            f"{where}: the relative pose of a loop is incomplete, expected x, y and heading, or none of them"
+        )
     return values

@@ -1,4 +1,4 @@
-"""The loops of a run, for estimators that keep earlier poses."""
+"""The sensor of loop closures in a run, for estimators that keep earlier poses."""
 
 from collections.abc import Iterator, Sequence
 from typing import cast
@@ -14,12 +14,12 @@ from factors.loops.factor import LoopFactor
 from factors.se2 import Array
 
 UNKNOWN = "the earlier pose is not kept"
-LEAST_SCORE = 0.01  # scores below count as this
+LEAST_SCORE = 0.01  # smaller scores are replaced by this
 
 
 class LoopSensor(Sensor):
-    """Loops that another program found, each a robust factor on two poses. Those whose earlier pose the estimator does not have,
-    as no filter has, are counted as ignored."""
+    """Turns each loop closure into a robust factor on two poses. A loop is counted as ignored if the estimator does not keep
+    its earlier pose. Filters keep no earlier poses."""
 
     modality = "loops"
     links = True
@@ -29,7 +29,7 @@ class LoopSensor(Sensor):
         self._settings, self._diagnostics = settings, binding.diagnostics
 
     def observe(self, m: Loops, view: View) -> Iterator[Link]:
-        """A link for each loop."""
+        """Yield a factor on two poses for each loop."""
         settings = self._settings
         scores = np.where(np.isnan(m.score), 1.0, m.score)
         for age, x, y, heading, score in zip(m.age, m.x, m.y, m.heading, scores.tolist(), strict=True):
@@ -45,13 +45,13 @@ class LoopSensor(Sensor):
             if np.isfinite(x):
                 measured = np.array((x, y, heading))
                 sigmas = np.array((settings.sigma_position, settings.sigma_position, settings.sigma_heading))
-            # whitened by wider deviations, a distance of sqrt(score) is score^1.5
-            given_up = settings.robust * wider**-1.5
-            factor = LoopFactor(measured, wider * sigmas, view.offset, earlier.offset, given_up)
+            # sigmas grow by 1/score, so a limit of sqrt(score) times the distance is score^1.5 times as many sigmas
+            scale = settings.robust * wider**-1.5
+            factor = LoopFactor(measured, wider * sigmas, view.offset, earlier.offset, scale)
             yield Link(m.t, earlier.t, factor, factor.rows)
 
     def at_end(self, factor: Factor, width: float) -> Factor:
-        """The loop with a loss ``width`` times as wide."""
+        """Return the loop's factor with a robust loss that is ``width`` times as wide."""
         return cast(LoopFactor, factor).widened(width)
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
@@ -59,18 +59,18 @@ class LoopSensor(Sensor):
 
 
 def bind(binding: Binding) -> LoopSensor | None:
-    """The sensor of a run, or None if it is not used."""
+    """Return the loop sensor of a run, or None if the run does not use it."""
     if LoopSensor.modality not in binding.setup.sensors:
         return None
     return LoopSensor(binding, binding.setup.rig.find(LoopSettings) or LoopSettings())
 
 
-NEAR = 1.0  # m: farther from each other two poses are not at one place
-GAP = 5.0  # s between poses of the reference
+NEAR = 1.0  # m; a loop is correct if its distance differs from that in the reference by less than this
+GAP = 5.0  # s; longest interpolated gap between poses of the reference
 
 
 def summarize(log: Log) -> Summary:
-    """The number of loops, of those with a relative pose, and of those that join places near to each other in the reference."""
+    """Return a summary: the number of loops, of loops with a relative pose, and of loops that agree with the reference."""
     stream = log.streams.get("loops")
     if not isinstance(stream, LoopStream) or not len(stream.t):
         return Summary()
@@ -86,5 +86,5 @@ def summarize(log: Log) -> Summary:
         near = np.abs(apart[known] - distance[known]) < NEAR
         entries |= {"compared": int(np.count_nonzero(known)), "near": int(np.count_nonzero(near))}
         if known.any():
-            line += f"; of {len(near)} within the reference {np.mean(near):.0%} are right to {NEAR:g} m"
+            line += f"; of {len(near)} within the reference {np.mean(near):.0%} are correct to {NEAR:g} m"
     return Summary({"loops": entries}, text=[Paragraph(line)])

@@ -1,4 +1,4 @@
-"""Wheel odometry and gyro."""
+"""Wheel odometry and gyro, which measure the motion of the robot."""
 
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType

@@ -1,8 +1,9 @@
-"""Calibration of wheel odometry, from the motion of the reference over segments of a log: constants, and growth of the errors.
+"""Calibration of wheel odometry: its constants and its noise are estimated from the motion of a reference over windows of time.
 
-The covariance of relative motion is linear in the variances of :class:`factors.odometry.model.Growth`, so the noise is a sum of
-non-negative variance components (Searle, Casella, McCulloch, "Variance Components", 1992, chapter 6). Windows of several
-lengths separate growing errors from the constant ones of the reference.
+The noise grows with distance, rotation and time (:class:`factors.odometry.model.Growth`). The covariance of a relative motion
+is linear in the variances per unit of distance, rotation and time. They are estimated as non-negative variance components
+(Searle, Casella, McCulloch, "Variance Components", 1992, chapter 6). Windows of several lengths separate errors of the
+odometry, which grow with time, from errors of the reference, which do not.
 """
 
 from __future__ import annotations
@@ -37,28 +38,29 @@ from factors.odometry.model import (
 )
 from factors.se2 import Array
 
-LEAD = 1.0  # s of complete odometry that a window needs at its beginning, because of the lag
-WINDOW = 2.0  # s; length of a window that constants are estimated from
-# error of the reference over a window: m, m, rad; lower bound of the residuals' standard deviations
+LEAD = 1.0  # s; odometry must be complete for this time before a window, because the wheels respond with a lag
+WINDOW = 2.0  # s; length of the windows for the estimation of constants
+# m, m, rad; error of the reference over a window: lower bound of the residuals' standard deviations
 REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
-MOVING = np.array((0.05, 0.1))  # m/s, rad/s above which the robot moves in a window
+MOVING = np.array((0.05, 0.1))  # m/s, rad/s; the robot moves in a window if it is faster than one of these
 MIN_WINDOWS = 15
-LENGTHS = (1.0, 3.0, 10.0)  # s
-BLACKOUT = 30.0  # s
+LENGTHS = (1.0, 3.0, 10.0)  # s; lengths of the windows for the estimation of noise
+BLACKOUT = 30.0  # s; length of the windows over which the noise is finally checked
 MIN_BLACKOUTS = 10
-MOST_OUTLIERS = 0.05  # share of the windows
+MOST_OUTLIERS = 0.05  # fraction of the windows; more outliers cause a warning
 ERRORS = {"along": "m", "lateral": "m", "heading": "rad"}
-FITS = 3  # each without the outliers of the one before
-GATE = chi_squared.quantile(0.9999, 3)  # squared error above which a window is an outlier
-_SMALLEST = 1e-8  # variance per unit below which a component is zero
-# Lower bounds for wheels, by error and driver. A reference that depends on the odometry gives lower values.
+FITS = 3  # number of fits of the noise; each one omits the outliers of the fit before
+GATE = chi_squared.quantile(0.9999, 3)  # a window with a larger squared Mahalanobis distance is an outlier
+_SMALLEST = 1e-8  # smaller variances per unit are set to zero
+# minimum standard deviations of wheels; rows: along, lateral, heading; columns: per distance, rotation, time.
+# A reference that depends on the odometry would give lower values.
 FLOOR = np.array(((0.01, 0.0, 0.0), (0.005, 0.0, 0.0), (0.003, 0.005, 0.0)))
 
 
 @dataclass(frozen=True)
 class Windows:
-    """M segments of a log: ``begin`` and ``end`` (M,) [s], and ``motion`` (M, 3) of the reference over them. ``sigmas`` (M, 3) of
-    the residuals."""
+    """M windows of time in a log. ``begin`` and ``end`` (M,): their times [s]. ``motion`` (M, 3): the motion of the reference
+    from begin to end, in the robot frame at the begin. ``sigmas`` (M, 3): standard deviations of the residuals [m, m, rad]."""
 
     log: Log
     begin: Array
@@ -71,32 +73,34 @@ class Windows:
         return self.begin
 
     def states(self, model: OdometryModel) -> tuple[Array, Array]:
-        """States of the odometry (M, 8) at both ends."""
+        """Return the odometry states (M, 8) at the begin and at the end of each window."""
         chain = integrated(self.log, model)
         return chain.states(self.begin), chain.states(self.end)
 
     def errors(self, model: OdometryModel) -> Array:
-        """Motion of the reference relative to the odometry (M, 3): a body-frame perturbation at the end, [m, m, rad]."""
+        """Return the errors (M, 3) of the odometry over each window, as body-frame perturbations at its end [m, m, rad]: motion
+        of the reference relative to that of the odometry."""
         start, end = self.states(model)
         odometry = se2.between(start[:, 1:4], end[:, 1:4])
         return se2.log(se2.between(odometry, self.motion))
 
     def residuals(self, settings: OdometrySettings) -> Array:
-        """The errors (M, 3) in standard deviations."""
+        """Return :meth:`errors` (M, 3) in standard deviations."""
         return self.errors(self.model(settings)) / self.sigmas
 
     def model(self, settings: OdometrySettings) -> OdometryModel:
-        """The model with these settings."""
+        """Return the odometry model with these settings."""
         return odometry_model(self.log.rig.model_copy(update={"odometry": settings}))
 
     def covariances(self, model: OdometryModel) -> Array:
-        """The model's covariances (M, 3, 3) of the residuals."""
+        """Return the covariances (M, 3, 3) of :meth:`errors` according to the model."""
         chain, no_constants = integrated(self.log, model), np.zeros(0)
         return chain.relatives(chain.states(self.begin), chain.states(self.end), no_constants)[1]
 
 
 def cut(log: Log, length: float) -> Windows:
-    """Consecutive windows of ``length`` seconds with reference poses at both ends and without odometry gaps."""
+    """Cut a log into consecutive windows of ``length`` seconds. Windows without reference poses at both ends, or with gaps in
+    the odometry, are omitted."""
     assert log.reference is not None
     first, last = overlap(log)
     edges = np.arange(first + LEAD, last, length)
@@ -111,8 +115,12 @@ def cut(log: Log, length: float) -> Windows:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """``growth`` by error; ``outliers``: share of windows outside the gate; ``widened``: factor already included in the growth,
-    because errors of wheels are correlated and grow faster than a random walk; ``floored``: errors raised to the lower bound."""
+    """The estimated noise of an odometry.
+
+    ``growth``: the noise by the name of the error (along, lateral, heading). ``outliers``: fraction of windows that are
+    outliers. ``widened``: a factor that is already included in ``growth``. It accounts for correlated errors of wheels, which
+    grow faster than a random walk. ``floored``: names of the errors whose noise was raised to its lower bound.
+    """
 
     growth: Mapping[str, Growth]
     outliers: float
@@ -121,7 +129,8 @@ class NoiseFit:
 
 
 def with_noise(model: OdometryModel, sigmas: Array) -> OdometryModel:
-    """The model with ``sigmas`` (3, 3) of longitudinal, lateral and heading errors, by distance, rotation and time."""
+    """Return the model with the noise ``sigmas`` (3, 3): rows are longitudinal, lateral and heading errors, columns are per
+    root of distance, rotation and time."""
     along, lateral, heading = (Growth(*row) for row in sigmas.tolist())
     return replace(model, along=along, lateral=lateral, heading=heading)
 
@@ -129,7 +138,7 @@ def with_noise(model: OdometryModel, sigmas: Array) -> OdometryModel:
 def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
     """Fit the noise of the odometry ``model`` to the residuals of windows of several lengths, without outliers.
 
-    The noise is widened so that the median error over half a minute, the length of a blackout, is correct.
+    The noise is then multiplied by a factor so that it explains the median error over windows of :data:`BLACKOUT` seconds.
     """
     windows = [cut(log, length) for log in logs for length in LENGTHS]
     bases = np.concatenate([_bases(part, model) for part in windows])
@@ -151,7 +160,8 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
 
 
 def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
-    """Ratio of the errors over a blackout to those of the model; at least 1, and 1 if there are too few windows."""
+    """Return the ratio of observed to modelled errors over windows of :data:`BLACKOUT` seconds. It is at least 1, and 1 if
+    there are too few windows."""
     windows = [cut(log, BLACKOUT) for log in logs]
     residuals = np.concatenate([part.errors(model) for part in windows])
     if len(residuals) < MIN_BLACKOUTS:
@@ -162,7 +172,9 @@ def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
 
 
 def _bases(windows: Windows, model: OdometryModel) -> Array:
-    """Covariances (M, 11, 3, 3) for unit variances: three drivers of each error, then position and heading of the reference."""
+    """Return covariances (M, 11, 3, 3) of the windows' errors for unit values of 11 variances. They are the variances of
+    longitudinal, lateral and heading errors per distance, rotation and time, then those of position and heading of the
+    reference."""
     start, end = windows.states(model)
     drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion
     drivers[:, 2] -= end[:, 7] - start[:, 7]
@@ -183,7 +195,8 @@ def _bases(windows: Windows, model: OdometryModel) -> Array:
 
 
 def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, Array]:
-    """Squared Mahalanobis distances (M,) and log-determinants (M,)."""
+    """Return squared Mahalanobis distances (M,) of ``residuals`` (M, 3), and log-determinants (M,) of their covariances.
+    ``bases`` (M, 11, 3, 3): covariances for unit values of the ``variances`` (11,)."""
     floor = np.diag((MINIMUM_POSITION_VARIANCE, MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE))
     covariance = np.tensordot(bases, variances, (1, 0)) + floor
     solved = np.linalg.solve(covariance, residuals[..., None])[..., 0]
@@ -191,7 +204,8 @@ def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, A
 
 
 def _maximise(bases: Array, residuals: Array, weights: Array, start: Array) -> Array:
-    """Variances (11,) that maximise the Gaussian likelihood; optimised as logarithms."""
+    """Return the variances (11,) that maximise the Gaussian likelihood of ``residuals`` (M, 3) with ``weights`` (M,), starting
+    from ``start`` (11,). The optimisation is in the logarithms of the variances."""
 
     def cost(logarithms: Array) -> float:
         squared, log_determinant = _squared(bases, residuals, np.exp(logarithms))
@@ -203,20 +217,20 @@ def _maximise(bases: Array, residuals: Array, weights: Array, start: Array) -> A
 
 
 class OdometryCalibrator(ConstantsCalibrator):
-    """The calibrator of wheel odometry."""
+    """Estimates the constants and the noise of wheel odometry."""
 
     section, channel, senses = "odometry", "odometry", False
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """The constants and the noise, if the reference has headings."""
+        """Return the constants and the noise. The result is empty if the reference has no headings."""
         reference = traced[0].log.reference
         has_heading = reference is not None and reference.has_heading
         return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()
 
     def part(self, log: Log) -> Windows:
-        """Windows of the log; InputError if there are too few."""
+        """Return windows of a log. Raises InputError if there are too few."""
         windows = cut(log, WINDOW)
         if len(windows.begin) < MIN_WINDOWS:
             raise InputError(
@@ -226,7 +240,8 @@ class OdometryCalibrator(ConstantsCalibrator):
         return windows
 
     def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
-        """The constants; velocities also have delay, lag and slowdown. Wheels that report turns have hardly any bias by time."""
+        """Return the constants to estimate, with priors. Delay, lag and slowdown only exist for commanded velocities. Wheels
+        with encoders have hardly any bias per time, so its priors are narrow."""
         commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
         by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s
         priors = {
@@ -244,8 +259,10 @@ class OdometryCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Windows], settings: OdometrySettings
     ) -> tuple[Sequence[Windows], OdometrySettings]:
-        """The windows with robust standard deviations of their errors, apart for motion and rest. Weights are equal in motion:
-        those of the noise model would favour windows with little motion."""
+        """Return the windows with robust standard deviations of their errors, separately for windows in motion and at rest.
+
+        All windows in motion have equal standard deviations. Those of the noise model would favour windows with little motion.
+        """
         errors, moves = [], []
         for part in parts:
             start, end = part.states(part.model(settings))
@@ -258,7 +275,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         return weighted, settings
 
     def finished(self, parts: Sequence[Windows], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """The result with the noise that remains."""
+        """Return the result with the noise that remains after the calibration of the constants."""
         noise = fit_noise([part.log for part in parts], odometry_model(rig))
         growth = {error: GrowthSettings.bounded(**asdict(g)) for error, g in noise.growth.items()}
         settings = rig.odometry.model_copy(update={"noise": OdometryNoise(**growth)})
@@ -278,14 +295,14 @@ class OdometryCalibrator(ConstantsCalibrator):
 
 
 def _residuals(windows: Windows, model: OdometryModel) -> Residuals:
-    """The errors of the odometry over the windows."""
+    """Return the errors of the odometry over the windows, for the report."""
     start, end = windows.states(model)
     sigmas = np.sqrt(np.diagonal(windows.covariances(model), axis1=1, axis2=2))
     return Residuals(windows.log.name, ERRORS, windows.t, end[:, 4] - start[:, 4], windows.errors(model), sigmas)
 
 
 def _warnings(noise: NoiseFit) -> list[Notice]:
-    """Warnings about outliers and implausibly low noise."""
+    """Return warnings about outliers and implausibly low noise."""
     notes = []
     if noise.outliers > MOST_OUTLIERS:
         sentence = "{percent:.0f} % of the odometry windows are outliers: check for slip, collisions, and gaps in the reference."
@@ -300,7 +317,7 @@ def _warnings(noise: NoiseFit) -> list[Notice]:
 
 
 def _wheels(settings: OdometrySettings) -> dict[str, float]:
-    """The calibrated radius and track [m] of the wheels, if the rig has them."""
+    """Return the calibrated radius and track width [m] of the wheels, or {} if the rig has no wheels."""
     if (drive := settings.wheels) is None:
         return {}
     radius, track = drive.corrected(settings.scale_distance, settings.scale_rotation)

@@ -1,4 +1,4 @@
-"""Measurements of wheel odometry and gyro, their streams, and validation of what is pushed."""
+"""Measurements of wheel odometry and gyro: their types, the columns of their files, and checks of pushed measurements."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class VelocityOdometry:
-    """Forward velocity ``v`` [m/s] and turn rate ``w`` [rad/s], held until the next row."""
+    """Forward velocity ``v`` [m/s] and turn rate ``w`` [rad/s] from the time ``t`` [s] until the next measurement."""
 
     sensor: ClassVar[str] = "odometry"
     modality: ClassVar[str] = "odometry"
@@ -50,7 +50,7 @@ class VelocityOdometry:
 
 @dataclass(frozen=True, slots=True)
 class IncrementOdometry:
-    """Motion since the previous row: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot frame at the previous row."""
+    """Motion since the previous measurement: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot frame at that measurement."""
 
     sensor: ClassVar[str] = "odometry"
     modality: ClassVar[str] = "odometry"
@@ -65,7 +65,7 @@ class IncrementOdometry:
 
 @dataclass(frozen=True, slots=True)
 class YawRate:
-    """Turn rate ``w`` [rad/s] of a gyro, held until the next row."""
+    """Turn rate ``w`` [rad/s] of a gyro from the time ``t`` [s] until the next measurement."""
 
     sensor: ClassVar[str] = "imu"
     modality: ClassVar[str] = "imu"
@@ -78,7 +78,7 @@ class YawRate:
 
 @dataclass(frozen=True)
 class VelocityStream(Stream):
-    """``v`` (N,) [m/s] and ``w`` (N,) [rad/s], each held until the next row."""
+    """All velocities of a log: ``v`` (N,) [m/s] and ``w`` (N,) [rad/s]. Each row is valid until the next row."""
 
     rank: ClassVar[int] = FLOOR
     kind: ClassVar[type[Any]] = VelocityOdometry
@@ -89,7 +89,8 @@ class VelocityStream(Stream):
 
 @dataclass(frozen=True)
 class IncrementStream(Stream):
-    """``dx``, ``dy``, ``dtheta`` (N,): motion since the previous row, in the robot frame at that row."""
+    """All increments of a log: ``dx``, ``dy`` [m] and ``dtheta`` [rad], each (N,): motion since the previous row, in the robot
+    frame at the previous row."""
 
     rank: ClassVar[int] = FLOOR
     kind: ClassVar[type[Any]] = IncrementOdometry
@@ -98,14 +99,14 @@ class IncrementStream(Stream):
     dtheta: Array
 
     def begun_anew(self) -> IncrementStream:
-        """The stream with a first increment of zero, because wheels do not measure how the robot is carried."""
+        """Return the stream with a first increment of zero. Use this for a log that begins after the robot was carried."""
         moves = np.arange(len(self.t)) > 0
         return replace(self, dx=self.dx * moves, dy=self.dy * moves, dtheta=self.dtheta * moves)
 
 
 @dataclass(frozen=True)
 class YawRateStream(Stream):
-    """``w`` (N,) [rad/s] of a gyro."""
+    """All turn rates ``w`` (N,) [rad/s] of a gyro in a log."""
 
     rank: ClassVar[int] = TURN
     kind: ClassVar[type[Any]] = YawRate
@@ -113,7 +114,7 @@ class YawRateStream(Stream):
 
 
 class Increments(Intake):
-    """Checks that increments are in order of time."""
+    """Checks that pushed increments are in order of time."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         self._newest = -math.inf
@@ -122,7 +123,9 @@ class Increments(Intake):
         if not isinstance(m, IncrementOdometry):
             return
         if m.t < self._newest:
-            raise InputError(f"{named(m)}: follows one at {self._newest:.3f} s, expected increments in order of time")
+            raise InputError(
+                f"{named(m)}: follows an increment at {self._newest:.3f} s, expected increments in order of time"
+            )
         self._newest = m.t
 
 
@@ -167,14 +170,15 @@ WHEELS = Table(
     (
         STAMP,
         *(within(f"{side}_speed", SPEED, FASTEST, "speed of that wheel") for side in ("left", "right")),
-        *(within(f"{side}_angle", ANGLE, 1e9, "how far that wheel turned") for side in ("left", "right")),
-        *(within(f"{side}_rate", RATE, 1e4, "how fast that wheel turns") for side in ("left", "right")),
+        *(within(f"{side}_angle", ANGLE, 1e9, "rotation of that wheel") for side in ("left", "right")),
+        *(within(f"{side}_rate", RATE, 1e4, "turn rate of that wheel") for side in ("left", "right")),
     ),
 )
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """The stream of velocities or increments; rows with equal timestamps are merged."""
+    """Return the stream of velocities or increments of a log. Increments with equal timestamps are composed. Of velocities with
+    equal timestamps the last is kept."""
     table = rows["odometry"]
     if "dx" not in table.numbers:
         return stream_of(VELOCITIES, table, reading.t0_ns, reading.warnings)

@@ -1,4 +1,4 @@
-"""Rig settings of wheel odometry and gyro."""
+"""Settings of wheel odometry and gyro in a rig."""
 
 from typing import Annotated, ClassVar
 
@@ -10,7 +10,7 @@ from factors.odometry.model import PARAMETERS, Growth
 
 
 class GrowthSettings(FileModel):
-    """Standard deviation of an error that grows with the square root of the way, the rotation and the time."""
+    """Standard deviation of an error that grows with the square root of distance, rotation and time."""
 
     per_distance: Noise = 0.0
     """standard deviation per sqrt(m) travelled"""
@@ -24,7 +24,7 @@ class GrowthSettings(FileModel):
 
 
 class OdometryNoise(FileModel):
-    """Growth of the error. The defaults are for unknown indoor wheels."""
+    """Noise of the odometry. The defaults are for indoor robots with unknown wheels."""
 
     along: GrowthSettings = GrowthSettings(per_distance=0.05, per_time=0.005)
     """growth of the error along the track [m]"""
@@ -35,12 +35,12 @@ class OdometryNoise(FileModel):
 
 
 class OdometryUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
+    """Standard deviations of the odometry's constants before a run. A constant is estimated if its value is above 0."""
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """standard deviation of the constant, relative"""
+    """relative standard deviation of the constant"""
     scale_rotation: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """standard deviation of the constant, relative"""
+    """relative standard deviation of the constant"""
     heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/s")] = 0.0
     """standard deviation of the constant"""
     heading_drift: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/m")] = 0.0
@@ -48,22 +48,23 @@ class OdometryUncertainty(FileModel):
 
 
 class DifferentialDrive(FileModel):
-    """Two wheels; a log contains their turns or distances. ``scale_distance`` and ``scale_rotation`` correct what these
-    values give: see :meth:`corrected`."""
+    """Geometry of two driven wheels, for logs that contain rotations or distances of the wheels. It converts them to odometry,
+    which ``scale_distance`` and ``scale_rotation`` then correct."""
 
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
-    """radius of the wheels; not needed if the log contains rolled distances"""
+    """radius of the wheels; not needed if the log contains distances of the wheels"""
     track: Annotated[float, Field(gt=0.0, le=20.0), InUnit("m")]
     """distance between the wheels"""
 
     def corrected(self, scale_distance: float, scale_rotation: float) -> tuple[float | None, float]:
-        """The true radius and track [m] with these scales of the odometry."""
+        """Return the true radius (or None) and track width [m], which include the corrections by these scales of the
+        odometry."""
         radius = None if self.radius is None else self.radius * scale_distance
         return radius, self.track * scale_distance / scale_rotation
 
 
 class OdometrySettings(SensorSettings):
-    """Wheel odometry. See :class:`factors.odometry.model.OdometryModel` for the model."""
+    """Constants and noise of wheel odometry. The model is :class:`factors.odometry.model.OdometryModel`."""
 
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     scale_distance: Scale = 1.0
@@ -91,16 +92,16 @@ class OdometrySettings(SensorSettings):
     unknown_rotation: Annotated[Noise, InUnit("rad per sqrt(s)")] = 0.2
     """growth of the error of the heading while the motion is unknown"""
     wheels: DifferentialDrive | None = None
-    """two wheels, if the log contains their turns"""
+    """geometry of two driven wheels, if the log contains their rotations or distances"""
     noise: OdometryNoise = OdometryNoise()
     """growth of the error of the odometry"""
     uncertainty: OdometryUncertainty = OdometryUncertainty()
-    """standard deviations of constants; those above 0 are estimated"""
+    """standard deviations of constants; a constant is estimated if its value is above 0"""
 
 
 class ImuSettings(SensorSettings):
-    """The gyro. Its yaw rate replaces the rotation of the wheels if an estimator uses the sensor ``imu``; a rig without these
-    settings has the default ones."""
+    """Settings of a gyro. Its turn rate replaces the rotation of the wheels if an estimator uses the sensor ``imu``. A rig
+    without this section has the defaults."""
 
     bias: Rate = 0.0
     """turn rate reported at rest"""

@@ -1,6 +1,6 @@
-"""Wheel odometry simulated from a reference, for recordings without odometry.
+"""Simulates wheel odometry along a reference trajectory, for simulated logs and for recordings without odometry.
 
-Results with it must state that it was simulated.
+Published results with such odometry must state that it is simulated.
 """
 
 import math
@@ -15,10 +15,10 @@ from factors import se2
 from factors.se2 import Array
 
 RATE = 10.0  # Hz
-SCALE_SIGMA = 0.02  # of distance and of rotation, constant over a run
-DRIFT_SIGMA = math.radians(1.0)  # rad/m, constant over a run
-ALONG, LATERAL = 0.01, 0.005  # m per sqrt(m)
-HEADING = math.radians(1.5)  # rad per sqrt(m)
+SCALE_SIGMA = 0.02  # standard deviation of the scales of distance and rotation, which are constant during a run
+DRIFT_SIGMA = math.radians(1.0)  # rad/m; standard deviation of the heading drift, which is constant during a run
+ALONG, LATERAL = 0.01, 0.005  # m per sqrt(m); noise along and across the track
+HEADING = math.radians(1.5)  # rad per sqrt(m); noise of the heading
 
 DESCRIPTION = (
     "simulated at 10 Hz from increments of the reference: scale errors of distance and rotation 2 %, heading drift 1 deg/m, "
@@ -27,12 +27,12 @@ DESCRIPTION = (
 
 
 def simulate(ride: Ride) -> Simulated:
-    """The odometry of a simulated drive."""
+    """Return the wheel odometry of a simulated drive."""
     return Simulated({"odometry": wheel_odometry(ride.truth, int(ride.rng("odometry").integers(2**32)))})
 
 
 def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
-    """Simulated odometry along ``reference``, starting with a row without motion at its first pose.
+    """Simulate odometry along ``reference``. The first row has no motion, at the time of the first pose.
 
     With increments (dx, dy, dyaw) of the reference over 0.1 s, in the body frame, and ds = length of (dx, dy):
 
@@ -40,9 +40,9 @@ def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
     - dy' = (1 + s) dy + 0.005 sqrt(ds) n2
     - dyaw' = (1 + g) dyaw + b ds + radians(1.5) sqrt(ds) n3
 
-    s, g ~ N(0, 0.02) and b ~ N(0, radians(1) per m) are constant; n1, n2, n3 ~ N(0, 1). Drawn from ``default_rng(seed)`` in the
-    order s, b, g, then n1 and n2 of each row, then n3 of each row. Gaps of the reference above 60 s have no rows; the row after
-    such a gap contains its whole motion.
+    The scales s, g ~ N(0, 0.02) and the drift b ~ N(0, radians(1) per m) are constant; n1, n2, n3 ~ N(0, 1) differ in each row.
+    They are drawn from ``default_rng(seed)`` in the order s, b, g, then n1 and n2 of each row, then n3 of each row. Gaps of the
+    reference above 60 s have no rows. The row after such a gap contains the whole motion during the gap.
     """
     t = _grid(reference.t)
     count = len(t) - 1
@@ -62,7 +62,8 @@ def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
 
 
 def _grid(stamps: Array) -> Array:
-    """Times (N,) at 10 Hz from the first of ``stamps``, without long gaps, because a clock may jump by days."""
+    """Return times (N,) at 10 Hz from the first to the last of ``stamps``. Long gaps are omitted, because a clock may jump by
+    days."""
     long = np.flatnonzero(np.diff(stamps) > TICK_GAP)
     begins, ends = stamps[np.append(0, long + 1)], stamps[np.append(long, -1)]
     first = np.ceil((begins - stamps[0]) * RATE - 1e-6).astype(int)

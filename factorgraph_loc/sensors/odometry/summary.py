@@ -1,6 +1,6 @@
-"""Checks whether odometry, gyro and reference agree in time, sign and unit.
+"""Checks if odometry, gyro and reference agree in time, sign, unit and scale.
 
-Turn rates, or speeds if the reference has no headings, are compared at various time shifts.
+Turn rates are compared at various time shifts. If the reference has no headings, speeds are compared instead.
 """
 
 from collections.abc import Mapping
@@ -19,28 +19,29 @@ from factors import se2
 from factors.se2 import Array
 
 WINDOW = 0.2  # s; minimum time over which a rate is averaged
-MOVES = 0.03  # rad/s and m/s: minimum root mean square of rates
-ALIKE = 0.6  # minimum correlation of equal motion
-DEGREES = (20.0, 150.0)  # range of the slope if one rate is in degrees
-CHORD = 2.0  # s over which distances and turns are compared
-SCALED = 0.1  # relative difference above which a scale is doubtful
-# m of a reference that stands still and of odometry that drives meanwhile, in a window of STILL
+MOVES = 0.03  # rad/s, m/s; a signal moves if the root mean square of its rate is at least this
+ALIKE = 0.6  # two signals of the same motion have at least this correlation
+DEGREES = (20.0, 150.0)  # bounds of the ratio of two rates if one of them is in degrees
+CHORD = 2.0  # s; distances and rotations are compared over time intervals of this length
+SCALED = 0.1  # a larger relative difference of two scales causes a warning
+# a reference stands still if it moves less than STANDS [m] while the odometry drives more than DRIVES [m] in STILL [s]
 STANDS, DRIVES = 0.02, 0.5
-STILL = 5.0  # s
+STILL = 5.0
 IN_DEGREES = "{source} turns {ratio:.0f} times as much as {other}: is it in degrees?"
-COVERED = 0.9  # minimum share of a log that the reference should cover
+COVERED = 0.9  # a reference should cover at least this fraction of a log's time
 
 
 @dataclass(frozen=True)
 class RateMatch:
-    """``shift`` [s]: delay of one signal to the other; ``slope``: ratio of their values."""
+    """The comparison of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``: the ratio of
+    its values to those of the first signal."""
 
     shift: float
     slope: float
 
 
 def summarize(log: Log) -> Summary:
-    """Warnings about the odometry of a log, and its scales against the reference."""
+    """Return warnings about the odometry of a log, and the ratios of distance and rotation of the reference to the odometry."""
     ratios, still = against_reference(log)
     covered = _coverage(log)
     problems = [*motion_problems(log), *still]
@@ -52,8 +53,11 @@ def summarize(log: Log) -> Summary:
 
 
 def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
-    """How much more the reference ``travels`` and ``turns`` than the odometry, as the rig corrects it, by least squares over
-    intervals of :data:`CHORD`; and a warning if the reference stands still meanwhile. Nothing without motion.
+    """Compare reference and odometry. Returns ratios and warnings.
+
+    The ratios ``travels`` and ``turns`` are distance and rotation of the reference divided by those of the odometry, as
+    corrected by the rig. They are least-squares estimates over time intervals of :data:`CHORD` seconds. A ratio is missing
+    without motion. A warning states that the reference stands still while the odometry drives.
     """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
@@ -72,14 +76,15 @@ def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
 
 
 def _ratio(theirs: Array, ours: Array) -> float | None:
-    """The least-squares ratio of ``theirs`` (N,), NaN where unknown, to ``ours`` (N,), None without motion."""
+    """Return the least-squares ratio of ``theirs`` (N,), NaN if unknown, to ``ours`` (N,). Returns None without motion."""
     known = np.isfinite(theirs)
     moved = float(ours[known] @ ours[known])
     return float(ours[known] @ theirs[known]) / moved if moved > 1.0 else None
 
 
 def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
-    """Warnings about scales that differ; signs and units of turns are compared by their rates."""
+    """Return warnings about ratios that differ from 1. Rotations of another sign or unit are left to
+    :func:`motion_problems`."""
     keys = {"travels": "scale_distance", "turns": "scale_rotation"}
     sentence = "the reference {moves} {ratio:.2f} times as much as the odometry ({setting}, or fgloc calibrate)"
     return [
@@ -90,7 +95,8 @@ def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
 
 
 def _standstill(t: Array, ours: Array, theirs: Array) -> list[Notice]:
-    """A warning if the reference stands still while the odometry drives, at places (N, 2) each."""
+    """Return a warning if the reference stands still while the odometry drives. ``ours``, ``theirs`` (N, 2): positions [m] by
+    odometry and reference at times ``t`` (N,) [s]."""
     steps = round(STILL / (CHORD / 4.0))
     stuck = np.flatnonzero((_chords(theirs, steps) < STANDS) & (_chords(ours, steps) > DRIVES))
     if not len(stuck):
@@ -101,13 +107,13 @@ def _standstill(t: Array, ours: Array, theirs: Array) -> list[Notice]:
 
 
 def _chords(places: Array, steps: int) -> Array:
-    """Distances (N - steps,) between places (N, 2) that many ``steps`` apart."""
+    """Return the distances (N - steps,) between each of the positions (N, 2) and the position ``steps`` rows later."""
     return np.asarray(np.hypot(*(places[steps:] - places[:-steps]).T))
 
 
 def motion_problems(log: Log) -> list[Notice]:
-    """Warnings about a gyro and a reference that contradict the odometry. In a log with long gaps the longest part between them is
-    compared."""
+    """Return warnings if the gyro or the reference contradicts the odometry in time, sign or unit. Only the longest part of the
+    log without a long gap is compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return []
@@ -138,17 +144,18 @@ def motion_problems(log: Log) -> list[Notice]:
 
 
 def _longest(t: Array) -> tuple[float, float]:
-    """Start and end of the longest part without a gap above :data:`~factorgraph_loc.model.scoring.TICK_GAP` in timestamps (N,)."""
+    """Return start and end [s] of the longest part of timestamps ``t`` (N,) without a gap above
+    :data:`~factorgraph_loc.model.scoring.TICK_GAP`."""
     parts = np.split(t, np.flatnonzero(np.diff(t) > TICK_GAP) + 1)
     longest = max(parts, key=lambda part: float(part[-1] - part[0]))
     return float(longest[0]), float(longest[-1])
 
 
 def match(rates: Array, delayed: Array) -> RateMatch | None:
-    """Delay of ``delayed`` (N,) relative to ``rates`` (N,), sampled every ``STEP``; None if they are uncorrelated.
+    """Estimate delay and slope of ``delayed`` (N,) relative to ``rates`` (N,), both sampled every ``STEP`` seconds.
 
-    The slope is negative if the signs differ. The shift is zero if it hardly improves the correlation. At constant rates no shift
-    can be observed: it is zero too.
+    Returns None if the signals are uncorrelated. The slope is negative if the signs differ. The shift is zero if it hardly
+    improves the correlation, or if it is not observable because the rates are constant.
     """
     if np.count_nonzero(np.isfinite(rates) & np.isfinite(delayed)) < FEWEST:
         return None
@@ -164,7 +171,7 @@ def match(rates: Array, delayed: Array) -> RateMatch | None:
 
 
 def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]:
-    """Correlation and slope of ``others``, ``shift`` steps later, by ``rates``; zeros without motion."""
+    """Return correlation and slope between ``rates`` and ``others`` of ``shift`` steps later. Both are zero without motion."""
     a = rates[max(0, -shift) : len(rates) - max(0, shift)]
     b = others[max(0, shift) : len(others) - max(0, -shift)]
     both = np.isfinite(a) & np.isfinite(b)
@@ -176,14 +183,13 @@ def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]
 
 
 def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
-    """Warnings about a wrong clock, sign or unit; ``sensor``: the one whose time_offset would correct it."""
+    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``sensor``: the section of the rig whose
+    time_offset corrects the clock."""
     if found is None:
         return []
     lines = []
     if found.slope < 0.0:
-        sentence = (
-            "{source} turns in the opposite direction of the odometry: angles are counter-clockwise, seen from above"
-        )
+        sentence = "{source} turns in the opposite direction of the odometry: expected counter-clockwise angles, seen from above"
         lines.append(notice("opposite_turns", sentence, name))
     size = abs(found.slope)
     if DEGREES[0] < size < DEGREES[1]:
@@ -191,14 +197,15 @@ def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
     elif DEGREES[0] < 1.0 / size < DEGREES[1]:
         lines.append(notice("degrees", IN_DEGREES, "the odometry", 1.0 / size, name))
     if found.shift:
-        # a late timestamp needs a negative offset; the odometry is early if the other one is late
+        # a late clock needs a negative offset; if the reference is late, the odometry is early and needs a positive offset
         offset = -found.shift if sensor == "imu" else found.shift
         lines.append(interfaces.line(name, found.shift, "the odometry", sensor, offset))
     return lines
 
 
 def _rates(values: Array, window: float) -> Array:
-    """How fast values (N,) grow, over a window about each time; NaN at the ends."""
+    """Return the rates of change (N,) of values (N,), averaged over a ``window`` [s] around each time. They are NaN at the
+    ends."""
     half = max(1, round(window / STEP / 2.0))
     out = np.full(len(values), np.nan)
     if len(values) > 2 * half:
@@ -207,7 +214,7 @@ def _rates(values: Array, window: float) -> Array:
 
 
 def _speeds(places: Array, window: float) -> Array:
-    """The same of places (N, 2), without direction."""
+    """Return the speeds (N,) of positions (N, 2), averaged over a ``window`` [s] around each time."""
     return np.asarray(np.hypot(_rates(places[:, 0], window), _rates(places[:, 1], window)))
 
 

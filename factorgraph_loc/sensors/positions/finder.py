@@ -1,7 +1,7 @@
 """Localization from measured positions alone, at an unknown start or after a kidnapping.
 
-The positions of the last minute are aligned with the path of the odometry. The heading is known once the robot has travelled far
-enough. A track is given up if all positions of some time contradict it and agree on another pose.
+The positions of the last minute are aligned with the path of the odometry. The heading becomes known when the robot has
+travelled far enough. A track is rejected if all positions of the last ten seconds contradict it and agree on another pose.
 """
 
 from __future__ import annotations
@@ -25,24 +25,27 @@ from factors.robust import geman_mcclure_weight
 from factors.se2 import Array
 from factors.update import GATE
 
-DURATION, INTERVAL = 60.0, 0.5  # s: of the positions that are aligned, and between them
-FEWEST, SHARE = 5, 0.8  # minimum number of positions of a pose, and share of them within the gate
+DURATION, INTERVAL = 60.0, 0.5  # s; time span of the positions that are aligned, and minimum time between them
+FEWEST, SHARE = 5, 0.8  # a pose is accepted from this many positions, if this fraction is within the gate
 HEADING = 0.15  # rad; largest standard deviation of a known heading
-WIDENINGS = (64.0, 16.0, 4.0, 1.0, 1.0, 1.0)  # of the loss, by iteration
-BEYOND = 2.0  # times the gate
-CONTRADICTED = 10.0  # s of positions beyond it, after which the track is doubted: a wrong fix may last some seconds
-SEARCH_INTERVAL = 1.0  # s between alignments while the track is doubted
+WIDENINGS = (64.0, 16.0, 4.0, 1.0, 1.0, 1.0)  # factor of the loss's scale in each iteration
+BEYOND = 2.0  # a position contradicts the track if its squared innovation exceeds this multiple of the gate
+CONTRADICTED = 10.0  # s; the track is suspicious if positions contradict it for so long; wrong fixes last less
+SEARCH_INTERVAL = 1.0  # s between alignments while the track is suspicious
 
 
 class Row(NamedTuple):
-    """The ``factor`` of a position on the pose at ``odometry``."""
+    """A measured position: its ``factor`` on the pose at its time, and the ``odometry`` state at its time."""
 
     odometry: ChainState
     factor: PositionFactor
 
 
 class PositionFinder:
-    """A :class:`~factorgraph_loc.sensors.base.Finder`; see the module. ``observation``: of a measurement, at its time."""
+    """Finds the pose by measured positions, without a prediction. It implements :class:`~factorgraph_loc.sensors.base.Finder`.
+
+    ``observation``: a function that returns the observation of a measurement, on the pose at its time.
+    """
 
     at_once = False
 
@@ -58,7 +61,7 @@ class PositionFinder:
 
     @property
     def suspicious_since(self) -> float | None:
-        """The time since which all positions contradict the track."""
+        """The time [s] since which all positions contradict the track, or None."""
         if not self._beyond or not all(beyond for _, beyond in self._beyond):
             return None
         first, last = self._beyond[0][0], self._beyond[-1][0]
@@ -94,7 +97,7 @@ class PositionFinder:
         return since if positive.squared(error, world) > BEYOND * GATE else None
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last position; their headings are uniform until the heading is known."""
+        """Return samples (N, 3) of the pose at the last position. Headings are uniform until the heading is known."""
         if not self.hypotheses:
             return np.empty((0, 3))
         (mode,) = self.hypotheses
@@ -107,7 +110,8 @@ class PositionFinder:
         self._beyond.clear()
 
     def _add(self, odometry: ChainState, factor: PositionFactor) -> None:
-        """Add a position; late ones are skipped, and close ones replaced by the last."""
+        """Store a position. A late position is skipped. Of positions that are closer in time than INTERVAL, only the last is
+        kept."""
         self._robust = factor.robust
         if self._rows and odometry.t <= self._rows[-1].odometry.t:
             return
@@ -118,7 +122,8 @@ class PositionFinder:
             self._rows.popleft()
 
     def _align(self, now: ChainState) -> None:
-        """Estimate the pose ``now`` by aligning the path with the positions, by least squares with a loss that narrows."""
+        """Estimate the pose at the odometry state ``now``: align the path of the odometry with the positions, by least squares
+        with a robust loss that narrows from iteration to iteration."""
         rows = list(self._rows)
         if self.start is not None:
             known = self.start.prior
@@ -145,7 +150,8 @@ class PositionFinder:
         self.best = PosePrior(now.t, pose, covariance) if agree and covariance[2, 2] < HEADING**2 else None
 
     def _on(self, now: ChainState, row: Row) -> PositionFactor:
-        """The factor of a position on the pose ``now``: the motion since then is reversed, with its error at the earlier end."""
+        """Return the factor of an earlier position on the pose at ``now``. Its offset is the inverse of the motion since the
+        position, with the covariance in the body frame of the earlier pose."""
         step = self._motion.relative(row.odometry, now)
         carried = se2.adjoint(step.delta)
         back = Increment(se2.inverse(step.delta), carried @ step.covariance @ carried.T, step.duration, step.still)

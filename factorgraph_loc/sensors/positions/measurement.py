@@ -1,4 +1,4 @@
-"""Measured positions, their stream and table, and the settings of the sensor."""
+"""Measured positions of the robot: their types, the columns of their files, and the settings of the sensor."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from factorgraph_loc.files.tables import TableRows
 
 AREA, DEGREES = {"m^2": 1.0}, {"deg": 1.0}
-LARGEST = 1e308  # m^2; some systems state such a variance
+LARGEST = 1e308  # m^2; some systems report such a variance as a placeholder
 VARIANCES = ("var_x", "cov_xy", "var_y")
 _POINT = {axis: f"pose.position.{axis}" for axis in "xy"}
 _COVARIANCE = dict(zip(VARIANCES, ("covariance[0]", "covariance[1]", "covariance[7]"), strict=True))
 _SPREAD = tuple(
-    number(name, AREA, -LARGEST, LARGEST, "of its covariance; not used if implausible", may_lack=True)
+    number(name, AREA, -LARGEST, LARGEST, "element of the covariance; not used if implausible", may_lack=True)
     for name in VARIANCES
 )
 POSITIONS = Table(
@@ -68,13 +68,14 @@ POSITIONS_ON_EARTH = Table(
 )
 # the ellipsoid of WGS 84: its semi-major axis [m], and the square of its eccentricity
 MAJOR, ECCENTRICITY = 6378137.0, 6.69437999014e-3
-# m^2: variances that a system may state; others are placeholders, such as 0, 9999 and 1e308
+# m^2; variances outside of these bounds are placeholders, such as 0, 9999 and 1e308
 PLAUSIBLE = (1e-6, 2500.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A position ``x``, ``y`` [m] in the world, and its covariance ``var_x``, ``cov_xy``, ``var_y`` [m^2], NaN if unknown."""
+    """A measured position at the time ``t`` [s]: ``x``, ``y`` [m] in the world. ``var_x``, ``cov_xy``, ``var_y`` [m^2]: the
+    elements of its covariance, NaN if unknown."""
 
     sensor: ClassVar[str] = "position"
     modality: ClassVar[str] = "position"
@@ -91,7 +92,7 @@ class Position:
 
 @dataclass(frozen=True)
 class PositionStream(Stream):
-    """Positions ``x``, ``y`` (N,) [m] and their covariances ``var_x``, ``cov_xy``, ``var_y`` (N,) [m^2], NaN if unknown."""
+    """All measured positions of a log. For the fields, each (N,), see :class:`Position`."""
 
     kind: ClassVar[type[Any]] = Position
     x: Array
@@ -102,34 +103,36 @@ class PositionStream(Stream):
 
 
 def are_plausible(var_x: Any, cov_xy: Any, var_y: Any) -> Any:
-    """Whether covariances, numbers or arrays (N,) of their elements [m^2], are not placeholders. False where they are unknown."""
+    """True for covariances that are possible, and False for placeholders and NaN. The elements [m^2] are numbers or arrays
+    (N,)."""
     low, high = PLAUSIBLE
     ranges = (low <= var_x) & (var_x <= high) & (low <= var_y) & (var_y <= high)
     return ranges & (np.abs(cov_xy) < np.sqrt(np.abs(var_x)) * np.sqrt(np.abs(var_y)))
 
 
 class PositionSettings(SensorSettings):
-    """A system that measures the position of a point of the robot."""
+    """Settings of a system that measures the position of a point on the robot."""
 
     x: Offset = 0.0
     """position of the point on the robot, forward"""
     y: Offset = 0.0
     """position of the point on the robot, to the left"""
     sigma: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("m")] = 0.3
-    """standard deviation of x and y where the log states no plausible covariance"""
+    """standard deviation of x and y if the log has no plausible covariance"""
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
     """scale of the Geman-McClure loss, in standard deviations"""
 
     def covariance(self, m: Position) -> Array:
-        """The covariance (2, 2) [m^2] of a position: its own, if that is plausible."""
+        """Return the covariance (2, 2) [m^2] of a measured position. It is that of the measurement if plausible, otherwise that
+        of ``sigma``."""
         if are_plausible(m.var_x, m.cov_xy, m.var_y):
             return np.array(((m.var_x, m.cov_xy), (m.cov_xy, m.var_y)))
         return self.sigma**2 * np.eye(2)
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """The positions of a log; covariances that it lacks are unknown. Latitudes and longitudes become metres to the east and north
-    of the first position."""
+    """Return the stream of positions of a log. Missing covariances become NaN. Latitudes and longitudes become metres to the
+    east and north of the first position."""
     (table,) = rows.values()
     columns = {name: np.full(len(table.rows), np.nan) for name in VARIANCES} | dict(table.numbers)
     if "latitude" in columns:
@@ -139,16 +142,19 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
         columns |= dict(zip("xy", on_map(degrees, degrees[:1]).T, strict=True))
         if len(degrees):
             sentence = (
-                "position: x points east and y north of latitude {latitude}, longitude {longitude}, the first position"
+                "position: x points east and y north; the origin is the first position, latitude {latitude}, "
+                "longitude {longitude}"
             )
             reading.warnings.append(notice("origin", sentence, *degrees[0]))
     return stream_of(POSITIONS, replace(table, numbers=columns), reading.t0_ns, reading.warnings)
 
 
 def on_map(degrees: Array, origin: Array) -> Array:
-    """Metres (N, 2) to the east and north of ``origin`` (1, 2) of latitudes and longitudes (N, 2) [deg], within some kilometres:
-    arcs of the radii of curvature there (Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems",
-    2nd edition, 2013, section 2.4.2)."""
+    """Convert latitudes and longitudes (N, 2) [deg] to metres (N, 2) east and north of ``origin`` (1, 2) [deg].
+
+    The result is accurate within some kilometres. It is the arc length on the radii of curvature at the origin (Groves,
+    "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems", 2nd edition, 2013, section 2.4.2).
+    """
     latitude = np.radians(origin[:, 0])
     root = 1.0 - ECCENTRICITY * np.sin(latitude) ** 2
     meridian, normal = MAJOR * (1.0 - ECCENTRICITY) / root**1.5, MAJOR / np.sqrt(root)

@@ -1,4 +1,4 @@
-"""The position sensor of a run."""
+"""The position sensor of a run, which turns measured positions into observations."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from factors.update import Correction
 
 @dataclass(frozen=True)
 class PositionObservation(ResidualObservation):
-    """One position; weighs all particles in one call."""
+    """The observation of one measured position. Its log-likelihood is vectorised over all particles."""
 
     @property
     def factor(self) -> PositionFactor:
-        """The factor of the position."""
+        """The factor of the position on the pose."""
         return cast(PositionFactor, self.terms[0].factor)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
@@ -32,8 +32,8 @@ class PositionObservation(ResidualObservation):
 
 
 class PositionSensor(Sensor):
-    """The position sensor of a run. A position that is equal to the previous one, to the last digit, is counted as ignored: the
-    system repeats what it knew, or the robot stands still."""
+    """The position sensor of a run. A position that equals the previous one in all digits is counted as ignored, because it has
+    no new information: the system repeats its last result."""
 
     modality = "position"
 
@@ -45,21 +45,22 @@ class PositionSensor(Sensor):
         self.finder = self._finder = PositionFinder(self.observation, binding.motion)
 
     def observation(self, m: Position, offset: Increment | None = None) -> PositionObservation:
-        """The observation of a measurement, on the pose that lies ``offset`` before it."""
+        """Return the observation of a measurement. ``offset``: the motion from the pose that the observation depends on to the
+        measurement, None if the times are equal."""
         position, covariance = np.array((m.x, m.y)), self._settings.covariance(m)
         factor = PositionFactor(position, covariance, self._arm, self._settings.robust, offset)
         return PositionObservation(m.t, (Term(factor, (), 2),))
 
     def observe(self, m: Position, view: View) -> Iterator[PositionObservation]:
-        """The position as one factor."""
+        """Yield the observation of a position, unless it repeats the previous one."""
         last, self._last = self._last, (m.t, m.x, m.y)
         if last is not None and last[0] < m.t and last[1:] == self._last[1:]:
-            self._diagnostics.ignore(f"{self.name}: the previous position again")
+            self._diagnostics.ignore(f"{self.name}: repeats the previous position")
             return
         yield self.observation(m, view.offset)
 
     def judge(self, observation: PositionObservation, correction: Correction, view: View) -> bool:
-        """Report the innovation and the residual."""
+        """Record the innovation and the residual [m] in the diagnostics."""
         self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
         (error,) = -observation.factor.errors(view.pose[None])
         self._diagnostics.add_residuals(f"{self.name}.x", [float(error[0])])
@@ -85,7 +86,7 @@ class PositionSensor(Sensor):
 
 
 def bind(binding: Binding) -> PositionSensor | None:
-    """The sensor of a run, or None if it is not used."""
+    """Return the position sensor of a run, or None if the run does not use it."""
     settings = binding.setup.rig.find(PositionSettings)
     if settings is None or PositionSensor.modality not in binding.setup.sensors:
         return None

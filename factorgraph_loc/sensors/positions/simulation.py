@@ -1,4 +1,4 @@
-"""Simulation of measured positions."""
+"""Simulates measured positions of a robot."""
 
 import numpy as np
 
@@ -10,14 +10,14 @@ from factors import se2
 
 
 class PositionSimulation(FileModel):
-    """The positions of a simulated robot whose rig has the section ``[position]``."""
+    """Settings of simulated positions. Positions are simulated if the rig has the section ``[position]``."""
 
     rate: Hertz = 5.0
     """measurements per second"""
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Positions of the true point, with noise."""
+    """Return the measured positions of a simulated drive: true positions of the rig's point, with Gaussian noise."""
     settings = ride.rig.find(PositionSettings)
     if settings is None:
         return Simulated()

@@ -1,4 +1,4 @@
-"""Measured positions in a log: their errors against the reference, and whether they fit the odometry."""
+"""Summarises the measured positions of a log, and compares them with the reference and the odometry."""
 
 import numpy as np
 
@@ -11,14 +11,15 @@ from factorgraph_loc.text import notice
 from factors import se2
 from factors.se2 import Array
 
-MAX_GAP = 1.0  # s between poses of the reference
-SPAN = 10.0  # s over which positions and odometry are compared
-SMALL = 0.1  # ratio of the distances that is doubtful
-DRIVEN = 1.0  # m that the odometry must have driven in a span
+MAX_GAP = 1.0  # s; longest interpolated gap between poses of the reference
+SPAN = 10.0  # s; positions and odometry are compared over time spans of this length
+SMALL = 0.1  # a smaller ratio of travelled distances, positions to odometry, causes a warning
+DRIVEN = 1.0  # m; time spans in which the odometry travels less are not compared
 
 
 def summarize(log: Log) -> Summary:
-    """The number of positions, and their error against the reference; warnings about their unit, covariances and repetitions."""
+    """Return the number of positions and their median error against the reference, with warnings about their unit, their
+    covariances and repeated positions."""
     stream, settings = log.streams.get("position"), log.rig.find(PositionSettings)
     if not isinstance(stream, PositionStream) or not len(stream.t):
         return Summary()
@@ -48,7 +49,8 @@ def summarize(log: Log) -> Summary:
 
 
 def _ratio(log: Log, t: Array, places: Array) -> float | None:
-    """The distance between positions relative to that by odometry, over spans of time; None if the robot hardly moves."""
+    """Return the median ratio of travelled distances, positions ``places`` (N, 2) at ``t`` (N,) to odometry, over spans of
+    time. Returns None if the robot hardly moves."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return None

@@ -160,7 +160,7 @@ def test_a_mapped_table_with_two_stamps_in_seconds_and_another_clock(tmp_path):
 def test_pushed_loops_are_checked():
     one = np.ones(1)
     assert checked(Loops(1.0, one, np.nan * one, np.nan * one, np.nan * one, one)).count == 1
-    with pytest.raises(InputError, match="a part of a relative pose"):
+    with pytest.raises(InputError, match="the relative pose of a loop is incomplete"):
         checked(Loops(1.0, one, one, np.nan * one, one, one))
     with pytest.raises(InputError, match="score"):
         checked(Loops(1.0, one, one, one, one, 2.0 * one))
