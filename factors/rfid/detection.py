@@ -1,8 +1,9 @@
 """The likelihood of RFID reads and misses with a map of tags.
 
-It is exact with derivatives for Gaussian states and graphs (:mod:`factors.rfid.kernels`), and from tables without derivatives for
-particles. The log-likelihood is tempered: multiplied by an exponent below 1 for correlated reads. A tag that may be dead or moved
-has a mixture likelihood (:mod:`factors.rfid.tag_states`).
+For Gaussian states and graphs the likelihood is exact and has derivatives (:mod:`factors.rfid.kernels`). For particles it comes
+from tables, without derivatives. The log-likelihood is tempered: it is multiplied by an exponent below 1, because reads are
+correlated. A tag is "as surveyed" if it works and is where the map has it. The likelihood of a tag that may be dead, weak or moved
+is a mixture (:mod:`factors.rfid.tag_states`).
 """
 
 from __future__ import annotations
@@ -27,14 +28,15 @@ from factors.se2 import Array, Integers
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
-    """T tags: ``points`` (T, 3) [m] in the world and ``facing`` (T,) [rad], NaN if unknown."""
+    """T tags of a map. ``points`` (T, 3) [m]: positions in the world. ``facing`` (T,) [rad]: the direction that each tag faces, NaN
+    if it is unknown."""
 
     points: Array
     facing: Array
 
     @cached_property
     def normals(self) -> Array:
-        """The facing directions (T, 2) of the tags, zero if unknown."""
+        """The facing directions as unit vectors (T, 2), zero if unknown."""
         known = np.isfinite(self.facing)
         angle = np.where(known, self.facing, 0.0)
         return np.where(known[:, None], np.column_stack((np.cos(angle), np.sin(angle))), 0.0)
@@ -42,15 +44,19 @@ class TagArray:
 
 @dataclass(frozen=True, eq=False)
 class TagReadCounts:
-    """Read counts of tags by K antennas, each at its own pose.
+    """The reads of tags in K measurements. A measurement is a number of inventory rounds of one antenna at one robot pose.
 
-    ``offsets`` (K, 3): the robot's pose at the measurement, in the frame of the likelihood's pose; ``twists`` (K, 3): its
-    velocity [m/s, rad/s] there, 0 by default; ``antennas`` (K,): indices in the model; ``rounds`` (K,): inventory rounds.
-    ``tags`` (C,): places in the map, ascending, of the tags that are listed; by default all of the map.
-    ``hits`` (K, C): number of rounds that read each of them; the others were not read.
-    ``odds`` (C,): prior log-odds that each is dead or moved (:class:`~factors.rfid.tag_states.TagStates`), ``-inf`` for as
-    surveyed, the default; ``unlisted_odds``: those of the other tags. ``elsewhere`` (C,): tempered log-likelihood of a tag's reads
-    and misses if it is dead or moved, relative to a silence out of reach; by default of a dead tag: 0, ``-inf`` if it was read.
+    ``offsets`` (K, 3): the robot's pose at each measurement, in the frame of a reference pose. The likelihood is a function of the
+    reference pose.
+    ``antennas`` (K,): indices of the antennas in the model. ``rounds`` (K,): numbers of inventory rounds.
+    ``hits`` (K, C): the number of rounds that read each of C listed tags. Tags that are not listed were not read.
+    ``odds`` (C,): prior log-odds that a listed tag is not as surveyed (:class:`~factors.rfid.tag_states.TagStates`). ``-inf``, the
+    default, means certainly as surveyed.
+    ``elsewhere`` (C,): the tempered log-likelihood of a tag's reads and misses if the tag is not as surveyed, relative to that of
+    misses out of reach. The default is that of dead tags: 0, or ``-inf`` for a tag that was read.
+    ``tags`` (C,): indices in the map of the listed tags, ascending. The default is all tags of the map.
+    ``unlisted_odds``: the odds of tags that are not listed.
+    ``twists`` (K, 3): the robot's body-frame velocity [m/s, m/s, rad/s] at each measurement. The default is zero.
     """
 
     offsets: Array
@@ -81,11 +87,11 @@ class TagReadCounts:
 
     @property
     def read_tags(self) -> Integers:
-        """Places in the map of the tags that were read, ascending."""
+        """The indices in the map of the tags that were read, ascending."""
         return np.asarray(self.tags[self.hits.any(axis=0)])
 
     def with_states(self, tags: Integers, odds: Array, elsewhere: Array) -> TagReadCounts:
-        """The counts with ``tags`` (U,) listed too, which have these ``odds`` (U,) and ``elsewhere`` (U,)."""
+        """The counts with ``tags`` (U,) added to the listed tags, and with ``odds`` (U,) and ``elsewhere`` (U,) set for these."""
         both = np.union1d(self.tags, tags)
         hits = np.zeros((len(self.hits), len(both)), dtype=np.int64)
         all_odds, all_elsewhere = np.full(len(both), self.unlisted_odds), np.zeros(len(both))
@@ -97,13 +103,14 @@ class TagReadCounts:
         return replace(self, hits=hits, odds=all_odds, elsewhere=all_elsewhere, tags=both)
 
     def moved(self, offset: Array) -> TagReadCounts:
-        """The counts relative to the pose that lies ``offset`` (3,) before theirs."""
+        """The counts relative to another reference pose. ``offset`` (3,): the present reference pose in the frame of the new
+        one."""
         return replace(self, offsets=moved(offset, self.offsets))
 
 
 def merged(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Merge counts relative to one pose, in order of time. The odds are those of the first that lists a tag; ``elsewhere`` is the
-    sum of all."""
+    """Merge several counts with the same reference pose into one. ``parts``: counts in order of time. The ``odds`` of a tag are
+    those of the first part that lists it. Its ``elsewhere`` is the sum over all parts."""
     first = parts[0]
     if len(parts) == 1:
         return first
@@ -122,9 +129,14 @@ def merged(parts: list[TagReadCounts]) -> TagReadCounts:
 
 
 class Score(NamedTuple):
-    """Tempered likelihoods of N poses. ``nll`` (N,); ``gradient`` (N, 3) and ``information`` (N, 3, 3) by body-frame perturbation;
-    ``expected`` (N,) and ``variance`` (N,): mean and variance of ``nll`` for a correct model and pose. The variance is proportional
-    to the tempering, which accounts for correlated reads."""
+    """The tempered likelihood of a measurement at N poses, with derivatives.
+
+    ``nll`` (N,): the negative log-likelihood, multiplied by the tempering exponent.
+    ``gradient`` (N, 3): its derivative by the body-frame perturbation of the pose. ``information`` (N, 3, 3): its Fisher
+    information.
+    ``expected`` (N,), ``variance`` (N,): mean and variance of ``nll`` over all outcomes, if model and pose are correct. The
+    variance is proportional to the tempering, which accounts for correlated reads.
+    """
 
     nll: Array
     gradient: Array
@@ -134,13 +146,17 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """The score of a likelihood whose expected value is not computed: every measurement counts as likely as expected."""
+        """The score of signal strengths or phases, whose mean and variance are not computed: ``expected`` is ``nll``, and
+        ``variance`` is zero."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
 
 class ExpectedReads(NamedTuple):
-    """Reads of C tags, by their places in the map, in K measurements: ``hits``, ``p``: probability of a read, and ``distance`` [m]
-    from the antenna in the plane, (K, C) each."""
+    """Observed and predicted reads of C tags in K measurements.
+
+    ``tags`` (C,): indices in the map. ``hits`` (K, C): numbers of reads. ``p`` (K, C): probability that one round reads the tag.
+    ``distance`` (K, C) [m]: horizontal distance from antenna to tag.
+    """
 
     tags: Integers
     hits: Integers
@@ -150,9 +166,10 @@ class ExpectedReads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of an antenna model with M detection models and A antennas, and a map of tags.
+    """The likelihood of read counts as a function of the robot's pose, for given antennas and a map of tags.
 
-    ``parameters`` (Q,), Q = 2 M + A + 2: of models, mounting and clock (:mod:`factors.rfid.parameters`).
+    ``parameters`` (Q,): adjustments of detection models, mounting and clock (:mod:`factors.rfid.parameters`), zero at first. With M
+    detection models and A antennas, Q is 2 M + A + 2.
     """
 
     model: RfidModel
@@ -165,42 +182,47 @@ class RfidLikelihood:
         object.__setattr__(self, "_unadjusted", self)
 
     def adjusted(self, parameters: Array) -> RfidLikelihood:
-        """The same with other parameters (Q,). ValueError if there is another number of them."""
+        """The likelihood with other ``parameters`` (Q,). Raises ValueError if their number is wrong."""
         parameters, out = np.asarray(parameters, dtype=float), copy.copy(self)
         if parameters.shape != self.parameters.shape:
-            raise ValueError(f"{parameters.shape} parameters of a likelihood, expected {self.parameters.shape}")
+            raise ValueError(
+                f"parameters of an RFID likelihood have shape {parameters.shape}, expected {self.parameters.shape}"
+            )
         out.__dict__.pop("packed", None)
         object.__setattr__(out, "parameters", parameters)
         return out
 
     def tempered(self, tempering: float) -> RfidLikelihood:
-        """The same with another exponent, for reads that are more or less correlated."""
+        """The likelihood with another tempering exponent, for reads that are more or less correlated."""
         out = copy.copy(self)
         object.__setattr__(out, "model", replace(self.model, tempering=tempering))
         return out
 
     def prepare(self) -> None:
-        """Make the tables now, which is done once, and not when they are first needed."""
+        """Compute the tables for particles now, instead of at their first use. This takes time once."""
         for name in ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
     @cached_property
     def packed(self) -> Packed:
-        """The models with the parameters, for compiled code."""
+        """The models, adjusted to the parameters, for compiled code."""
         if self._unadjusted is self:
             return self.model.packed()
         return adjusted(self._unadjusted.packed, self.parameters)
 
     @cached_property
     def arrays(self) -> tuple[Packed, MapTags]:
-        """The models without adjustment and the map, for compiled code."""
+        """The models before adjustment, and the map, for compiled code."""
         return self._unadjusted.packed, self._unadjusted._map
 
     def joint_score(
         self, pose: Array, parameters: Array, counts: TagReadCounts, estimated: Sequence[int] | None = None
     ) -> Score:
-        """Likelihood, gradient (1, 3 + P) and information (1, 3 + P, 3 + P) at one pose (3,), by its body-frame perturbation and
-        those of the ``parameters`` (Q,) that are ``estimated`` (P,), by default all."""
+        """The score of one pose (3,) with given ``parameters`` (Q,), with derivatives by both.
+
+        ``estimated`` (P,): the indices of the parameters in the derivatives. None means all. The gradient is (1, 3 + P), and the
+        information (1, 3 + P, 3 + P), by the body-frame perturbation of the pose and by these parameters.
+        """
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
         packed = *self.arrays, counts.packed
@@ -209,7 +231,7 @@ class RfidLikelihood:
         return Score(np.array((nll,)), gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, counts: TagReadCounts) -> Score:
-        """Likelihood, gradient and information at poses (N, 3)."""
+        """The score of ``counts`` at poses (N, 3)."""
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
         no_columns = np.full(len(self.parameters), -1, dtype=np.int64)
         alpha = float(self.model.tempering)
@@ -218,19 +240,25 @@ class RfidLikelihood:
     def displaced(
         self, poses: Array, counts: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
     ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-        """The tags (U,) within a ``margin`` [m] of the reach from any of the poses (N, 3), or read, whose ``odds`` (T,) are not
-        ``-inf``; the tempered log-likelihood (U, S) of the reads and misses of each for ``hypotheses`` (S, 4) of
-        :mod:`factors.rfid.tag_states`, relative to a silence out of reach: the mean of the likelihood over the poses; and which
-        of them were read. ``parameters``: (Q,)."""
+        """The likelihood of possible states of each tag, such as weak or moved, for :mod:`factors.rfid.tag_states`.
+
+        ``poses`` (N, 3): possible robot poses. The likelihood is the mean over these.
+        ``hypotheses`` (S, 4): the states, from :func:`factors.rfid.tag_states.hypotheses`.
+        ``margin`` [m]: tags that are farther than reach plus margin from all poses are left out, unless they were read.
+        ``parameters`` (Q,): parameters of the likelihood. ``odds`` (T,): tags with odds ``-inf`` are left out.
+
+        Returns the indices (U,) of the remaining tags, the tempered log-likelihood (U, S) of the reads and misses of each tag for
+        each state, relative to that of misses out of reach, and a mask (U,) of the tags that were read.
+        """
         alpha = float(self.model.tempering)
         return tag_states.displaced(*self._tabled, counts.packed, poses, margin, odds, hypotheses, alpha, parameters)
 
     def log_likelihood(self, poses: Array, counts: TagReadCounts, parameters: Array | None = None) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), from tables (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`):
-        for particles.
+        """The tempered log-likelihood (N,) of particles at poses (N, 3), from tables (:mod:`factors.rfid.weighing`,
+        :mod:`factors.rfid.places`).
 
-        ``parameters`` (N, Q): at each pose, by default its own; where time offsets differ, all measurements have
-        the velocity of the first.
+        ``parameters`` (N, Q): the parameters of each particle. None means those of the likelihood. If particles differ in their
+        time offset, the velocity of the first measurement is used for all measurements.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
         if parameters is None and not (self.parameters.any() or counts.offsets.any()) and is_wide(poses, self.reach):
@@ -252,17 +280,17 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """The mean number of tags, summed over antennas, that enter the likelihood of one pose if poses are far apart."""
+        """An estimate of the cost of the likelihood at one pose, about the number of tags to evaluate, if poses are far apart."""
         return self._unadjusted._places.work(counts.packed)
 
     @property
     def reach(self) -> float:
-        """How far [m] an antenna reaches from the robot's middle."""
+        """The largest distance [m] from the robot's origin at which an antenna can read a tag."""
         return kernels.reach_of(self.packed, np.zeros((0, 3)))
 
     @cached_property
     def reached(self) -> float:
-        """How many tags are in reach of a pose among them, on average."""
+        """The mean number of tags in reach of a random pose in the area of the map's tags."""
         return in_reach(self.tags.points[:, :2], self._unadjusted.reach)
 
     @cached_property
@@ -271,27 +299,32 @@ class RfidLikelihood:
 
     @property
     def uses_facing(self) -> bool:
-        """Whether the facing of tags matters."""
+        """True if the read probability of any antenna depends on the facing of tags."""
         return any(self.model.models[a.model].uses_facing for a in self.model.antennas)
 
     def robot_tables(self, finest: int, facings: int) -> RobotTables:
-        """Tables of the response by a tag's position in the robot frame (:func:`factors.rfid.places.robot_tables`)."""
+        """Tables of the antennas' responses by a tag's position in the robot frame. ``finest``: cell size in units of the finest
+        table.
+        ``facings``: number of facing directions. See :func:`factors.rfid.places.robot_tables`."""
         antennas = antennas_of(self.packed, self._unadjusted._tables)
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
-        """The contribution of each tag, all of the map being listed, at one pose (3,): tempered negative log-likelihood (T,),
-        its gradient (T, 2) by the tag's position in the world, and information (T, 2, 2)."""
+        """The likelihood of each tag's reads as a function of the tag's position, at one robot pose (3,).
+
+        ``counts`` must list all tags of the map. Returns the tempered negative log-likelihood (T,) of each tag, its gradient (T, 2)
+        by the tag's position in the world, and its information (T, 2, 2).
+        """
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)
         return alpha * nll, alpha * slope[:, 3:], alpha * curve[:, 3:, 3:]
 
     def expected(self, pose: Array, counts: TagReadCounts, parameters: Array) -> ExpectedReads:
-        """Observed and expected reads at a pose (3,) with ``parameters`` (Q,), of the tags that are in reach or listed."""
+        """Observed and predicted reads at a pose (3,) with ``parameters`` (Q,), of the tags that are in reach or listed."""
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
-        """Probability (N, T), floor included, that a round of an antenna reads each tag from poses (N, 3)."""
+        """The probability (N, T), floor included, that one round of an ``antenna`` (index) reads each tag from each pose (N, 3)."""
         poses, antennas = np.ascontiguousarray(poses, dtype=float), np.full(len(poses), antenna)
         return kernels.probabilities(self.packed, antennas, poses, self.tags.points, self.tags.normals)[0]

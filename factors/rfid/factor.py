@@ -1,4 +1,4 @@
-"""Likelihoods of RFID reads and misses, signal strength and phase: as factors, and the correction of a Gaussian by them."""
+"""Factors of RFID measurements (reads and misses, signal strength, phase), and the correction of a Gaussian by them."""
 
 from __future__ import annotations
 
@@ -32,33 +32,34 @@ from factors.rfid.signals import (
 from factors.se2 import Array, Integers
 from factors.update import Correction
 
-ROWS = 4  # of the residual
-CONVERGED = 0.1  # of a standard deviation: a smaller step of a correction is the last one
-LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: the likelihood is evaluated again after each step
-LARGEST_CHANGE = 0.5  # of a parameter of a detection model
-ITERATIONS = 4
-RIDGE = 1e-9  # added to an information matrix that may be singular
-LEAST_INFORMATION = 1e-6  # minimum relevant eigenvalue of an information matrix
-NO_VALUES = np.zeros(0)
-NO_RESIDUAL = np.empty((0, 1))
+ROWS = 4  # number of residuals of a factor on a pose
+CONVERGED = 0.1  # a correction ends when a step is smaller than this fraction of the standard deviations
+LARGEST_STEP = np.array((0.5, 0.5, 0.3))  # m, m, rad: largest step of a pose before the likelihood is evaluated again
+LARGEST_CHANGE = 0.5  # largest step of a parameter of a detection model
+ITERATIONS = 4  # maximum number of steps of a correction
+RIDGE = 1e-9  # is added to the diagonal of an information matrix that may be singular
+LEAST_INFORMATION = 1e-6  # smaller eigenvalues of an information matrix do not count as degrees of freedom
+NO_VALUES = np.zeros(0)  # values of the estimated parameters if there are none
+NO_RESIDUAL = np.empty((0, 1))  # residuals of a correction by a likelihood
 
 
 class TagLikelihood(Protocol):
-    """A likelihood of reads and misses, of strengths, or of phases, observed around a pose."""
+    """The interface of a likelihood of read counts, signal strengths or phases as a function of the robot's pose."""
 
     @property
     def model(self) -> Any:
-        """Its model, with the exponent ``tempering``."""
+        """The measurement model, with an attribute ``tempering``, the exponent of the likelihood."""
 
     def score(self, poses: Array, reads: Any, /) -> Score:
-        """Likelihood, gradient and information at poses (N, 3)."""
+        """The tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
 
     def log_likelihood(self, poses: Array, reads: Any, /) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), for particles."""
+        """The tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
 
 
 class TagProblem(NamedTuple):
-    """Reads and misses for compiled code: models without adjustment, their ``parameters`` (Q,), and which are ``estimated``."""
+    """Reads and misses for compiled code. ``packed``: models before adjustment. ``parameters`` (Q,): adjustments of the models.
+    ``estimated`` (P,): the indices of those parameters that are estimated."""
 
     packed: Packed
     of_map: MapTags
@@ -70,12 +71,16 @@ class TagProblem(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidFactor:
-    """A likelihood of reads on the one pose (3,) that they are placed around, in compressed Fisher form: whatever their number
-    there are four residuals, whose squares have the value, the gradient and the expected curvature of the likelihood. ``reads``:
-    :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`, reads for the other two.
+    """RFID measurements as a factor on the robot's pose, and optionally on parameters of the read model.
 
-    ``estimated`` (P,): places of those parameters of the likelihood (:mod:`factors.rfid.parameters`) that are a second variable
-    (P,) of read counts; there are P residuals more then.
+    ``likelihood``: that of read counts, signal strengths or phases.
+    ``reads``: :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`, otherwise
+    :class:`~factors.rfid.signals.RssiReads` or :class:`~factors.rfid.signals.PhaseReads`.
+    ``estimated`` (P,): indices of the parameters (:mod:`factors.rfid.parameters`) that are estimated; read counts only.
+
+    Methods with ``values`` take a list of the pose (3,) and, if P > 0, the parameters (P,). For any number of reads there are 4 + P
+    residuals. The sum of their squares has the value, the gradient and the Fisher information of the negative log-likelihood
+    (:func:`factors.graph.compressed`).
     """
 
     likelihood: TagLikelihood
@@ -89,26 +94,27 @@ class RfidFactor:
 
     @property
     def work(self) -> int:
-        """About how many reads and misses are evaluated for the likelihood of one pose."""
+        """An estimate of the cost of the likelihood at one pose: about the number of reads and misses to evaluate."""
         if isinstance(self.likelihood, RfidLikelihood) and isinstance(self.reads, TagReadCounts):
             return self.likelihood.work(self.reads)
         return len(self.reads.antennas)
 
     def fixed(self, values: Array) -> RfidFactor:
-        """The same on the pose alone, with the ``values`` (P,) of what is estimated."""
+        """The factor on the pose only, with the estimated parameters fixed at ``values`` (P,)."""
         if not isinstance(self.likelihood, RfidLikelihood):
             return self
         return replace(self, likelihood=self.likelihood.adjusted(self._parameters(values)), estimated=())
 
     def _parameters(self, values: Array) -> Array:
-        """All parameters (..., Q) for ``values`` (..., P) of those that are estimated."""
+        """All parameters (..., Q) of the likelihood: ``values`` (..., P) for the estimated ones, zero for the rest."""
         assert isinstance(self.likelihood, RfidLikelihood)
         out = np.zeros((*values.shape[:-1], len(self.likelihood.parameters)))
         out[..., list(self.estimated)] = values
         return out
 
     def score(self, values: Sequence[Array]) -> Score:
-        """Of one pose (3,) and what is estimated (P,): gradient (1, 3 + P) and information (1, 3 + P, 3 + P) by both."""
+        """The score of one pose (3,) and the estimated parameters (P,), with gradient (1, 3 + P) and information
+        (1, 3 + P, 3 + P)."""
         if not self.estimated:
             return self.likelihood.score(values[0], self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -116,7 +122,7 @@ class RfidFactor:
         return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.reads, self.estimated)
 
     def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
-        """The tempered log-likelihood (N,) of poses (N, 3), with ``values`` (N, P) of what is estimated at each."""
+        """The tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): the estimated parameters of each pose, or None."""
         if values is None:
             return self.likelihood.log_likelihood(poses, self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -124,33 +130,34 @@ class RfidFactor:
         return self.likelihood.log_likelihood(poses, self.reads, self._parameters(values))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Residual (4 + P,) and its Jacobians: (4 + P, 3) by the pose and, if P > 0, (4 + P, P) by the P estimated parameters."""
+        """The residual (4 + P,), and its Jacobians by the pose (4 + P, 3) and, if P > 0, by the estimated parameters (4 + P, P)."""
         score = self.score(values)
         residual, jacobian = compressed(float(score.nll[0]), score.gradient[0], score.information[0])
         return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The tempered negative log-likelihood."""
+        """The tempered negative log-likelihood at these values."""
         return float((self.fixed(values[1]) if self.estimated else self).score(values[:1]).nll[0])
 
     def correct(
         self, pose: Array, covariance: Array, values: Array = NO_VALUES, iterations: int = ITERATIONS
     ) -> Correction:
-        """The most likely pose and ``values`` (P,) of what is estimated, by Fisher scoring, under a Gaussian prior.
+        """Correct a Gaussian of the pose and the estimated parameters, by Fisher scoring.
 
-        ``pose`` (3,) and ``values`` have ``covariance`` (3 + P, 3 + P), in the body frame. A step that does not lower the cost is
-        halved. The evidence is by Laplace's method.
+        ``pose`` (3,), ``values`` (P,): the prediction. ``covariance`` (3 + P, 3 + P): its covariance, with a body-frame
+        perturbation of the pose. ``iterations``: maximum number of steps. A step that does not reduce the cost is halved. The
+        evidence in the result is computed by Laplace's method.
         """
         pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
         problem = (*self._problems(), float(self.likelihood.model.tempering), pose, values)
         try:
             delta, posterior, nis, dof, *rest = _corrected(*problem, covariance, iterations)
-        except np.linalg.LinAlgError:  # rounding made it singular
+        except np.linalg.LinAlgError:  # the covariance is singular because of rounding
             delta, posterior, nis, dof, *rest = _corrected(*problem, positive.nearest(covariance), iterations)
         return Correction(delta, posterior, NO_RESIDUAL, nis, dof, *rest)
 
     def _problems(self) -> tuple[TagProblem | None, PhaseProblem | None, StrengthProblem | None]:
-        """Likelihood and reads for compiled code: one of the three."""
+        """The likelihood and reads for compiled code: read counts, phases, and strengths, of which two are None."""
         match self.likelihood, self.reads:
             case RfidLikelihood() as detection, TagReadCounts() as counts:
                 estimated, alpha = np.array(self.estimated, dtype=np.int64), float(detection.model.tempering)
@@ -160,16 +167,18 @@ class RfidFactor:
                 return None, phase.problem(phases), None
             case RssiLikelihood() as strength, RssiReads() as strengths:
                 return None, None, strength.problem(strengths)
-        raise TypeError(f"{type(self.likelihood).__name__} is not a likelihood of {type(self.reads).__name__}")
+        raise TypeError(f"a {type(self.likelihood).__name__} does not accept {type(self.reads).__name__} as reads")
 
 
 @dataclass(frozen=True, eq=False)
 class RfidTagFactor:
-    """The likelihood of read counts of tag number ``tag`` of ``likelihood``, as a factor on the pose (3,) and the tag's position
-    (2,) in the world, in compressed Fisher form (:mod:`factors.compressed`): whatever the number of reads there are six
-    residuals.
+    """The read counts of one tag as a factor on the robot's pose and on the tag's position.
 
-    Height and facing of the tag are those in ``likelihood``; its position there is not used.
+    ``likelihood``: its map has the height and facing of the tag; the position in that map is not used.
+    ``tag``: the index of the tag in the map. ``counts``: reads that list all tags of the map.
+
+    The methods take a list of the pose (3,) and the tag's position (2,) in the world. For any number of reads there are six
+    residuals, see :func:`factors.graph.compressed`.
     """
 
     likelihood: RfidLikelihood
@@ -177,18 +186,18 @@ class RfidTagFactor:
     counts: TagReadCounts
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Residual (6,) and its Jacobians (6, 3) by the pose and (6, 2) by the position."""
+        """The residual (6,), and its Jacobians by the pose (6, 3) and by the tag's position (6, 2)."""
         nll, gradient, information = self.score(values)
         residual, jacobian = compressed(nll, gradient, information)
         return residual, [jacobian[:, :3], jacobian[:, 3:]]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The tempered negative log-likelihood."""
+        """The tempered negative log-likelihood at these values."""
         return self.score(values)[0]
 
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
-        """Tempered negative log-likelihood, its gradient (5,) and Fisher information (5, 5) by the body-frame perturbation of the
-        pose and the position in the world."""
+        """The tempered negative log-likelihood, and its gradient (5,) and Fisher information (5, 5) by the body-frame perturbation
+        of the pose and by the tag's position in the world."""
         tags, counts, alpha = self.likelihood.tags, self.counts, self.likelihood.model.tempering
         point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
         hits = np.ascontiguousarray(counts.hits[:, self.tag : self.tag + 1])
@@ -201,8 +210,9 @@ class RfidTagFactor:
 def _score(
     tags: Any, phase: Any, strength: Any, pose: Array, values: Array
 ) -> tuple[float, Array, Array, float, float]:
-    """Of one pose (3,) and ``values`` (P,), by the one problem that is not None: tempered negative log-likelihood, its gradient
-    (3 + P,) and information (3 + P, 3 + P), and its mean and variance, which is 0 where they are not computed."""
+    """Evaluate the likelihood of one pose (3,) and parameters ``values`` (P,). Exactly one of ``tags``, ``phase`` and ``strength``
+    is not None. Returns the tempered negative log-likelihood, its gradient (3 + P,) and information (3 + P, 3 + P), and its mean
+    and variance. For phase and strength the mean is the value itself, and the variance is 0."""
     if tags is not None:
         parameters = tags.parameters.copy()
         for i in range(len(values)):
@@ -228,8 +238,9 @@ def _corrected(
     covariance: Array,
     iterations: int,
 ) -> tuple[Array, Array, float, int, float, float, float]:
-    """Step (3 + P,), covariance, normalised innovation squared with degrees of freedom, excess of the prior negative log-likelihood
-    and its variance, and log-evidence: see :meth:`RfidFactor.correct`."""
+    """Compute :meth:`RfidFactor.correct`. Returns the correction (3 + P,), the covariance after it, the normalised innovation
+    squared and its degrees of freedom, the negative log-likelihood of the prediction minus its mean, the variance of that, and the
+    log-evidence."""
     size = len(covariance)
     nll, gradient, information, expected, variance = _score(tags, phase, strength, pose, values)
     prior_information = inverse(covariance)
@@ -266,7 +277,7 @@ def _corrected(
 
 @compiled
 def _difference(pose: Array, values: Array, target: Array, other_values: Array) -> Array:
-    """The step (3 + P,) from one pose and its values to another."""
+    """The step (3 + P,) from ``pose`` and ``values`` to ``target`` and ``other_values``."""
     out = np.empty(3 + len(values))
     out[0], out[1], out[2] = se2.twist_to(pose, target)
     for i in range(len(values)):
@@ -276,7 +287,8 @@ def _difference(pose: Array, values: Array, target: Array, other_values: Array) 
 
 @compiled
 def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array) -> Array:
-    """The step (D,) of Fisher scoring from where the state has ``moved`` (D,) to, shortened to the largest allowed."""
+    """One step (D,) of Fisher scoring, shortened to the largest allowed step. ``moved`` (D,): the total step so far, from the
+    prediction."""
     size, both, pull = len(gradient), prior_information.copy(), np.empty((len(gradient), 1))
     for i in range(size):
         pull[i, 0] = -gradient[i]
@@ -295,7 +307,7 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
 
 @compiled
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """Covariance (D, D) after an update, and the log of its determinant's ratio to that before."""
+    """The covariance (D, D) after an update, and the logarithm of its determinant relative to that before the update."""
     size, both = len(information), prior_information.copy()
     for i in range(size):
         for j in range(size):
@@ -306,7 +318,8 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
 
 @compiled
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
-    """Normalised square of a score, and its degrees of freedom."""
+    """The normalised innovation squared of a likelihood and its degrees of freedom, from its ``gradient`` (D,) and ``information``
+    (D, D) at the prediction with ``covariance`` (D, D)."""
     size, predicted, pull = (
         len(gradient),
         product(product(information, covariance), information),
@@ -318,7 +331,7 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
         for j in range(size):
             predicted[i, j] += tempering * information[i, j]
     if covariance[0, 0] + covariance[1, 1] > FAR:
-        # of one direction so much more than of the others that these would be lost
+        # the gradient's variance in one direction may be so large that rounding deletes the rest: scale all to unit variance
         units = np.empty(size)
         for i in range(size):
             units[i] = math.sqrt(predicted[i, i])
@@ -335,8 +348,8 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
 
 @compiled(error_model="numpy")
 def _rank(information: Array) -> int:
-    """The number of eigenvalues above :data:`LEAST_INFORMATION`: that of positive pivots of the matrix less this times the identity
-    (Sylvester's law of inertia)."""
+    """The number of eigenvalues above :data:`LEAST_INFORMATION`. By Sylvester's law of inertia, it is the number of positive pivots
+    of the information minus this limit times the identity."""
     size, left, count = len(information), information.copy(), 0
     for k in range(size):
         left[k, k] -= LEAST_INFORMATION

@@ -1,6 +1,6 @@
-"""Tags of a map by position, and read counts of tags: which tags count for a pose, in compiled code.
+"""Selection of the tags that matter for a pose, in compiled code.
 
-An index finds the tags in reach of a pose in a few cells instead of the whole map.
+A spatial index of square cells finds the tags in reach of a pose without a loop over the whole map.
 """
 
 from __future__ import annotations
@@ -14,17 +14,23 @@ from numpy.typing import NDArray
 from factors.compiled import compiled
 from factors.se2 import Array, Integers, exp_scalars, wrap_scalar
 
-CELL = 2.0  # m
-SPARE = 0.5  # m: tags are found in a box on a grid of this size, which neighbouring poses share
+CELL = 2.0  # m; size of a cell of the index
+SPARE = 0.5  # m; the corners of search boxes are rounded outwards to multiples of this
 Corner = tuple[float, float]
-MOST_CELLS = 1 << 20  # a map that is wider has larger cells
-# offsets, antennas, rounds, hits, odds and elsewhere; the places in the map that are listed, the odds of the others, and the twists
+MOST_CELLS = 1 << 20  # maximum number of cells; a larger map has larger cells
+# The fields of factors.rfid.detection.TagReadCounts for compiled code: offsets, antennas, rounds, hits, odds, elsewhere, tags,
+# unlisted_odds, twists.
 Counts = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, float, Array]
 
 
 class TagIndex(NamedTuple):
-    """T tags by cells of ``cell`` [m] in rows of ``columns``, the first at ``corner`` (2,): ``order`` (T,), their places in the
-    map, cell by cell, those of a cell ascending; ``start`` (C + 1,): where each cell begins there."""
+    """A spatial index of T tags in square cells.
+
+    ``corner`` (2,) [m]: the lower corner of the first cell. ``cell`` [m]: the size of a cell. ``columns``: the number of cells in a
+    row; the C cells are numbered row by row.
+    ``order`` (T,): the indices of the tags in the map, cell by cell, and ascending within a cell.
+    ``start`` (C + 1,): the index in ``order`` of the first tag of each cell.
+    """
 
     corner: Array
     cell: float
@@ -34,7 +40,7 @@ class TagIndex(NamedTuple):
 
 
 def tag_index(points: Array) -> TagIndex:
-    """The index of tags at ``points`` (T, 3) [m]."""
+    """Make the index of tags at ``points`` (T, 3) [m]."""
     if not len(points):
         return TagIndex(np.zeros(2), CELL, 1, np.zeros(2, dtype=np.int64), np.empty(0, dtype=np.int64))
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
@@ -49,7 +55,8 @@ def tag_index(points: Array) -> TagIndex:
 
 @compiled(inline="always")
 def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tuple[int, int]:
-    """First and last of ``count`` cells along an axis that an interval touches; the last is before the first if none is."""
+    """The first and last cell along an axis (0 for x, 1 for y) that the interval from ``low`` to ``high`` [m] touches. ``count``:
+    number of cells along the axis. Returns (0, -1) if the interval touches none."""
     first = (low - index.corner[axis]) / index.cell
     last = (high - index.corner[axis]) / index.cell
     if not (first < count and last >= 0.0):
@@ -59,7 +66,7 @@ def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tu
 
 @compiled
 def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArray[np.int64]:
-    """Places, ascending, of the tags in the cells that a box from ``low`` to ``high`` (2,) [m] touches."""
+    """The indices in the map, ascending, of all tags in the cells that the box from ``low`` to ``high`` (2,) [m] touches."""
     rows = (len(index.start) - 1) // index.columns
     first_x, last_x = cells(index, low[0], high[0], 0, index.columns)
     first_y, last_y = cells(index, low[1], high[1], 1, rows)
@@ -79,7 +86,8 @@ def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArra
 
 
 class MapTags(NamedTuple):
-    """The tags of a map: ``points`` (T, 3) [m] and ``normals`` (T, 2), with their index."""
+    """The tags of a map: ``points`` (T, 3) [m], ``normals`` (T, 2) (facing directions, zero if unknown), and the spatial index
+    ``cells``."""
 
     cells: TagIndex
     points: Array
@@ -87,7 +95,8 @@ class MapTags(NamedTuple):
 
 
 class NearTags(NamedTuple):
-    """C tags that matter to some poses: places in the map, ascending, with survey, reads and states."""
+    """The data of the C tags that matter for some poses. ``tags`` (C,): their indices in the map, ascending. The remaining fields
+    are those of :class:`MapTags` and of :class:`~factors.rfid.detection.TagReadCounts` for these tags."""
 
     tags: Integers
     points: Array
@@ -99,8 +108,8 @@ class NearTags(NamedTuple):
 
 @compiled
 def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
-    """The corners of the box that holds what is within ``reach`` [m] of poses (N, 3), on a grid, so that the same tags count
-    whatever was looked at before: to the last bit, sums depend on them."""
+    """The lower and upper corner of a box that contains all points within ``reach`` [m] of poses (N, 3). The corners are rounded
+    outwards to a grid, so that slightly different poses select the same tags and sums have the same rounding errors."""
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for n in range(len(poses)):
         low_x, high_x = min(low_x, poses[n, 0]), max(high_x, poses[n, 0])
@@ -111,8 +120,9 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 
 @compiled
 def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
-    """The tags within ``reach`` [m] of poses (N, 3), or in the same cells, and those that are listed in what was ``counts``
-    (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
+    """Select the tags that matter for poses (N, 3): those within ``reach`` [m] of any pose, those in the same cells, and those
+    listed in
+    ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
     _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)
@@ -128,7 +138,7 @@ def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> Ne
 
 @compiled
 def moved(offset: Array, offsets: Array) -> Array:
-    """The poses (K, 3) ``offset`` (3,) composed with ``offsets`` (K, 3)."""
+    """The poses (K, 3) that result from composing the pose ``offset`` (3,) with each of ``offsets`` (K, 3)."""
     c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
     for k in range(len(offsets)):
         out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
@@ -139,7 +149,7 @@ def moved(offset: Array, offsets: Array) -> Array:
 
 @compiled
 def delayed(poses: Array, twists: Array, delays: Array) -> Array:
-    """The poses (K, 3) ``delays`` [s] (K or 1,) later, of a robot with velocities ``twists`` (K or 1, 3)."""
+    """The poses (K, 3) of a robot ``delays`` (K or 1,) [s] later, for body-frame velocities ``twists`` (K or 1, 3)."""
     if not delays.any():
         return poses
     out = np.empty_like(poses)
@@ -154,7 +164,7 @@ def delayed(poses: Array, twists: Array, delays: Array) -> Array:
 
 @compiled
 def union(first: Integers, second: Integers) -> Integers:
-    """All numbers of either, which are ascending both."""
+    """The union of two ascending arrays of numbers, ascending and without duplicates."""
     out = np.empty(len(first) + len(second), np.int64)
     i = j = count = 0
     while i < len(first) or j < len(second):
@@ -173,7 +183,8 @@ def union(first: Integers, second: Integers) -> Integers:
 def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """Hits, odds and elsewhere of ``tags``, both ascending; tags that are not listed have 0 hits, ``unlisted_odds`` and 0."""
+    """The hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,), from those of the ``listed`` tags. Both arrays of tags are
+    ascending. A tag that is not listed has 0 hits, ``unlisted_odds`` and 0."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
     new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0

@@ -3,7 +3,7 @@
 An antenna reads a tag in k of n inventory rounds with probability q each (:mod:`factors.rfid.model`), so the negative
 log-likelihood is ``-sum(k log q + (n - k) log(1 - q))``. Its Hessian is replaced by the Fisher information, which is positive
 semi-definite. Derivatives are by the body-frame perturbation of the pose, by the parameters of the likelihood
-(:mod:`factors.rfid.parameters`), and by the position of a tag.
+(:mod:`factors.rfid.parameters`), and by the position of a tag. A tag is "as surveyed" if it works and is where the map has it.
 """
 
 import math
@@ -18,16 +18,17 @@ from factors.rfid.parameters import MOST_CERTAIN, adjusted
 from factors.se2 import Array, Integers
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
-ROW = 8  # numbers of each row of placed antennas
-OF_READ, PLACE = 5, 7  # derivatives of one measurement of a tag, without and with those by its position
-MOST_COLUMNS = 8  # of the pose and the parameters that one measurement depends on
+ROW = 8  # numbers per antenna in the result of `_place_antennas`
+OF_READ, PLACE = 5, 7  # numbers of derivatives of one read probability, without and with those by the tag's position
+MOST_COLUMNS = 8  # largest number of components of pose and parameters that one measurement depends on
 
 
 @compiled(inline="always")
 def tag_logit(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Logit of a tag at (p, q, height) from the antenna, in axes rotated by its yaw only, and derivatives by p, q, height, c."""
+    """The logit of a tag at (p, q, height) from the antenna, in axes rotated by the antenna's yaw but not by its pitch, with facing
+    cosine c, and its derivatives by p, q, height and c."""
     cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
     m = packed.which[antenna]
     x, z = cp * p + sp * height, cp * height - sp * p
@@ -39,8 +40,8 @@ def tag_logit(
 
 @compiled(inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
-    """The antenna's x, y, cosine and sine of its heading in the world, with the robot at ``offset`` (3,) from ``pose`` (3,); and
-    the cosine and sine of the robot's heading."""
+    """The antenna's x, y, cosine and sine of its heading in the world, and the cosine and sine of the robot's heading. The robot is
+    at ``offset`` (3,) in the frame of ``pose`` (3,)."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
     c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
@@ -53,8 +54,9 @@ def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[fl
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float, float]:
-    """Logit of one tag for an antenna at (x, y) with boresight (c, s), and its derivatives: by the tag's place along and across
-    the boresight, by the antenna's heading, and by the logarithm of the model's range. Beyond the reach it is constant."""
+    """The logit of one tag for an antenna at (x, y) with horizontal boresight (c, s) in the world. Also returns its derivatives by
+    the tag's position along and across the boresight, by the antenna's heading, and by the logarithm of the model's range.
+    ``point`` (3,), ``normal`` (2,): the tag's position and facing in the world. The logit is constant beyond the reach."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey
@@ -77,17 +79,19 @@ def of_tag(
 
 @compiled(inline="always")
 def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, float]:
-    """Probability of a read at a logit, floor included, and its derivatives by the logit and by the logarithm of ``rate``."""
+    """The read probability, floor included, at the logit ``z``, and its derivatives by the logit and by the logarithm of
+    ``rate``."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
     by_rate = packed.span * rate * sigmoid
-    # a model without a floor may be certain, and certainty has no logarithm
+    # without a floor a probability may be 0 or 1, whose logarithm or that of the complement is infinite
     q = min(max(packed.false_read + by_rate, 1e-12), 1.0 - 1e-12)
     return q, by_rate * (1.0 - sigmoid), by_rate
 
 
 @compiled
 def reach_of(packed: Packed, offsets: Array) -> float:
-    """How far [m] the antennas reach at most from the pose that measurements at ``offsets`` (K, 3) are relative to."""
+    """The largest distance [m] from the reference pose at which a tag can be read. ``offsets`` (K, 3): the robot's poses at the
+    measurements, in the frame of the reference pose."""
     offset = farthest = 0.0
     for k in range(len(offsets)):
         offset = max(offset, math.hypot(offsets[k, 0], offsets[k, 1]))
@@ -99,10 +103,8 @@ def reach_of(packed: Packed, offsets: Array) -> float:
 
 @compiled(inline="always")
 def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
-    """Fill ``out`` (K, 8): position and boresight of each antenna in the world, then both in the frame of the pose.
-
-    Returns how far from the pose [m] the antennas reach.
-    """
+    """Write the antenna of each measurement into ``out`` (K, 8): position and boresight in the world, then boresight and position
+    in the frame of the pose. Returns the largest distance [m] from the pose at which a tag can be read."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]
@@ -119,12 +121,13 @@ def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArr
 def mixture(
     odds: float, elsewhere: float, e: float, mean: float, variance: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """The factor of the derivatives of a tag that may be dead or moved (:mod:`factors.rfid.tag_states`), and its tempered negative
-    log-likelihood with mean and variance.
+    """The likelihood of a tag that may not be as surveyed (:mod:`factors.rfid.tag_states`).
 
-    ``e``, ``mean`` and ``variance``: the same, untempered, of a tag as surveyed; ``none``: the negative log-likelihood of misses
-    out of range. Reads of a tag that is not as surveyed are as likely as expected. The derivatives neglect the information lost by
-    the unknown state (Louis, JRSS B 44(2), 1982, eq. 3.2').
+    ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`. ``e``, ``mean``, ``variance``: the untempered
+    negative log-likelihood of a tag as surveyed, and its mean and variance over all outcomes. ``none``: the untempered negative
+    log-likelihood of misses out of range. Returns a factor for the derivatives of ``e``, and the tempered negative log-likelihood
+    with its mean and variance. The derivatives neglect the information that the unknown state costs (Louis, JRSS B 44(2), 1982,
+    eq. 3.2').
     """
     if odds == -np.inf or elsewhere == -np.inf:
         return tempering, tempering * e, tempering * mean, tempering * variance
@@ -140,8 +143,8 @@ def mixture(
 
 @compiled(inline="always")
 def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """Negative log-likelihood of k hits in n rounds with probability q, its derivative by q, Fisher's information on q, and mean
-    and variance of the negative log-likelihood."""
+    """The negative log-likelihood of ``hits`` reads in ``rounds`` rounds with read probability ``q``, its derivative by q, the
+    Fisher information on q, and the mean and variance of the negative log-likelihood over all outcomes."""
     log_q, log_p = math.log(q), math.log1p(-q)
     nll = -(hits * log_q + (rounds - hits) * log_p)
     gradient = -(hits / q - (rounds - hits) / (1.0 - q))
@@ -153,7 +156,8 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
 
 @compiled
 def _unread(packed: Packed, rounds: Integers) -> Array:
-    """Negative log-likelihood of misses of a tag out of range, its mean and variance, (K, 3)."""
+    """For each of K measurements, the negative log-likelihood that a tag out of range is missed, and its mean and variance (K,
+    3)."""
     out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
     for k in range(len(rounds)):
         out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])
@@ -174,12 +178,12 @@ def _add_tag(
     slope: Array,
     curve: Array,
 ) -> tuple[float, float, float]:
-    """Negative log-likelihood of one tag as surveyed in all measurements, its mean and variance over all outcomes.
+    """The negative log-likelihood of one tag as surveyed in K measurements, and its mean and variance over all outcomes.
 
-    Filled for each measurement: its derivative ``slope`` (K,) by the probability of a read and Fisher's information ``curve`` (K,)
-    on that, both 0 out of reach; and the derivatives ``by`` (K, 7) of the probability by the antenna's position in the frame of the
-    pose, its yaw, ``a`` and ``b`` of its model, and the tag's position in the world. ``far`` (K, 3): what a miss out of range
-    contributes.
+    Writes, for each measurement, the derivative ``slope`` (K,) by the read probability and the Fisher information ``curve`` (K,) on
+    that probability, both 0 out of reach. Writes the derivatives ``by`` (K, 7) of the probability by the antenna's position in the
+    frame of the pose (2), its yaw, the parameters ``a`` and ``b`` of its model, and the tag's position in the world (2). ``at``:
+    the result of :func:`_place_antennas`. ``far``: that of :func:`_unread`.
     """
     nll = mean = variance = 0.0
     for k in range(len(antennas)):
@@ -194,7 +198,7 @@ def _add_tag(
         q, by_z, by_rate = detection(packed, z, rate)
         e, slope[k], curve[k], expected, own_variance = outcome(q, hits[k], rounds[k])
         nll, mean, variance = nll + e, mean + expected, variance + own_variance
-        # the antenna moves, the tag does not
+        # the derivatives by a motion of the antenna are opposite to those by a motion of the tag
         by[k, 0] = by_z * (at[k, 5] * by_q - at[k, 4] * by_p)
         by[k, 1] = -by_z * (at[k, 5] * by_p + at[k, 4] * by_q)
         by[k, 2], by[k, 3] = by_z * by_heading, by_z * by_range
@@ -216,10 +220,11 @@ def _add_measurement(
     gradient: Array,
     information: Array,
 ) -> None:
-    """Add the ``pull`` (5,) and the lower triangle of the ``curve`` (5, 5) of a measurement, by what :func:`_add_tag` derives by,
-    to the ``gradient`` (D,) and the ``information`` (D, D) by the pose and the parameters that have a column.
+    """Convert the derivatives of one measurement to pose and parameters, and add them to ``gradient`` (D,), ``information`` (D, D).
 
-    ``at`` (8,): the antenna, of a robot at ``offset`` (3,) from the pose with velocity ``twist`` (3,).
+    ``pull`` (5,) and the lower triangle of ``curve`` (5, 5): gradient and information by the first five variables of
+    :func:`_add_tag`. ``at`` (8,): the antenna. ``offset`` (3,), ``twist`` (3,): the robot's pose in the frame of the reference
+    pose, and its velocity. ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated.
     """
     own, by, count = np.empty(MOST_COLUMNS, np.int64), np.zeros((MOST_COLUMNS, OF_READ)), 3
     own[0], own[1], own[2] = 0, 1, 2
@@ -255,8 +260,8 @@ def _add_measurement(
 def scores(
     packed: Packed, of_map: MapTags, counts: Counts, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """The fields of a :class:`~factors.rfid.detection.Score` of poses (N, 3) for adjusted models. ``columns``: of the parameters in
-    the derivatives, -1 for those that have none."""
+    """The fields of a :class:`~factors.rfid.detection.Score` of poses (N, 3), for adjusted models. ``columns`` (Q,): the component
+    of each parameter in the gradient, -1 if it is not estimated."""
     antennas, rounds, twists = counts[1], counts[2], counts[8]
     offsets = delayed(counts[0], twists, packed.delay)
     count, scans, size = len(poses), len(antennas), 3
@@ -275,7 +280,7 @@ def scores(
     pulls, curves = np.empty((scans, OF_READ)), np.empty((scans, OF_READ, OF_READ))
     for n in range(count):
         farthest = _place_antennas(packed, poses[n], offsets, antennas, at)
-        # tags that are not listed are out of reach and not read
+        # the tags that are not near any pose are out of reach and not read
         beyond = len(of_map.points) - tags
         e_sum = mean_sum = variance_sum = 0.0
         pulls[:], curves[:] = 0.0, 0.0
@@ -317,8 +322,9 @@ def scores(
 def score(
     packed: Packed, of_map: MapTags, counts: Counts, alpha: float, pose: Array, parameters: Array, estimated: Integers
 ) -> tuple[float, Array, Array, float, float]:
-    """Score of one pose (3,) with tempering ``alpha`` and ``parameters`` of models without adjustment: negative log-likelihood;
-    gradient (3 + P,) and information (3 + P, 3 + P) by pose and ``estimated`` (P,) parameters; mean and variance."""
+    """The tempered likelihood of one pose (3,) with ``parameters`` (Q,), and its derivatives. ``packed``: models before adjustment.
+    ``alpha``: the tempering. Returns the negative log-likelihood, its gradient (3 + P,) and information (3 + P, 3 + P) by the pose
+    and the parameters with indices ``estimated`` (P,), and its mean and variance."""
     columns = np.full(len(parameters), -1, np.int64)
     for i in range(len(estimated)):
         columns[estimated[i]] = 3 + i
@@ -338,8 +344,8 @@ def by_tag(
     rounds: Integers,
     hits: Integers,
 ) -> tuple[Array, Array, Array]:
-    """Of each of T tags as surveyed, at one pose (3,): negative log-likelihood (T,); gradient (T, 5) and information (T, 5, 5) by
-    the pose and by the tag's position in the world."""
+    """For each of T tags as surveyed, at one pose (3,): the untempered negative log-likelihood (T,), and its gradient (T, 5) and
+    information (T, 5, 5) by the pose (3) and by the tag's position in the world (2)."""
     scans, tags, size = len(antennas), len(points), 5
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
     at, far, by = np.empty((scans, ROW)), _unread(packed, rounds), np.empty((scans, PLACE))
@@ -362,8 +368,8 @@ def by_tag(
 def probabilities(
     packed: Packed, antennas: Integers, poses: Array, points: Array, normals: Array
 ) -> tuple[Array, Array]:
-    """Probability (N, T), floor included, that a round of ``antennas`` (N,) on a robot at ``poses`` (N, 3) reads each tag, and the
-    distance (N, T) [m] in the plane from the antenna."""
+    """The probability (N, T), floor included, that one round of antenna ``antennas[n]`` on a robot at ``poses[n]`` reads each tag,
+    and the horizontal distance (N, T) [m] from the antenna to the tag."""
     none = np.zeros(3)
     p, distance = np.empty((len(poses), len(points))), np.empty((len(poses), len(points)))
     for n in range(len(poses)):
@@ -380,8 +386,9 @@ def probabilities(
 def predicted(
     packed: Packed, of_map: MapTags, counts: Counts, pose: Array, parameters: Array
 ) -> tuple[Integers, Integers, Array, Array]:
-    """With ``parameters`` of models without adjustment, of the tags near a pose (3,) or listed: their indices in the map (C,), and
-    for each measurement the hits, the probability of a read and the distance [m] from the antenna, (K, C)."""
+    """Observed and predicted reads at one pose (3,), of the C tags that are near or listed in ``counts``. ``packed``: models before
+    adjustment by ``parameters`` (Q,). Returns the indices (C,) of the tags in the map, and for each measurement and tag the number
+    of reads, the read probability and the horizontal distance [m] from the antenna, (K, C) each."""
     own, antennas = adjusted(packed, parameters), counts[1]
     offsets = delayed(counts[0], counts[8], own.delay)
     near = near_tags(of_map, counts, pose.copy().reshape(1, 3), reach_of(own, offsets))

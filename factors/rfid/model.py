@@ -1,9 +1,9 @@
 """The detection model of RFID antennas: the probability that an inventory round of an antenna reads a tag.
 
-A model gives the logit of that probability as a function of the tag's position in the antenna's frame (x along the boresight, y to
-the left, z up) and its facing. The final probability is ``q = false_read + (1 - false_read - miss) * sigmoid(logit)``: the floor
-allows a read from anywhere, as by misplaced tags and reflections, which makes the likelihood robust. The likelihood is in
-:mod:`factors.rfid.kernels`.
+An inventory round is one attempt of a reader to read all tags in range. A model gives the logit of the read probability as a
+function of the tag's position in the antenna's frame (x along the boresight, y to the left, z up) and of the tag's facing. The
+final probability is ``q = false_read + (1 - false_read - miss) * sigmoid(logit)``. The floor ``false_read`` allows reads from
+anywhere, such as reflections, which makes the likelihood robust. The likelihood is in :mod:`factors.rfid.kernels`.
 """
 
 import math
@@ -20,40 +20,40 @@ from factors.se2 import Array
 
 BEAM, LOGISTIC, GRID = 0, 1, 2
 FEATURES = ("1", "r", "r^2", "w", "w^2", "r w", "|z|", "c", "c^2", "r c", "w c")
-NEGLIGIBLE_LOGIT = -14.0  # out of range
-NEAR = 1e-2  # m; minimum distance with a defined direction
-PARAMETERS = 12  # maximum length of a parameter vector of a compiled model
-ALMOST_ONE = 1.0 - 1e-9
-# of the cosine of a tag's facing: where the reads of a beam decrease behind the tag, and over what width
+NEGLIGIBLE_LOGIT = -14.0  # logit of a tag out of range
+NEAR = 1e-2  # m; is added in square to a squared distance, so that directions are defined at the antenna
+PARAMETERS = 12  # maximum number of parameters of a detection model in compiled code
+ALMOST_ONE = 1.0 - 1e-9  # maximum read probability of a beam model, because 1 has no logit
+# Center (negated) and width of the sigmoid by which reads of a beam model decrease behind a tag, in the cosine of the tag's facing.
 FRONT, SIDE = 0.25, 0.15
 
 
 class DetectionModel(Protocol):
-    """A detection model. ``reach`` [m]: range in the plane, beyond which there are only false reads."""
+    """The interface of a detection model. ``reach`` [m]: the horizontal range beyond which there are only false reads."""
 
     @property
     def reach(self) -> float: ...
 
     @property
     def uses_facing(self) -> bool:
-        """Whether the logit depends on the tag's facing."""
+        """True if the read probability depends on the tag's facing."""
 
     @property
     def peak(self) -> float:
-        """The largest probability that it gives to a tag."""
+        """The largest read probability of the model."""
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
-        """Kind, parameters, and knots (H, F, NX, NY) of a grid (empty for others)."""
+        """The model for compiled code: its kind, its parameters, and the knots (H, F, NX, NY) of a grid, empty for other kinds."""
 
 
 @dataclass(frozen=True)
 class BeamModel:
-    """``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with distance r [m] and bearing phi [rad] in
-    the plane of the boresight; the default of uncalibrated antennas.
+    """A beam with soft edges, the default of uncalibrated antennas.
 
-    ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)`` depends on the cosine c of the angle between the tag's facing
-    and the direction to the antenna, 0 if the facing is unknown. ``behind`` is the share of reads from behind a tag, 1 if tags
-    are read from all sides.
+    ``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with the distance r [m] to the tag and the
+    tag's bearing phi [rad] from the boresight. ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)`` depends on the cosine
+    c of the angle between the tag's facing and the direction to the antenna; c is 0 if the facing is unknown. ``behind`` is the
+    read probability from behind a tag relative to that from its front, 1 if tags are equally readable from all sides.
     """
 
     p0: float = 0.9
@@ -82,8 +82,11 @@ class BeamModel:
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """A logit that is linear in :data:`FEATURES`: distance r [m] in the plane, w = 1 - cosine of the bearing, height difference z
-    [m], and c, the cosine of the angle between the tag's facing and the direction to the antenna (0 if the facing is unknown)."""
+    """A logit that is linear in :data:`FEATURES`. ``coefficients`` (11,): one for each feature.
+
+    The features are made of the horizontal distance r [m], w = 1 - cosine of the bearing, the height difference z [m], and c, the
+    cosine of the angle between the tag's facing and the direction to the antenna (0 if the facing is unknown).
+    """
 
     coefficients: Sequence[float]
     reach: float = 8.0
@@ -102,12 +105,13 @@ class LogisticModel:
 
 @dataclass(frozen=True, eq=False)
 class GridModel:
-    """The paper's Cartesian field: ``logits`` (H, F, NX, NY) at knots ``cell`` [m] apart, the first at (``x0``, ``y0``) in the
-    antenna's frame.
+    """A grid of logits in the antenna's frame. ``logits`` (H, F, NX, NY): at knots ``cell`` [m] apart, the first at (``x0``,
+    ``y0``).
 
-    H ascending ``heights`` (H,) [m] of the tag above the antenna, and F evenly spaced facings from -1 to 1 (cosine of the angle
-    between the tag's facing and the direction to the antenna), or one if irrelevant. Interpolation: cubic convolution in the plane
-    and in the facing (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6), linear in height; constant beyond the edge up to ``reach``.
+    ``heights`` (H,) [m]: heights of the tag above the antenna, ascending and evenly spaced. The F facings are evenly spaced cosines
+    from -1 to 1 of the angle between the tag's facing and the direction to the antenna; F is 1 if the facing is irrelevant.
+    Interpolation is by cubic convolution in the plane and in the facing (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6), and linear in
+    height. The logit is constant from the edge of the grid up to ``reach``.
     """
 
     logits: Array
@@ -138,8 +142,8 @@ class GridModel:
 
 @dataclass(frozen=True)
 class Antenna:
-    """Position and boresight of an antenna in the robot frame: ``x``, ``y``, ``z`` [m], ``yaw``, ``pitch`` (up is positive) [rad];
-    ``model``: index of its model."""
+    """Position ``x``, ``y``, ``z`` [m] and boresight ``yaw``, ``pitch`` (positive is up) [rad] of an antenna in the robot frame.
+    ``model``: index of its detection model."""
 
     x: float = 0.0
     y: float = 0.0
@@ -150,10 +154,11 @@ class Antenna:
 
 
 class Packed(NamedTuple):
-    """A :class:`RfidModel` as compiled code takes it. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw and pitch;
-    ``which`` (A,): their models; ``kinds`` (M,); ``parameters`` (M, 12); ``shapes`` (M, 5): H, F, NX, NY and the first place in
-    ``knots``; ``reach`` (M,); ``span``: what the floor leaves to the model. ``scale`` and ``rate`` (M,), ``delay`` (1,)
-    [s]: :mod:`factors.rfid.parameters`; ``peak`` (M,): largest probability of a model."""
+    """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw, and of pitch. ``which`` (A,):
+    the model of each. ``kinds`` (M,), ``parameters`` (M, 12): of each model. ``shapes`` (M, 5): H, F, NX, NY of a grid, and its
+    first index in ``knots``, the logits of all grids. ``reach`` (M,) [m]. ``span``: ``1 - false_read - miss``. ``scale``, ``rate``
+    (M,) and
+    ``delay`` (1,) [s]: the adjustment by :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest probability of each model."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -172,7 +177,8 @@ class Packed(NamedTuple):
 
 @dataclass(frozen=True)
 class RfidModel:
-    """All antennas of a robot. ``false_read`` and ``miss``: see the module; ``tempering``: exponent of the likelihood."""
+    """All antennas of a robot and their detection models. ``false_read``: the read probability of a tag out of range. ``miss``: the
+    probability that a round misses any tag. ``tempering``: the exponent of the likelihood, below 1 if reads are correlated."""
 
     antennas: tuple[Antenna, ...]
     models: tuple[DetectionModel, ...]
@@ -216,10 +222,8 @@ def _probability(logit: float) -> float:
 
 
 def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> tuple[Array, Array]:
-    """Logit (N,) and its gradient (N, 4) by x, y, z and facing, for tags at ``points`` (N, 3) [m] in the antenna's frame.
-
-    ``facing`` (N,): cosine of the angle between the tag's facing and the direction to the antenna.
-    """
+    """The logits (N,) of tags at ``points`` (N, 3) [m] in the antenna's frame, and their gradient (N, 4) by x, y, z and facing.
+    ``facing`` (N,): the cosine of the angle between each tag's facing and the direction to the antenna."""
     packed = RfidModel((Antenna(),), (model,)).packed()
     points = np.atleast_2d(np.asarray(points, dtype=float))
     facing = np.ascontiguousarray(np.broadcast_to(np.asarray(facing, dtype=float), len(points)))
@@ -229,14 +233,14 @@ def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) ->
 
 
 def probability(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> Array:
-    """Detection probability (N,), without the floor, for tags at ``points`` (N, 3) in the antenna's frame."""
+    """The read probabilities (N,), without the floor, of tags at ``points`` (N, 3) in the antenna's frame."""
     return np.asarray(1.0 / (1.0 + np.exp(-logits(model, points, facing)[0])))
 
 
 def bake(
     model: DetectionModel, extent: float, cell: float = 0.1, heights: Sequence[float] = (0.0,), facings: int = 1
 ) -> GridModel:
-    """Sample a model as a grid from -``extent`` to ``extent`` [m] in x and y, with ``facings`` knots of the facing's cosine."""
+    """Sample any model as a grid from -``extent`` to ``extent`` [m] in x and y, with ``facings`` knots of the facing's cosine."""
     count = 2 * math.ceil(extent / cell) + 1
     axis = cell * (np.arange(count) - (count - 1) / 2.0)
     cosines = np.linspace(-1.0, 1.0, facings) if facings > 1 else np.zeros(1)
@@ -264,7 +268,7 @@ def _logits(
 def logit(
     kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Logit at (x, y, z) in the antenna's frame with facing c, and its derivatives by them."""
+    """The logit of a tag at (x, y, z) in the antenna's frame with facing cosine c, and its derivatives by x, y, z and c."""
     if kind == BEAM:
         return _beam(parameters, x, y, z, c)
     if kind == LOGISTIC:
@@ -278,7 +282,7 @@ def _beam(parameters: Array, x: float, y: float, z: float, c: float) -> tuple[fl
     r = math.sqrt(x * x + y * y + z * z + NEAR * NEAR)
     phi = math.atan2(y, x)
     excess = (r_max - r) / s_r
-    # log of a sigmoid, without overflow
+    # the logarithm of a sigmoid, without overflow
     log_range = -math.log1p(math.exp(-excess)) if excess > 0.0 else excess - math.log1p(math.exp(excess))
     behind = parameters[4]
     sigmoid = 1.0 / (1.0 + math.exp(-(c + FRONT) / SIDE))
@@ -295,8 +299,7 @@ def _beam(parameters: Array, x: float, y: float, z: float, c: float) -> tuple[fl
 
 @compiled(inline="always")
 def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> float:
-    """Logit of a logistic model with coefficients ``b`` of :data:`FEATURES`, at range r, one minus the cosine of the bearing w,
-    height, and facing c."""
+    """The logit of a logistic model with coefficients ``b``. See :data:`FEATURES` and :class:`LogisticModel` for r, w and c."""
     value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r) + b[6] * abs(height)
     return float(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))
 
@@ -328,7 +331,7 @@ def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, 
 
 @compiled
 def _slope(f: float) -> tuple[float, float, float, float]:
-    """Derivatives of the :func:`cubic_weights`."""
+    """The derivatives of :func:`cubic_weights` by ``f``."""
     return (
         (-1.5 * f + 2.0) * f - 0.5,
         (4.5 * f - 5.0) * f,
@@ -339,7 +342,8 @@ def _slope(f: float) -> tuple[float, float, float, float]:
 
 @compiled
 def _place(s: float, count: int) -> tuple[int, float, float]:
-    """The knot below ``s``, the fraction above it, and the derivative of clipping (1 inside, 0 outside)."""
+    """Clip a place ``s`` to a row of ``count`` knots. Returns the knot below, the fraction above that knot, and 1 if the place is
+    inside, otherwise 0."""
     if count == 1 or s <= 0.0:
         return 0, 0.0, 0.0
     if s >= count - 1:

@@ -1,13 +1,16 @@
-"""The parameters of the likelihood of reads: what differs between installations.
+"""The parameters of the likelihood of RFID reads. They adapt detection models, antenna mounting and clock to an installation.
 
-Two belong to each detection model (power, cables, kinds of tags). With ``a``, the logarithm of a factor of the range, and ``b``, a
-shift of the logit of the largest read probability ``peak``, the model's ``p(x, y, z)`` of a tag in the antenna's frame becomes
+Each detection model has two parameters, because power, cables and kinds of tags differ. ``a`` is the logarithm of a factor of the
+range. ``b`` is a shift of the logit of the largest read probability ``peak``. The read probability ``p(x, y, z)`` of a tag in the
+antenna's frame becomes
 
-    rate * p(x / scale, y / scale, z),    scale = exp(a),    rate = sigmoid(logit(peak) + b) / peak,
+    rate * p(x / scale, y / scale, z),    scale = exp(a),    rate = sigmoid(logit(peak) + b) / peak.
 
-which for a beam is another ``r_max`` (with its ``s_r`` in proportion) and another ``p0``. The parameters of M models and A antennas
-are a vector (Q,), Q = 2 M + A + 2: ``a`` and ``b`` of each model; the common change of yaw [rad] of all antennas; the additional
-change of yaw of each antenna; and the time offset [s], which is added to the stamps. Zeros change nothing.
+For a beam model this changes ``r_max`` and ``s_r`` in proportion, and ``p0``.
+
+The parameters of M models and A antennas are a vector (Q,) with Q = 2 M + A + 2. Its elements are ``a`` and ``b`` of each model,
+the common change of yaw [rad] of all antennas, the additional change of yaw of each antenna, and the time offset [s] that is added
+to the timestamps. Zeros change nothing.
 """
 
 import math
@@ -18,20 +21,20 @@ from factors.compiled import compiled
 from factors.rfid.model import Packed
 from factors.se2 import Array
 
-OF_MODEL = ("range_scale", "read_rate")  # of each detection model
-MOST_CERTAIN = 0.99  # limit of the peak of a model: a larger one would leave the rate nothing to change
+OF_MODEL = ("range_scale", "read_rate")  # names of the parameters a and b of a detection model
+MOST_CERTAIN = 0.99  # limit of the peak of a model, because a shift of the logit hardly changes a larger peak
 
 
 @compiled
 def rate_of(peak: float, shift: float) -> float:
-    """The factor of the probabilities of a model with largest probability ``peak``, whose logit shifts by ``shift``."""
+    """The factor ``rate`` of a model's probabilities, for its largest probability ``peak`` and the ``shift`` b of the logit."""
     certain = min(peak, MOST_CERTAIN)
     return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
 
 
 @compiled
 def adjusted(packed: Packed, parameters: Array) -> Packed:
-    """The models with these parameters; ``packed``: the models without adjustment."""
+    """Adjust detection models and mounting to ``parameters`` (Q,). ``packed``: the models before adjustment."""
     models, antennas = len(packed.reach), packed.antennas.copy()
     scale, reach, rate = np.empty(models), np.empty(models), np.empty(models)
     for m in range(models):

@@ -1,10 +1,12 @@
-"""Tables of reads by the tag's position in the robot frame, and the likelihood of poses that may be anywhere in a large map.
+"""Likelihood tables by the tag's position in the robot frame, and the likelihood of reads at poses anywhere in a large map.
 
-All antennas of a robot measure from one pose, so the response of all of them to a tag is a function of the tag's position in the
-robot frame, the same for all tags of one height. A search and planning both use these tables, planning with larger cells.
-For each pose only the tags in its reach count, which a :class:`~factors.rfid.index.TagIndex` finds. Most of them were not read, and
-the log-likelihood of a miss is tabulated for all antennas together. Models that use the facing of tags are evaluated antenna by
-antenna in a search: close to an antenna the facing changes within a cell.
+All antennas of a robot measure from one robot pose. Their responses to a tag are therefore functions of the tag's position in the
+robot frame, and equal for all tags of one height. A global search for the pose uses these tables, and so does planning, with larger
+cells.
+
+For each pose, a :class:`~factors.rfid.index.TagIndex` finds the tags in reach. Most of these were not read, so one table has the
+log-likelihood that all antennas together miss a tag. If a model depends on the facing of tags, a search evaluates each antenna
+separately instead, because close to an antenna the facing changes within a cell.
 """
 
 from __future__ import annotations
@@ -24,18 +26,22 @@ from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of
 from factors.rfid.weighing import LEAST, mixed
 from factors.se2 import Array, Integers
 
-MOST = 1 << 25  # numbers in a table; cells are so large that there are no more
-WIDE = 2.0  # times the square that an antenna reaches: poses that touch more are evaluated one by one
-PLACED = 25  # work of a pose, besides that of its tags
-BY_ANTENNA = 7  # work of a tag for one antenna, if tables of the robot frame are missing
+MOST = 1 << 25  # maximum number of elements of a table; cells are made larger if necessary
+# Poses are far apart if the area within their reach exceeds this multiple of the area within reach of one pose.
+WIDE = 2.0
+# Costs in units of the cost of a table look-up for one tag: of a pose without its tags, and of a tag and antenna without tables.
+PLACED = 25
+BY_ANTENNA = 7
 
 
 class RobotTables(NamedTuple):
-    """The response of A antennas to a tag by its position in the robot frame: S x S cells of ``cell`` [m] in F layers, one for
-    each facing of the tag and the last for an unknown or irrelevant one, for each of H heights.
+    """The responses of A antennas to a tag, by the tag's position in the robot frame. q is the read probability of one round.
 
-    ``gain`` (A, H, F, S, S): log q - log(1 - q); ``missed`` (A, H, F, S, S): log(1 - q) above that out of reach; ``level`` (T,):
-    height of each tag; ``none`` (A, 2): log q and log(1 - q) out of reach.
+    A table has S x S cells of ``cell`` [m], for each of H heights and each of F facings of the tag. The last facing is for tags
+    whose facing is unknown or irrelevant.
+    ``gain`` (A, H, F, S, S): log q - log(1 - q).
+    ``missed`` (A, H, F, S, S): log(1 - q) minus its value out of reach.
+    ``level`` (T,): the index of each tag's height. ``none`` (A, 2): log q and log(1 - q) out of reach.
     """
 
     gain: Array32
@@ -46,10 +52,12 @@ class RobotTables(NamedTuple):
 
 
 class MissTable(NamedTuple):
-    """Log-likelihood of a tag that nobody reads, by its position in the robot frame.
+    """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is relative to that
+    of a tag out of reach.
 
-    ``surveyed`` (H, S, S): of a tag as surveyed, above that out of reach; ``folded`` (H, S, S): the same, tempered, of a tag that
-    may be dead or moved; ``cell`` [m]; ``reach`` [m], beyond which it is 0.
+    ``surveyed`` (H, S, S): that of a tag as surveyed, untempered, for H heights.
+    ``folded`` (H, S, S): that of a tag that may not be as surveyed, tempered.
+    ``cell`` [m]: the size of a cell. ``reach`` [m]: the distance beyond which both are zero.
     """
 
     surveyed: Array32
@@ -59,9 +67,13 @@ class MissTable(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """``hits`` (K, W) in ``rounds`` (K,) of ``antennas`` (K,) of the W exceptional tags; ``number`` (T,): the place of a tag of the
-    index among these, -1 for the usual tags. ``odds`` (W,) and ``elsewhere`` (W,) of the exceptional tags and the ``unlisted_odds``
-    of the usual ones: see :class:`~factors.rfid.detection.TagReadCounts`."""
+    """The reads of one likelihood evaluation. W tags are exceptional: they were read, or their odds differ from those of most tags.
+
+    ``antennas`` (K,), ``rounds`` (K,): of each measurement. ``hits`` (K, W): the number of reads of each exceptional tag.
+    ``number`` (T,): for each tag, in the order of the index, its number among the exceptional tags, or -1.
+    ``odds`` (W,), ``elsewhere`` (W,): of the exceptional tags. ``unlisted_odds``: of all remaining tags. See
+    :class:`~factors.rfid.detection.TagReadCounts`.
+    """
 
     antennas: Integers
     rounds: Integers
@@ -73,8 +85,8 @@ class Scan(NamedTuple):
 
 
 class Antennas(NamedTuple):
-    """An adjusted model and its tables. ``logs`` (M, Z, 2): log q and log(1 - q) of each detection model for the logits of the
-    tables; ``reach`` [m], from the robot's middle."""
+    """An adjusted model and its tables. ``logs`` (M, Z, 2): the logarithms of read and miss probability of each detection model, at
+    the logits of the tables. ``reach`` [m]: the largest distance from the robot's origin at which an antenna can read a tag."""
 
     packed: Packed
     tables: Tables
@@ -83,18 +95,18 @@ class Antennas(NamedTuple):
 
 
 def antennas_of(packed: Packed, tables: Tables) -> Antennas:
-    """An adjusted model with the ``tables`` of its antennas."""
+    """Combine an adjusted model and the ``tables`` of its antennas."""
     return Antennas(packed, tables, logs_of(packed), reach_of(packed, np.zeros((0, 3))))
 
 
 def is_wide(poses: Array, reach: float) -> bool:
-    """Whether poses (N, 3) are so far apart that most tags are within ``reach`` [m] of few of them."""
+    """True if poses (N, 3) are so far apart that most tags are within ``reach`` [m] of only a few poses."""
     reached = np.ptp(poses[:, :2], axis=0) + 2.0 * reach
     return bool(np.prod(reached) > WIDE * (2.0 * reach) ** 2)
 
 
 def in_reach(points: Array, reach: float) -> float:
-    """How many of the tags at ``points`` (T, 2) are within ``reach`` [m] of a pose among them, on average."""
+    """The mean number of tags at ``points`` (T, 2) within ``reach`` [m] of a random pose in their bounding box."""
     if not len(points):
         return 0.0
     area = float(np.prod(np.ptp(points, axis=0) + 2.0 * reach))
@@ -102,10 +114,11 @@ def in_reach(points: Array, reach: float) -> float:
 
 
 def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: int = 0) -> RobotTables:
-    """The tables of a model for tags at ``heights`` (T,) [m], which face in so many directions or in an irrelevant one.
+    """Compute the tables of a model by the tag's position in the robot frame.
 
-    Cells and heights are ``finest`` times as far apart as in the tables of the antennas, or farther if the table would be too
-    large.
+    ``heights`` (T,) [m]: heights of the tags. ``facings``: number of facing directions, besides that for an irrelevant facing.
+    ``finest``: the size of cells and height steps, in units of those in the tables of the antennas. It is increased if the tables
+    would be too large.
     """
     scale, size, (packed, tables, logs, reach) = finest, MOST + 1, antennas
     while size > MOST:
@@ -122,7 +135,7 @@ def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: i
 
 
 def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) -> MissTable:
-    """The table of misses of the antennas and rounds of a scan."""
+    """Compute the table of misses for the antennas, rounds and odds of a scan. ``reach`` [m]: the largest distance of the table."""
     total: Array32 = np.zeros((tables.missed.shape[1], *tables.missed.shape[3:]), dtype=np.float32)
     if not total.size:
         return MissTable(total, total, tables.cell, reach)
@@ -139,9 +152,12 @@ def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """A map's tags by position, with the ``tables`` of a model, which are empty if it uses the facing of tags.
+    """The likelihood of reads at poses anywhere in a map.
 
-    ``points`` (T, 3), ``normals`` (T, 2) and ``levels`` (A, T) are in the order of the ``index``.
+    ``antennas``: the model and its tables. ``tables``: the tables by position in the robot frame, empty if the model depends on the
+    facing of tags.
+    ``index``: the spatial index of the map's tags. ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): the tags' positions,
+    facings and numbers of tables, in the order of the index.
     """
 
     antennas: Antennas
@@ -154,7 +170,7 @@ class Places:
 
     @classmethod
     def of(cls, antennas: Antennas, of_map: MapTags, *, uses_facing: bool) -> Places:
-        """For the tags of a map."""
+        """Make the likelihood for the tags of a map. ``uses_facing``: True if the model depends on the facing of tags."""
         order = of_map.cells.order
         points, normals = np.ascontiguousarray(of_map.points[order]), np.ascontiguousarray(of_map.normals[order])
         tables = robot_tables(antennas, points[: 0 if uses_facing else len(points), 2])
@@ -163,7 +179,7 @@ class Places:
         )
 
     def work(self, counts: Counts) -> int:
-        """How many tags count for one pose, on average; one that was read counts as four."""
+        """An estimate of the cost of the likelihood at one pose, in units of the cost of one tag that was not read."""
         near = in_reach(self.points[:, :2], self.antennas.reach)
         _, antennas, _, hits, *_ = counts
         if not self.tables.gain.size:
@@ -171,7 +187,7 @@ class Places:
         return PLACED + round(near) + 4 * int(np.count_nonzero(hits.any(axis=0)))
 
     def log_likelihood(self, poses: Array, counts: Counts, tempering: float) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3)."""
+        """The tempered log-likelihood (N,) of read ``counts`` at poses (N, 3)."""
         scan = self._scan(counts)
         missed = float(scan.rounds @ self.tables.none[scan.antennas, 1])
         out = np.full(len(poses), tempering * len(self.points) * missed)
@@ -180,7 +196,7 @@ class Places:
         return out
 
     def _missed(self, scan: Scan, tempering: float) -> MissTable:
-        """The table of misses for the odds that most tags have; that of the last scan is kept."""
+        """The table of misses for the odds of most tags. The last table is cached, because consecutive scans are often alike."""
         key = (scan.antennas.tobytes(), scan.rounds.tobytes(), scan.unlisted_odds, tempering)
         if key not in self._last:
             self._last.clear()
@@ -188,7 +204,7 @@ class Places:
         return self._last[key]
 
     def _scan(self, counts: Counts) -> Scan:
-        """The counts of the exceptional tags: those that were read, or whose state is unusual."""
+        """Convert counts to a :class:`Scan` of the exceptional tags: those that were read, and those with unusual odds."""
         _, antennas, rounds, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
         rows = np.arange(len(odds))
         if len(odds) == len(self.points) > 0:
@@ -214,9 +230,9 @@ def _log_likelihood(
     tempering: float,
     out: Array,
 ) -> None:
-    """Add to ``out`` (N,) the tempered log-likelihood, above that of misses out of reach, of poses (N, 3).
+    """Add the tempered log-likelihood of poses (N, 3), relative to that of misses out of reach, to ``out`` (N,).
 
-    ``points`` (T, 3), ``normals`` (T, 2) and ``levels`` (A, T): of tags in the order of the index.
+    ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): those of :class:`Places`. ``missed``: the table of misses.
     """
     far, tabled, reach = _far(tables, scan, tempering), tables.gain.size > 0, model.reach
     rows, base, size = (len(index.start) - 1) // index.columns, far.sum(), missed.surveyed.shape[1]
@@ -259,7 +275,12 @@ def _log_likelihood(
 def _of_tag(
     model: Antennas, scan: Scan, x: float, y: float, height: float, nx: float, ny: float, levels: Integers, w: int
 ) -> float:
-    """The log-likelihood of one tag as surveyed at (x, y) in the robot frame, above that of misses out of reach, by antennas."""
+    """The untempered log-likelihood of one tag as surveyed, relative to that of misses out of reach, from the tables of each
+    antenna.
+
+    ``x``, ``y``, ``height``, ``nx``, ``ny``: position and facing of the tag in the robot frame. ``levels`` (A,): the tables of the
+    tag. ``w``: its number among the exceptional tags, -1 if it was not read.
+    """
     packed, own = model.packed, 0.0
     for k in range(len(scan.antennas)):
         antenna = scan.antennas[k]
@@ -280,7 +301,8 @@ def _of_tag(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _far(tables: RobotTables, scan: Scan, tempering: float) -> Array:
-    """The tempered log-likelihood (W,) of each listed tag out of reach, above that of misses."""
+    """The tempered log-likelihood (W,) of the reads of each exceptional tag if the tag is out of reach, relative to that of
+    misses."""
     out = np.empty(len(scan.odds))
     for w in range(len(out)):
         own = 0.0
@@ -303,12 +325,13 @@ def _fill(
     gain: Array32,
     missed: Array32,
 ) -> None:
-    """Fill ``gain`` and ``missed`` from the tables of the antennas; ``levels`` (A, H): table of each antenna and height."""
+    """Compute ``gain`` and ``missed`` of :class:`RobotTables` from the tables of the antennas. ``levels`` (A, H): the number of the
+    table of each antenna and height."""
     layers, half = gain.shape[2], gain.shape[3] // 2
     for a in range(len(gain)):
         at, m = packed.antennas[a], packed.which[a]
         unit, reach2, is_logistic = 1.0 / packed.scale[m], packed.reach[m] ** 2, packed.kinds[m] == LOGISTIC
-        by_reach = is_logistic or layers > 1  # else all of the square of a table counts
+        by_reach = is_logistic or layers > 1  # False: the whole square of a table is in reach
         for h in range(len(heights)):
             level, edge = levels[a, h], 0.0
             if not is_logistic:

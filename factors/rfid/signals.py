@@ -1,16 +1,16 @@
 """Likelihoods of the phase and of the strength of RFID reads.
 
-**Phase** refines a pose known to decimetres to centimetres. A reader reports ``phi = offset - 4 pi d / lambda`` (mod 2 pi) for the
-distance d [m] to the tag, with an unknown offset of each antenna, tag and channel (Nikitin et al., IEEE RFID 2010, eq. 4). Many
-readers add pi at random, which twice the phase removes: ``psi = 2 phi + 8 pi d / lambda`` is constant over the R reads of a
-group (one antenna, tag and channel in a window). With a von Mises density of concentration kappa and the most likely offset, the
-negative log-likelihood of a group is
+**Phase** refines a pose that is known to decimetres to centimetres. A reader reports ``phi = offset - 4 pi d / lambda`` (mod 2 pi)
+for the distance d [m] to the tag and the wavelength lambda [m]. The offset of each antenna, tag and channel is unknown (Nikitin et
+al., IEEE RFID 2010, eq. 4). Many readers add pi at random. Twice the phase removes this ambiguity: ``psi = 2 phi + 8 pi d /
+lambda`` is constant over the R reads of a group, which is one antenna, tag and channel in a time window. With a von Mises density
+of concentration kappa and the most likely offset, the negative log-likelihood of a group needs no phase unwrapping:
 
- nll = kappa (R - |S|),  S = sum exp(i psi),
+ nll = kappa (R - |S|),  S = sum exp(i psi).
 
-without phase unwrapping. With c and s, cosine and sine of psi - arg S, its gradient is ``kappa sum s dpsi``, and its Hessian,
-neglecting the curvature of the distances, ``kappa sum c (dpsi - m)(dpsi - m)^T`` with m the mean of dpsi weighted by c. Reads with
-c < 0 are excluded from it, which makes it positive semi-definite.
+Let c and s be cosine and sine of psi - arg S, and m the mean of the gradient dpsi weighted by c. The gradient is
+``kappa sum s dpsi``. The Hessian, without the curvature of the distances, is ``kappa sum c (dpsi - m)(dpsi - m)^T``. Reads with c <
+0 are excluded from the Hessian, which makes it positive semi-definite.
 
 **Strength** follows log-distance path loss with the antenna's pattern,
 
@@ -40,7 +40,7 @@ from factors.rfid.model import Antenna
 from factors.se2 import Array, Integers
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
-CHANNEL = 1e3  # Hz; carriers closer than that are one channel
+CHANNEL = 1e3  # Hz; carrier frequencies are rounded to multiples of this to number the channels
 FEATURES = ("1", "-10 log10 d", "w", "w^2", "c", "c^2")
 NEAR = 0.1  # m; minimum distance of the path loss
 DECIBEL = 10.0 / math.log(10.0)
@@ -48,10 +48,10 @@ DECIBEL = 10.0 / math.log(10.0)
 
 @dataclass(frozen=True, eq=False)
 class TagReads:
-    """R reads, each at its own pose.
+    """R reads of tags, each at its own robot pose.
 
-    ``offsets`` (R, 3): the robot's pose at the read, in the frame of the likelihood's pose; ``antennas`` (R,) and ``tags`` (R,):
-    indices in the model and in the map.
+    ``offsets`` (R, 3): the robot's pose at each read, in the frame of a reference pose. The likelihood is a function of the
+    reference pose. ``antennas`` (R,), ``tags`` (R,): indices in the model and in the map.
     """
 
     offsets: Array
@@ -59,25 +59,25 @@ class TagReads:
     tags: Integers
 
     def moved(self, offset: Array) -> Self:
-        """The same reads relative to another pose. ``offset`` (3,): the present pose in the frame of that pose."""
+        """The reads relative to another reference pose. ``offset`` (3,): the present reference pose in the frame of the new one."""
         return replace(self, offsets=se2.compose(offset, self.offsets))
 
     def chosen(self, which: NDArray[np.bool_] | Integers) -> Self:
-        """The selected reads."""
+        """The reads that a mask (R,) or indices select."""
         return type(self)(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class RssiReads(TagReads):
-    """Strengths ``rssi`` (R,) [dBm] of reads."""
+    """Reads with signal strengths ``rssi`` (R,) [dBm]."""
 
     rssi: Array
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseReads(TagReads):
-    """Phases of reads: ``phase`` (R,) [rad] as reported, ``frequency`` (R,) [Hz] of the carrier; ``windows`` (R,): window numbers,
-    if there are several."""
+    """Reads with phases. ``phase`` (R,) [rad]: as reported. ``frequency`` (R,) [Hz]: of the carrier. ``windows`` (R,): the number
+    of each read's time window."""
 
     phase: Array
     frequency: Array
@@ -85,7 +85,7 @@ class PhaseReads(TagReads):
 
     @cached_property
     def groups(self) -> Integers:
-        """The group of each read (R,), numbered from 0."""
+        """The group number (R,) of each read, from 0. A group is one antenna, tag and channel in a time window."""
         channel = np.rint(self.frequency / CHANNEL).astype(np.int64)
         rows = np.column_stack((self.windows, self.tags, self.antennas, channel))
         return np.asarray(np.unique(rows, axis=0, return_inverse=True)[1], dtype=np.int64).reshape(-1)
@@ -106,7 +106,8 @@ class PhaseReads(TagReads):
 
 
 class _Ordered(NamedTuple):
-    """``doubled`` (R,) [rad]: twice the phase; ``wavenumber`` (R,) [rad/m]: of that; ``bounds`` (G + 1,): of the groups."""
+    """Phase reads sorted by group. ``doubled`` (R,) [rad]: twice the phase. ``wavenumber`` (R,) [rad/m]: its change per metre of
+    distance. ``bounds`` (G + 1,): the indices at which the G groups begin and end."""
 
     offsets: Array
     antennas: Integers
@@ -117,7 +118,8 @@ class _Ordered(NamedTuple):
 
 
 class PhaseProblem(NamedTuple):
-    """Phases for compiled code: ``antennas`` (A, 6), ``points`` (T, 3) of tags, and a ``weight`` of the likelihood for kappa 1."""
+    """Phase reads, map and model for compiled code. ``antennas`` (A, 6): from :func:`mounting`. ``points`` (T, 3): of the tags.
+    ``weight``: tempering times kappa."""
 
     antennas: Array
     points: Array
@@ -126,7 +128,9 @@ class PhaseProblem(NamedTuple):
 
 
 class StrengthProblem(NamedTuple):
-    """Strengths for compiled code: antennas (A, 6), points (T, 3) and normals (T, 2) of tags, and the model; then the reads."""
+    """Signal strengths, map and model for compiled code: ``antennas`` (A, 6) from :func:`mounting`, ``points`` (T, 3) and
+    ``normals`` (T, 2) of the tags, the fields of the model, and the fields of the reads. ``weight``: tempering. ``which`` (R,):
+    antennas."""
 
     antennas: Array
     points: Array
@@ -143,8 +147,9 @@ class StrengthProblem(NamedTuple):
 
 @dataclass(frozen=True)
 class PhaseModel:
-    """``antennas``: their mounting; ``kappa``: concentration of twice the phase; ``tempering``: exponent of the likelihood, for
-    correlated reads and windows; ``max_range`` [m]: limit because of reflections; ``min_reads``: minimum per group."""
+    """The model of phases. ``kappa``: concentration of the von Mises density of twice the phase. ``tempering``: exponent of the
+    likelihood, for correlated reads. ``max_range`` [m]: the likelihood ignores more distant tags, because of reflections.
+    ``min_reads``: minimum number of reads of a group."""
 
     antennas: tuple[Antenna, ...]
     kappa: float = 1.0
@@ -155,8 +160,8 @@ class PhaseModel:
 
 @dataclass(frozen=True)
 class RssiModel:
-    """``antennas``: their mounting; ``coefficients`` (6,) in the order of :data:`FEATURES`; ``sigma`` [dB] and ``dof``: of the
-    Student density; ``tempering``: exponent of the likelihood, for correlated reads."""
+    """The model of signal strengths. ``coefficients`` (6,): a0 to a5, of :data:`FEATURES`. ``sigma`` [dB], ``dof``: scale and
+    degrees of freedom of the Student density. ``tempering``: exponent of the likelihood, for correlated reads."""
 
     antennas: tuple[Antenna, ...]
     coefficients: Sequence[float]
@@ -167,7 +172,7 @@ class RssiModel:
 
 @dataclass(frozen=True, eq=False)
 class PhaseLikelihood:
-    """The likelihood of a phase model with a map of tags."""
+    """The likelihood of phases as a function of the robot's pose, for a map of tags."""
 
     model: PhaseModel
     tags: TagArray
@@ -177,9 +182,9 @@ class PhaseLikelihood:
         return mounting(self.model.antennas)
 
     def near(self, pose: Array, reads: PhaseReads) -> PhaseReads:
-        """The reads within the model's range of a pose (3,), in groups with enough of them.
+        """Select the reads of tags within ``max_range`` for a robot at ``pose`` (3,), in groups of at least ``min_reads``.
 
-        Call this once per window with the best known pose: a selection that depends on the pose makes the likelihood discontinuous.
+        Call this once per window, with the best known pose. A selection for each pose would make the likelihood discontinuous.
         """
         at = se2.compose(np.asarray(pose, dtype=float), reads.offsets)
         places = self._antennas[reads.antennas]
@@ -189,21 +194,22 @@ class PhaseLikelihood:
         return nearby.chosen(np.bincount(nearby.groups)[nearby.groups] >= self.model.min_reads)
 
     def problem(self, reads: PhaseReads) -> PhaseProblem:
-        """Model, map and reads for compiled code."""
+        """Combine model, map and ``reads`` for compiled code."""
         return PhaseProblem(self._antennas, self.tags.points, reads.ordered, self.model.tempering * self.model.kappa)
 
     def score(self, poses: Array, reads: PhaseReads) -> Score:
-        """Likelihood, gradient and information at poses (N, 3)."""
+        """The tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
         return Score.of_signals(*phase_scores(self.problem(reads), _rows(poses), True))
 
     def log_likelihood(self, poses: Array, reads: PhaseReads) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), for particles."""
+        """The tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
         return -phase_scores(self.problem(reads), _rows(poses), False)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of a strength model with a map of tags, relative to that of zero residuals."""
+    """The likelihood of signal strengths as a function of the robot's pose, for a map of tags. It is relative to that of zero
+    residuals."""
 
     model: RssiModel
     tags: TagArray
@@ -215,15 +221,15 @@ class RssiLikelihood:
         return *arrays, float(m.sigma), float(m.dof), float(m.tempering)
 
     def problem(self, reads: RssiReads) -> StrengthProblem:
-        """Model, map and reads for compiled code."""
+        """Combine model, map and ``reads`` for compiled code."""
         return StrengthProblem(*self._arrays, reads.offsets, reads.antennas, reads.tags, reads.rssi)
 
     def score(self, poses: Array, reads: RssiReads) -> Score:
-        """Likelihood, gradient and information at poses (N, 3)."""
+        """The tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
         return Score.of_signals(*strength_scores(self.problem(reads), _rows(poses), True))
 
     def log_likelihood(self, poses: Array, reads: RssiReads) -> Array:
-        """Tempered log-likelihood (N,) at poses (N, 3), for particles."""
+        """The tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
         return -strength_scores(self.problem(reads), _rows(poses), False)[0]
 
 
@@ -233,7 +239,7 @@ def _rows(poses: Array) -> Array:
 
 
 def mounting(antennas: Sequence[Antenna]) -> Array:
-    """Position and boresight (A, 6) of antennas in the robot frame."""
+    """The positions and boresights (A, 6) of antennas in the robot frame: x, y, z and a unit vector."""
     rows = [
         (a.x, a.y, a.z, math.cos(a.yaw) * math.cos(a.pitch), math.sin(a.yaw) * math.cos(a.pitch), math.sin(a.pitch))
         for a in antennas
@@ -242,22 +248,22 @@ def mounting(antennas: Sequence[Antenna]) -> Array:
 
 
 def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: RssiReads) -> Array:
-    """The :data:`FEATURES` (R, 6) of reads at a pose (3,)."""
+    """The :data:`FEATURES` (R, 6) of each read for a robot at ``pose`` (3,), to fit the coefficients."""
     pose, rows = np.asarray(pose, dtype=float), mounting(antennas)
     return _all_features(rows, tags.points, tags.normals, pose, reads.offsets, reads.antennas, reads.tags)
 
 
 @compiled(inline="always")
 def _on_robot(offset: Array, x: float, y: float) -> tuple[float, float]:
-    """A position in the robot frame, in the frame of the likelihood's pose."""
+    """Transform a position (x, y) from the robot frame at a read to the frame of the reference pose."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * x - s * y, offset[1] + s * x + c * y
 
 
 @compiled
 def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """Tempered negative log-likelihood (N,) of reads at poses (N, 3); gradient (N, 3) and information (N, 3, 3), which are empty
-    without ``derivatives``."""
+    """The tempered negative log-likelihood (N,) of phases at poses (N, 3), its gradient (N, 3) and its information (N, 3, 3). The
+    last two are empty if ``derivatives`` is False."""
     antennas, points, reads, factor = problem
     count, each = len(poses) if derivatives else 0, len(reads.doubled)
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -293,7 +299,7 @@ def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tupl
 
 @compiled
 def _add_group(psi: Array, by: Array, offset: float, gradient: Array, information: Array) -> None:
-    """Add gradient (3,) and information (3, 3) of a group with its most likely ``offset``, for kappa 1."""
+    """Add the ``gradient`` (3,) and ``information`` (3, 3) of one group, for kappa 1. ``offset``: arg S of the module's formula."""
     total, mean = 0.0, np.zeros(3)
     for r in range(len(psi)):
         sine, weight = math.sin(psi[r] - offset), max(math.cos(psi[r] - offset), 0.0)
@@ -312,7 +318,7 @@ def _add_group(psi: Array, by: Array, offset: float, gradient: Array, informatio
 
 @compiled(inline="always")
 def _mounted(antenna: Array, offset: Array) -> tuple[float, float, float, float]:
-    """An antenna's x, y and the horizontal part of its boresight, in the frame of the likelihood's pose."""
+    """An antenna's x, y and the horizontal part (x, y) of its boresight, in the frame of the reference pose."""
     x, y = _on_robot(offset, antenna[0], antenna[1])
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return x, y, c * antenna[3] - s * antenna[4], s * antenna[3] + c * antenna[4]
@@ -322,8 +328,9 @@ def _mounted(antenna: Array, offset: Array) -> tuple[float, float, float, float]
 def _features(
     at: tuple[float, float, float, float], height: float, up: float, ex: float, ey: float, nx: float, ny: float
 ) -> tuple[float, float, float, float, float]:
-    """Vector (3,) and distance from an antenna to a tag that lies at (ex, ey) in the frame of the pose, with normal (nx, ny), and
-    the w and c of :data:`FEATURES`. ``height``: of the tag above the antenna; ``up``: vertical part of the boresight."""
+    """The vector (x, y) from an antenna to a tag, their distance d, and w and c of :data:`FEATURES`. ``at``: from :func:`_mounted`.
+    ``height``: of the tag above the antenna. ``up``: vertical part of the boresight. (``ex``, ``ey``), (``nx``, ``ny``): position
+    and facing of the tag in the frame of the reference pose."""
     ex, ey = ex - at[0], ey - at[1]
     d = math.sqrt(ex * ex + ey * ey + height * height + NEAR * NEAR)
     return ex, ey, d, 1.0 - (ex * at[2] + ey * at[3] + height * up) / d, -(nx * ex + ny * ey) / d
@@ -333,6 +340,7 @@ def _features(
 def _all_features(
     antennas: Array, points: Array, normals: Array, pose: Array, offsets: Array, which: Integers, tags: Integers
 ) -> Array:
+    """Compute :func:`features`."""
     out, c0, s0 = np.empty((len(tags), 6)), math.cos(pose[2]), math.sin(pose[2])
     for r in range(len(tags)):
         antenna, point, normal = antennas[which[r]], points[tags[r]], normals[tags[r]]
@@ -353,8 +361,8 @@ def _all_features(
 
 @compiled
 def strength_scores(problem: StrengthProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """Tempered negative log-likelihood (N,) of strengths at poses (N, 3); gradient (N, 3) and information (N, 3, 3), which are
-    empty without ``derivatives``."""
+    """The tempered negative log-likelihood (N,) of signal strengths at poses (N, 3), its gradient (N, 3) and its information
+    (N, 3, 3). The last two are empty if ``derivatives`` is False."""
     antennas, points, normals, b, sigma, dof, factor, offsets, which, tags, rssi = problem
     count = len(poses) if derivatives else 0
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -375,7 +383,7 @@ def strength_scores(problem: StrengthProblem, poses: Array, derivatives: bool) -
             if not derivatives:
                 continue
             for i in range(3):
-                # x, y: the antenna moves, the tag does not; heading: vector and normal rotate backwards
+                # x, y: a motion of the antenna changes the vector by the opposite; heading: vector and facing rotate backwards
                 dx, dy, dnx, dny = -1.0 if i == 0 else 0.0, -1.0 if i == 1 else 0.0, 0.0, 0.0
                 if i == 2:
                     dx, dy, dnx, dny = ey + at[1], -ex - at[0], ny, -nx

@@ -1,7 +1,7 @@
-"""Detection models by place, in tables: for many poses without derivatives, as particles.
+"""Tables of detection models, to evaluate many poses (particles) without derivatives.
 
-A table holds the field of an antenna model at one height of tags, in cells of :data:`CELL`, and with facings if the model uses
-them.
+A table has the logits of one detection model in the horizontal plane of the antenna's frame, for tags of one height. Its cells have
+the size :data:`CELL`. It has several layers if the model depends on the facing of tags.
 """
 
 import math
@@ -31,21 +31,26 @@ Measured = tuple[Array, Integers, Integers]  # offsets, antennas and rounds of r
 Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T) and hits (K, T)
 
 CELL = 0.05  # m
-COARSE = 8  # cells along each side of a block
-FACINGS = 9  # knots of the facing's cosine
-NEGLIGIBLE = 15.0  # log of the ratio of two likelihoods above which the smaller one is neglected
-NO_MATTER = 1e-3  # of a log-likelihood: a smaller difference from a miss out of reach is neglected
-SCATTERED = 2.0  # m: tags that may be anywhere in so wide a circle are evaluated pose by pose
-STEP, LEVEL = 0.01, 0.04  # of the logit, in the tables; m of height within which tags share a table
+COARSE = 8  # number of cells along each side of a block, for which the largest value is stored
+FACINGS = 9  # number of layers, for evenly spaced cosines of the facing from -1 to 1
+NEGLIGIBLE = 15.0  # logarithm of the ratio of two likelihoods above which the smaller one is neglected
+NO_MATTER = 1e-3  # smaller differences of a log-likelihood from that of a tag out of reach are neglected
+SCATTERED = 2.0  # m; if a tag's position relative to an antenna differs by more among particles, blocks are not used to exclude it
+STEP, LEVEL = 0.01, 0.04  # resolution of logits in the tables, and the height [m] within which tags have one table
 _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
 
 
 class Tables(NamedTuple):
-    """``rows``: places in ``sigmoids`` of all tables, each (F, NX, NX), and ``chances``: the sigmoids there; ``start`` (L,): first
-    index of each table; ``half`` (L,): knots from its middle to its edge; ``facings`` (L,); ``level`` (A, T): table of each
-    antenna and tag; ``sigmoids`` (Z,): of logits :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its negative. ``most``: the
-    largest chance, of all facings, in each block of :data:`COARSE` by :data:`COARSE` cells, of all tables; ``first`` (L,): where
-    those of each begin."""
+    """L tables of detection models, stored one after the other. Table l is an array (F, NX, NX) of facings and cells.
+
+    ``sigmoids`` (Z,): the sigmoids of logits that are :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its negative.
+    ``rows``: the elements of all tables, as indices into ``sigmoids``. ``chances``: the sigmoids of these.
+    ``start`` (L,): the index of the first element of each table.
+    ``half`` (L,): the number of cells from the middle of a table to its edge. ``facings`` (L,): F of each table.
+    ``level`` (A, T): the number of the table of each antenna and tag.
+    ``most``: for each block of :data:`COARSE` by :data:`COARSE` cells, the largest of ``chances`` over all facings.
+    ``first`` (L,): the index of the first block of each table in ``most``.
+    """
 
     rows: NDArray[np.uint16]
     chances: Array32
@@ -59,14 +64,15 @@ class Tables(NamedTuple):
 
 
 def logs_of(packed: Packed) -> Array32:
-    """Log q and log(1 - q), (M, Z, 2), of adjusted models at the logits of :class:`Tables`."""
+    """The logarithms (M, Z, 2) of read probability and miss probability, of M adjusted models at the logits of :class:`Tables`."""
     q = packed.false_read + packed.span * packed.rate[:, None] / (1.0 + np.exp(-_LOGITS))
     q = np.clip(q, 1e-12, 1.0 - 1e-12)
     return np.asarray(np.log(np.stack((q, 1.0 - q), axis=-1)), dtype=np.float32)
 
 
 def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
-    """One table for each model, pitch and height difference, for tags at ``heights`` (T,) [m]."""
+    """Compute the tables of a model for tags at ``heights`` (T,) [m]: one for each detection model, pitch of the antenna, and
+    height of tags above the antenna. ``packed``: the model for compiled code. Logistic models need no table."""
     sigmoids = 1.0 / (1.0 + np.exp(-_LOGITS))
     numbers: dict[tuple[int, float, int], int] = {}
     level = np.zeros((len(model.antennas), len(heights)), dtype=np.int64)
@@ -114,7 +120,7 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
 
 
 def _blocks(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """The largest row, of all facings, in each block of a table (F, NX, NX)."""
+    """The largest element, over all facings, in each block of a table (F, NX, NX)."""
     begins = np.arange(0, table.shape[1], COARSE)
     highest = np.maximum.reduceat(table.max(axis=0), begins, axis=0)
     return np.asarray(np.maximum.reduceat(highest, begins, axis=1))
@@ -122,12 +128,13 @@ def _blocks(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
 
 @compiled
 def logit_row(z: float) -> int:
-    """Place of a logit in the sigmoids."""
+    """The index of a logit in ``sigmoids`` of :class:`Tables`."""
     return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
 
 
 def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
-    """The logits (H, F, NX, NX) of a grid at the heights of its knots, with the facings and in the cells of tables (F, NX, NX)."""
+    """Interpolate a grid model at the facings and cells of tables with ``shape`` (F, NX, NX). Returns logits (H, F, NX, NX) at the
+    H heights of the grid."""
     heights, facings, nx, ny, first = packed.shapes[model].tolist()
     x0, y0, cell = packed.parameters[model, :3]
     grid = packed.knots[first : first + heights * facings * nx * ny].reshape(heights, facings, nx, ny)
@@ -138,7 +145,8 @@ def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
 
 
 def _fill_level(planes: Array, packed: Packed, model: int, height: float, table: NDArray[np.uint16]) -> None:
-    """As :func:`_fill` if the antenna has no pitch: all cells lie in the planes of a grid."""
+    """Compute a ``table`` of a grid model for an antenna without pitch, like :func:`_fill` but faster. ``planes``: the result of
+    :func:`_planes`. ``height`` [m]: the tags' height above the antenna."""
     z0, step = packed.parameters[model, 3:5]
     levels, weights = knots.linear(np.array(((height - z0) / step,)), len(planes))
     z = sum(weight * planes[level] for level, weight in zip(levels[0], weights[0], strict=True) if weight > 0.0)
@@ -151,6 +159,7 @@ def _fill_level(planes: Array, packed: Packed, model: int, height: float, table:
 
 @compiled
 def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray[np.uint16]) -> None:
+    """Compute a ``table`` of any model, for tags at ``height`` [m] above the antenna."""
     facings = len(table)
     for f in range(facings):
         c = 2.0 * f / (facings - 1) - 1.0 if facings > 1 else 0.0
@@ -164,8 +173,11 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
 def row_of(
     packed: Packed, tables: Tables, antenna: int, level: int, along: float, across: float, height: float, facing: float
 ) -> int:
-    """The place in the sigmoids of a tag in reach, which lies along and across an antenna's heading, in units of the scale of its
-    model's range, with its height and facing."""
+    """The index in ``sigmoids`` of the logit of a tag in reach of an antenna.
+
+    ``level``: the number of the table. ``along``, ``across``: the tag's position relative to the antenna's heading, divided by the
+    range scale of the model. ``height``: that of the tag above the floor. ``facing``: the cosine of the tag's facing.
+    """
     m = packed.which[antenna]
     if packed.kinds[m] == LOGISTIC:
         above = height - packed.antennas[antenna, 2]
@@ -198,11 +210,13 @@ def relevant(
     near: NDArray[np.bool_],
     tempering: float,
 ) -> NDArray[np.bool_]:
-    """The measurements of tags (K, T) that matter to some of the poses (N, 3) with ``parameters`` (N or 1, Q). The yaw
-    of antennas in ``packed`` is that of the first row.
+    """A mask (K, T) of measurements and tags that change the likelihood of any particle noticeably.
 
-    These are measurements of tags that are ``near`` (T,), and were read or, by the blocks of the tables, could have been. In a
-    dense map most others do not matter.
+    ``poses`` (N, 3), ``parameters`` (N or 1, Q): of the particles. ``packed``: models adjusted to the first row of ``parameters``.
+    ``near`` (T,): a mask of tags in reach.
+
+    The mask is True for near tags that were read, and for near tags that have a relevant read probability according to the blocks
+    of the tables. In a dense map most tags have none, which saves time.
     """
     offsets, antennas, rounds = measured
     points, _, levels, hits = tags
@@ -236,7 +250,8 @@ def relevant(
 
 @compiled
 def _largest(tables: Tables, level: int, along: float, across: float, radius: float) -> float:
-    """An upper bound of the chances of a table in a circle; beyond the edge they are those at the edge."""
+    """An upper bound of the sigmoids of a table within ``radius`` [m] of a position. Beyond its edge a table continues with the
+    values at the edge."""
     half, largest = tables.half[level], 0.0
     last, reach = 2 * half, radius / CELL + 1.0
     i, j, count = along / CELL + half, across / CELL + half, 2 * half // COARSE + 1
@@ -248,4 +263,5 @@ def _largest(tables: Tables, level: int, along: float, across: float, radius: fl
 
 @compiled(inline="always")
 def _block(place: float, last: int) -> int:
+    """The number of the block of a cell, which is clipped to the range from 0 to ``last``."""
     return int(min(max(place, 0.0), last)) // COARSE

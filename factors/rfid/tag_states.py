@@ -1,22 +1,25 @@
-"""Filtering of the state of each tag of a map: as surveyed, weak, moved or dead.
+"""Filters that estimate the state of each tag of a map: as surveyed, weak, moved or dead.
 
-A tag is *as surveyed*: where the map has it, with the strength of its antenna's model; *weak*: there, but read much less, as on
-metal (:data:`WEAKNESSES`); *moved*: at one of the places around there (:func:`displacements`); or *dead*: broken, hidden or gone,
-and never read. Given the robot's poses, the states of tags are independent. So each tag has a filter of its own, whose prediction
-is trivial, because states last. A scan informs the pose by the tags as surveyed only.
+- *as surveyed*: the tag is where the map has it, and is read as the detection model predicts;
+- *weak*: the tag is where the map has it, but is read much less, for example on metal (:data:`WEAKNESSES`);
+- *moved*: the tag is at one of several displacements from its position in the map (:func:`displacements`);
+- *dead*: the tag is broken, hidden or gone, and is never read.
 
-With prior odds ``exp(odds)`` of not as surveyed against as surveyed, and E the negative log-likelihood of a tag's reads and misses
-if it is as surveyed, relative to a silence out of range, a tag's likelihood of a pose is the mixture
+Given the robot's poses, the states of tags are independent. So each tag has its own filter. The filter has no prediction step,
+because states do not change. Only tags as surveyed inform the robot's pose.
 
- log p = log(exp(-E) + exp(odds + elsewhere)) - log(1 + exp(odds)),
+Let ``exp(odds)`` be the prior odds that a tag is not as surveyed. Let E be the negative log-likelihood of its reads and misses if
+it is as surveyed, relative to that of misses out of range. Then the tag's likelihood of a pose is the mixture
 
-where ``elsewhere`` is the log-likelihood of the same reads and misses if the tag is not as surveyed: the mean over these states,
-weighted by their probabilities before the scan, at the predicted pose. It does not depend on the pose, so that the cost
-of a tag is bounded. E and the evidence on the state have the same tempering. The odds in a likelihood precede its scan, so that
-no scan is used twice.
+ log p = log(exp(-E) + exp(odds + elsewhere)) - log(1 + exp(odds)).
 
-The share of moved tags is learnt as well, up to :data:`MOST_MOVED`: the more of the tags that were read have moved, the higher is
-the prior of the next one. The share has a beta prior with the mean of the rig.
+``elsewhere`` is the log-likelihood of the same reads and misses if the tag is not as surveyed. It is the mean over the states weak,
+moved and dead at the predicted pose, weighted by their probabilities before the scan. It does not depend on the pose, which bounds
+the influence of a tag. E and the evidence on the state have the same tempering. The odds are those before the scan, so that no scan
+is used twice.
+
+The fraction of moved tags is also estimated, up to :data:`MOST_MOVED`: the more of the read tags have moved, the higher is the
+prior of the rest. The fraction has a beta prior, whose mean is a setting.
 """
 
 import math
@@ -36,23 +39,24 @@ from factors.rfid.tables import Tables
 from factors.rfid.weighing import FARTHEST_RATIO, fast_exp, mark_near, place_antennas, tags_of_tables, weigh_tag
 from factors.se2 import Array, Integers
 
-KEPT = 200.0  # s of evidence that can be taken back
-BELIEVED = 0.5  # probability above which a tag is believed to be dead, weak or moved
+KEPT = 200.0  # s; evidence of this age can still be removed
+BELIEVED = 0.5  # a tag is reported as dead, weak or moved if the probability exceeds this value
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
-PITCH, FARTHEST = 0.5, 1.5  # m: of the grid of displacements, and the largest of them
-WORTH = 20.0  # tags that were read: what the prior of the share of moved ones is worth
-# largest learnt share: beyond it a wrong pose or model is likelier than so many moved tags
+PITCH, FARTHEST = 0.5, 1.5  # m: spacing of the grid of displacements, and the largest displacement
+WORTH = 20.0  # the weight of the prior of the fraction of moved tags, as a number of tags that were read
+# The largest estimate of the fraction of moved tags. If more tags seem to have moved, a wrong pose or model is more likely.
 MOST_MOVED = 0.15
-# weak tags: changes of the logarithm of the range and of the logit of the read rate, as of the parameters of a detection model
-# (:mod:`factors.rfid.parameters`), and their shares
+# The kinds of weak tags. Each row has the changes of the parameters a and b of a detection model (factors.rfid.parameters), which
+# are the logarithm of the range and the logit of the read rate, and the fraction of weak tags of this kind.
 WEAKNESSES = np.array(((0.0, -2.4, 0.5), (0.0, -3.7, 0.1), (-0.5, 0.0, 0.2), (-0.5, -1.0, 0.2)))
-# columns of the weights: as surveyed, then dead, weak, and moved to each place
+# The columns of the weights are the states: as surveyed, dead, each kind of weak, and moved by each displacement. These are the
+# first columns of the last three.
 DEAD, WEAK, MOVED = 1, 2, 2 + len(WEAKNESSES)
 COLUMNS = {"dead": slice(DEAD, WEAK), "weak": slice(WEAK, MOVED), "moved": slice(MOVED, None)}
 
 
 def displacements() -> Array:
-    """The displacements (K, 2) [m] of moved tags: a grid in a disc, without its centre."""
+    """The possible displacements (K, 2) [m] of moved tags: a grid in a disc, without the centre."""
     steps = np.arange(-FARTHEST, FARTHEST + 0.5 * PITCH, PITCH)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     distance = np.hypot(*grid.T)
@@ -60,19 +64,25 @@ def displacements() -> Array:
 
 
 def hypotheses() -> Array:
-    """The states (S, 4) of a tag that may be read, displacement [m] and change of strength: as surveyed, then weak, then moved."""
+    """The S states of a tag that is not dead: as surveyed, each kind of weak, each displacement. A row (4,) has the displacement
+    (2) [m], and the changes of the parameters a and b of the detection model (:mod:`factors.rfid.parameters`)."""
     weak, moves = WEAKNESSES[:, :2], displacements()
     still, usual = np.zeros_like(weak), np.zeros_like(moves)
     return np.concatenate((np.zeros((1, 4)), np.hstack((still, weak)), np.hstack((moves, usual))))
 
 
 def _log(probability: float) -> float:
+    """The logarithm of a probability, ``-inf`` for zero."""
     return math.log(probability) if probability > 0.0 else -math.inf
 
 
 class TagStates:
-    """The states of T tags. ``dead``, ``weak`` and ``moved``: prior probabilities, together below 1, that a tag is so; ``prior``:
-    the log-odds of all three against as surveyed."""
+    """The filters of the states of T tags.
+
+    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, together below 1.
+    Attributes: ``odds`` (T,), the log-odds that each tag is not as surveyed; ``prior``, these odds of a tag without evidence;
+    ``hypotheses`` (S, 4), the result of :func:`hypotheses`; ``last_read`` [s], the time of the last read.
+    """
 
     def __init__(self, count: int, dead: float, weak: float, moved: float) -> None:
         self.hypotheses = hypotheses()
@@ -80,25 +90,26 @@ class TagStates:
         usual = 1.0 - dead - weak - moved
         shares = (usual, dead, *(weak * WEAKNESSES[:, 2]), *np.full(places, moved / places))
         prior = np.array([_log(share) for share in shares])
-        self._weights = np.tile(prior, (count, 1))  # logarithms, not normalised
+        self._weights = np.tile(prior, (count, 1))  # log-probabilities of the states of each tag, not normalised
         self._prior, self._moved, self._raised = prior, moved, 0.0
         self.prior = _odds(prior)
         self.odds: Array = np.full(count, self.prior)  # log-odds (T,) of not as surveyed against as surveyed
-        self._doubtful: Integers | None = None  # not known
-        # time, tags, and the log-likelihoods of their states
+        self._doubtful: Integers | None = None  # the cached result of `doubtful`, None if it must be computed
+        # the evidence of the last seconds: time, tags, and the log-likelihoods of their states
         self._evidence: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
-        self.last_read = -math.inf  # time [s]
+        self.last_read = -math.inf  # s; time of the last read of any tag
 
     @property
     def doubtful(self) -> Integers:
-        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`, ascending."""
+        """The indices of tags, ascending, that are not as surveyed with a probability above :data:`BELIEVED`."""
         if self._doubtful is None:
             self._doubtful = np.flatnonzero(self.odds > LIMIT)
         return self._doubtful
 
     @property
     def suspects(self) -> dict[str, dict[int, float]]:
-        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`, by state, with that probability."""
+        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`. For each of the three states, a
+        dictionary from the index of a tag to the probability."""
         doubtful, suspects = self.doubtful, dict[str, dict[int, float]]()
         weights = self._weights[doubtful]
         shares = np.exp(weights - weights.max(axis=1, keepdims=True))
@@ -110,11 +121,11 @@ class TagStates:
         return suspects
 
     def were_read(self, tags: Integers) -> NDArray[np.bool_]:
-        """Which of ``tags`` (U,) were read, and are not dead therefore."""
+        """A mask (U,) of the ``tags`` (U,) that have been read at any time, and are therefore not dead."""
         return np.asarray(self._weights[tags, DEAD] == -np.inf)
 
     def hear(self, t: float, tags: Integers) -> None:
-        """Tags (R,) were read at ``t``: they are not dead."""
+        """Report that ``tags`` (R,) were read at time ``t`` [s]. They are not dead."""
         if len(tags):
             if _hear(self._weights, self.odds, tags):
                 self._doubtful = None
@@ -122,12 +133,15 @@ class TagStates:
             self.last_read = max(self.last_read, t)
 
     def expect(self, tags: Integers, evidence: Array) -> Array:
-        """The log-likelihood (U,) of a scan's reads and misses of U ``tags`` that are not as surveyed. ``evidence`` (U, S): the
-        log-likelihoods for each of the ``hypotheses``, relative to a silence out of range."""
+        """The log-likelihood (U,) of a scan's reads and misses of ``tags`` (U,) if these are not as surveyed (``elsewhere``).
+
+        ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative to that of
+        misses out of range.
+        """
         return _expected(self._weights, tags, evidence)
 
     def learn(self, t: float, tags: Integers, evidence: Array) -> None:
-        """Add the log-likelihoods ``evidence`` (U, S) of U ``tags`` at ``t``, see :meth:`expect`."""
+        """Update the filters of ``tags`` (U,) by the ``evidence`` (U, S) of a scan at time ``t`` [s]. See :meth:`expect`."""
         if len(tags):
             self._evidence.append((t, tags, evidence.astype(np.float32)))
             self._add(tags, self._evidence[-1][2], 1.0)
@@ -135,8 +149,8 @@ class TagStates:
             self._evidence.popleft()
 
     def forget(self, since: float) -> None:
-        """Take back what was learnt since ``since``, at most :data:`KEPT` seconds: the robot was elsewhere, or it will be processed
-        again. That a tag was read is kept."""
+        """Remove the evidence since the time ``since`` [s], of at most the last :data:`KEPT` seconds. This is necessary if the
+        robot was at another pose then, or if the scans will be processed again. Tags that were read remain known as not dead."""
         kept: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         for row in self._evidence:
             if row[0] < since:
@@ -146,12 +160,13 @@ class TagStates:
         self._evidence = kept
 
     def _add(self, tags: Integers, evidence: NDArray[np.float32], sign: float) -> None:
+        """Add (``sign`` 1) or remove (``sign`` -1) the evidence of a scan."""
         if _learn(self._weights, self.odds, tags, evidence, sign):
             self._doubtful = None
         self._raise_prior()
 
     def _raise_prior(self) -> None:
-        """Raise the prior of moved tags to their share, at most :data:`MOST_MOVED`, among the tags that were read."""
+        """Raise the prior of moved tags to their estimated fraction among the tags that were read, at most :data:`MOST_MOVED`."""
         raised = _raised(self._weights, self.odds, self._moved, self._raised)
         if raised != self._raised:
             self._weights[:, MOVED:] += raised - self._raised
@@ -163,10 +178,11 @@ class TagStates:
 
 @compiled
 def sigma_poses(pose: Array, covariance: Array, width: float) -> Array:
-    """The poses (6, 3) that lie ``width`` times a column of the root of ``covariance`` (3, 3) before and behind ``pose`` (3,)."""
+    """Sigma points (6, 3) of a Gaussian of poses: ``pose`` (3,) moved by plus and minus ``width`` times each column of the lower
+    root of the body-frame ``covariance`` (3, 3)."""
     out = np.empty((6, 3))
     root, exists = cholesky(covariance)
-    if not exists:  # by rounding: correlations are ignored
+    if not exists:  # because of rounding; correlations are then ignored
         root = np.diag(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(6):
@@ -190,7 +206,7 @@ def displaced(
     tempering: float,
     parameters: Array,
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-    """See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
+    """The compiled part of :meth:`factors.rfid.detection.RfidLikelihood.displaced`, with the same results."""
     placed = adjusted(packed, parameters)
     measured = delayed(counts[0], counts[8], placed.delay), counts[1], counts[2]
     reach = margin + reach_of(placed, measured[0])
@@ -207,7 +223,7 @@ def displaced(
     out = np.empty((len(chosen), len(hypotheses)))
     each = len(poses)
     size = len(hypotheses) * each
-    # reads of a tag that was moved are those of the map's tag from poses that were moved the other way
+    # a tag displaced by d is read from a pose like the tag of the map from the pose displaced by -d
     moved, changed = np.empty((size, 3)), np.empty((size, len(parameters)))
     for i in range(size):
         state, pose = hypotheses[i // each], poses[i % each]
@@ -255,12 +271,13 @@ def _log_sum(weights: Array, evidence: Array) -> float:
 
 @compiled
 def _odds(weights: Array) -> float:
-    """The log-odds of not as surveyed against as surveyed."""
+    """The log-odds that a tag is not as surveyed. ``weights``: the log-probabilities of its states."""
     return float(_log_sum(weights[DEAD:], np.zeros(len(weights) - DEAD)) - weights[0])
 
 
 @compiled
 def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
+    """Compute :meth:`TagStates.expect`."""
     out, added = np.empty(len(tags)), np.zeros(weights.shape[1] - DEAD)
     for u in range(len(tags)):
         unsurveyed = weights[tags[u], DEAD:]
@@ -273,7 +290,7 @@ def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
 
 @compiled
 def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
-    """Take ``tags`` to be not dead. Returns whether another set of tags is doubtful."""
+    """Exclude the state dead for ``tags``. Returns True if this changes which tags are doubtful."""
     changed = False
     for t in tags:
         if weights[t, DEAD] > -np.inf:
@@ -285,7 +302,8 @@ def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
 
 @compiled
 def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.float32], sign: float) -> bool:
-    """Add log-likelihoods. Returns whether another set of tags is doubtful."""
+    """Add ``sign`` times the log-likelihoods ``evidence`` to the weights of ``tags``. Returns True if this changes which tags are
+    doubtful."""
     changed = False
     for u in range(len(tags)):
         of_tag, old_odds = weights[tags[u]], odds[tags[u]]
@@ -298,22 +316,25 @@ def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.flo
 
 @compiled
 def _all_odds(weights: Array) -> Array:
+    """:func:`_odds` of all tags."""
     return np.array([_odds(of_tag) for of_tag in weights])
 
 
 @compiled
 def _raised(weights: Array, odds: Array, moved: float, raised: float) -> float:
-    """The increase of the log prior of moved tags, from the share of moved tags among those that were read.
+    """The increase of the log prior of moved tags, from the fraction of moved tags among those that were read.
 
-    More tags are believed to have moved with a higher prior. The result is the lowest prior that explains itself, which depends on
-    the evidence only, not on its order. ``weights`` (T, W) and ``odds`` (T,) are those with a prior that has risen by ``raised``.
+    ``weights`` (T, W), ``odds`` (T,): of all tags, with a prior that is already increased by ``raised``. ``moved``: the prior
+    probability before any increase.
+
+    A higher prior makes more tags count as moved, which makes the prior higher. The result is the smallest fixed point of this
+    iteration. It depends on the evidence only, not on the order of its arrival.
     """
     if moved == 0.0:
         return 0.0
     most, read = max(MOST_MOVED, moved), 0
-    unraised = np.empty(
-        len(odds)
-    )  # log-odds of moved, without the rise, of those tags that could be believed to have moved
+    # the log-odds of moved, without the increase, of the tags that could count as moved
+    unraised = np.empty(len(odds))
     candidates = 0
     for t in range(len(odds)):
         if weights[t, DEAD] > -np.inf:

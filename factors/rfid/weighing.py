@@ -1,8 +1,8 @@
-"""Likelihoods of reads and misses for many poses that are near each other, as particles, from tables.
+"""Likelihoods of reads and misses for many poses that are near each other, such as particles, from tables.
 
-The logarithm is taken once per tag, of the product over the measurements of all antennas. The inner loops run over
-poses, which access nearby cells of a table for one tag, and use vector registers: also for logarithms and exponentials, which the
-library computes one by one.
+Three measures make this fast. The probabilities of all measurements of a tag are multiplied before one logarithm is taken. The
+inner loops run over poses, which access nearby cells of a table for one tag. These loops use vector instructions, also for
+logarithms and exponentials, for which a library would be called pose by pose.
 """
 
 import math
@@ -18,14 +18,14 @@ from factors.rfid.parameters import MOST_CERTAIN, adjusted
 from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, relevant, row_of
 from factors.se2 import Array, Integers
 
-BLOCK = 512  # poses at a time, so that what is needed of them stays in the cache
-FARTHEST_RATIO = 20.0  # log of the ratio of two likelihoods above which the smaller one is neglected
-LEAST = 1e-12  # probability of a read, and of a miss
-PRODUCT = 20  # factors of at least LEAST: their product does not underflow
-SHIFT = 0.05  # rounding of the logit of a model's peak, as in tables of places
-MIXED = 500  # factors up to two: their product does not overflow
+BLOCK = 512  # number of poses that are evaluated together, so that their data stay in the processor's cache
+FARTHEST_RATIO = 20.0  # logarithm of the ratio of two likelihoods above which the smaller one is neglected
+LEAST = 1e-12  # minimum probability of a read, and of a miss
+PRODUCT = 20  # this many factors of at least LEAST have a product that does not underflow
+SHIFT = 0.05  # shifts of the logit of a model's peak are rounded to multiples of this
+MIXED = 500  # this many factors of at most two have a product that does not overflow
 
-_MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a number, and of 0.5
+_MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a float: mask of the mantissa, and the number 0.5
 
 
 @compiled(error_model="numpy", fastmath=FAST)
@@ -38,7 +38,11 @@ def log_likelihood(
     tempering: float,
     parameters: Array,
 ) -> Array:
-    """The tempered log-likelihood (N,) of what was ``counts`` of a map's tags, for poses (N, 3) with ``parameters`` (N or 1, Q)."""
+    """The tempered log-likelihood (N,) of read ``counts`` at poses (N, 3).
+
+    ``packed``: models before adjustment. ``of_map``: the map's tags. ``parameters`` (N or 1, Q): the parameters of each pose
+    (:mod:`factors.rfid.parameters`), or of all poses.
+    """
     first_row = adjusted(packed, parameters[0])
     measured = delayed(counts[0], counts[8], first_row.delay), counts[1], counts[2]
     widest = parameters[0].copy()
@@ -57,7 +61,7 @@ def log_likelihood(
     none = packed.false_read + packed.span / (1.0 + math.exp(-NEGLIGIBLE_LOGIT))
     for t in range(len(odds)):
         hits = near.hits[:, t].sum()
-        if hits > 0 and not near_enough[t]:  # all poses are as likely
+        if hits > 0 and not near_enough[t]:  # a false read, which is equally likely at all poses
             base += mixed(tempering * hits * (math.log(none) - math.log1p(-none)), odds[t], elsewhere[t])
     out = np.full(len(poses), base)
     size = min(BLOCK, len(poses))
@@ -93,7 +97,8 @@ def log_likelihood(
 
 @compiled
 def mixed(own: float, odds: float, elsewhere: float) -> float:
-    """Log-likelihood of a tag that may be dead or moved; ``own``: that of the tag as surveyed."""
+    """The log-likelihood of a tag that may not be as surveyed. ``own``: the log-likelihood if it is as surveyed. ``odds``,
+    ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`."""
     if odds == -np.inf or elsewhere == -np.inf:
         return own
     displaced = odds + elsewhere
@@ -105,8 +110,8 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """The data of the C near tags that :func:`weigh_tag` needs: points (C, 3), normals (C, 2), the number of the table for each
-    antenna and tag (A, C), and hits (K, C)."""
+    """The data of C near tags for :func:`weigh_tag`: points (C, 3), normals (C, 2), the numbers (A, C) of the tables of each
+    antenna and tag, and the numbers of reads (K, C)."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):
@@ -116,7 +121,7 @@ def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
 
 @compiled
 def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> None:
-    """Which tags (T,) are within ``reach`` [m] of the box that holds the poses (N, 3)."""
+    """Write a mask of tags into ``out`` (T,): True if a tag is within ``reach`` [m] of the bounding box of the poses (N, 3)."""
     points = tags[0]
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
@@ -133,9 +138,13 @@ def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) ->
 def place_antennas(
     packed: Packed, poses: Array, measured: Measured, parameters: Array, placed: Array, at: Array, models: Array
 ) -> None:
-    """Fill ``at`` (K, 4, N): x, y, cosine and sine of the heading of each measurement's antenna; and ``models`` (M, 2, N): inverse
-    range scale and rate of the probabilities. Poses (N, 3) have ``parameters`` (N or 1, Q). ``placed`` (Q,): the mounting in
-    ``packed``; yaws may differ from it by half a radian at most."""
+    """Compute the antennas' poses and the models' adjustments for N robot poses.
+
+    ``poses`` (N, 3), ``parameters`` (N or 1, Q): the robot poses and the parameters of each.
+    ``placed`` (Q,): the parameters to which ``packed`` is adjusted. The yaws of antennas may differ from these by at most 0.5 rad.
+    ``at`` (K, 4, N): output, x, y, cosine and sine of the heading of each measurement's antenna in the world.
+    ``models`` (M, 2, N): output, the inverse range scale, and the rate times the span of :class:`~factors.rfid.model.Packed`.
+    """
     offsets, antennas, _ = measured
     cosine, sine, yaw = np.empty(len(poses)), np.empty(len(poses)), 2 * len(models)
     for n in range(len(poses)):
@@ -166,7 +175,7 @@ def place_antennas(
 
 @compiled
 def _silence(packed: Packed, rounds: Integers) -> float:
-    """Log-likelihood of one tag out of reach that is not read."""
+    """The log-likelihood that a tag out of reach is not read in any of ``rounds`` (K,)."""
     count = 0
     for k in range(len(rounds)):
         count += rounds[k]
@@ -188,7 +197,11 @@ def weigh_tag(
     product: Array,
     room: Array,
 ) -> None:
-    """The log-likelihood ``own`` (N,) of one tag relative to a silence out of reach, from the measurements that matter (K,)."""
+    """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of misses out of reach.
+
+    ``at``, ``models``: the results of :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of measurements to evaluate.
+    ``product`` (N,), ``room`` (N,): working memory.
+    """
     points, normals, levels, hits = tags
     _, antennas, rounds = measured
     silent, factors = -_silence(packed, rounds[matters]), 0
@@ -227,7 +240,8 @@ def _chances(
     normal: Array,
     chance: Array,
 ) -> None:
-    """The sigmoids (N,) of the model's logits of one tag from one antenna."""
+    """Write the sigmoids of the logits of one tag for one antenna at N poses into ``chance`` (N,). ``unit`` (N,): the inverse range
+    scale of each pose."""
     x, y, c, s = at[0], at[1], at[2], at[3]
     tx, ty, height, nx, ny = point[0], point[1], point[2], normal[0], normal[1]
     if packed.kinds[packed.which[antenna]] == LOGISTIC or tables.facings[level] > 1:
@@ -243,7 +257,9 @@ def _chances(
     half = tables.half[level]
     width, ends, middle = np.int32(2 * half + 1), np.int32(2 * half), half + 0.5
     table = tables.chances[tables.start[level] : tables.start[level] + (2 * half + 1) ** 2]
-    cells = np.empty(count, np.int32)  # a loop of its own, in registers, which looking up is not
+    cells = np.empty(
+        count, np.int32
+    )  # computed in a separate loop, because the compiler cannot vectorise a table look-up
     for n in range(count):
         scale = unit[n] * (1.0 / CELL)
         ex, ey = scale * (tx - x[n]), scale * (ty - y[n])
@@ -257,13 +273,14 @@ def _chances(
 
 @compiled(inline="always")
 def _floored(packed: Packed, rate: float, chance: float) -> float:
-    """Probability of a read."""
+    """The read probability with floor and limits, from the sigmoid ``chance``. ``rate``: that of ``models`` in
+    :func:`place_antennas`."""
     return float(min(max(packed.false_read + rate * chance, LEAST), 1.0 - LEAST))
 
 
 @compiled(fastmath=True)
 def _add_logs(values: Array, count: int, out: Array) -> None:
-    """Add the logarithms of positive numbers (N,) to ``out``, to 1e-10; the numbers become one."""
+    """Add the logarithms of positive ``values`` (N,) to ``out`` (N,), with an error of at most 1e-10. Sets ``values`` to 1."""
     room = np.empty(count)
     bits, mantissas = values.view(np.int64), room.view(np.int64)
     for n in range(count):
@@ -281,7 +298,7 @@ def _add_logs(values: Array, count: int, out: Array) -> None:
 
 @compiled(inline="always")
 def fast_exp(x: float) -> float:
-    """The exponential of x from -20 to 0, to 1e-8."""
+    """The exponential of x, for x from -20 to 0, with an error of at most 1e-8."""
     y = x / 64.0
     e = 1.0 + y * (
         1.0 + y / 2 * (1.0 + y / 3 * (1.0 + y / 4 * (1.0 + y / 5 * (1.0 + y / 6 * (1.0 + y / 7 * (1.0 + y / 8))))))
