@@ -1,12 +1,13 @@
-"""Maximum a posteriori estimates of the parameters that several logs share.
+"""Maximum a posteriori estimates of parameters that are equal in several logs, such as the constants of a sensor.
 
-The cost is the negative log-likelihood of all logs, plus that of Gaussian priors. All parameters take each damped Gauss-Newton step
-together. Parameters with nearly the same effect, such as two kinds of drift, may be correlated.
+The cost is the negative log-likelihood of all logs, plus that of Gaussian priors. Damped Gauss-Newton steps minimise the cost over
+all parameters together, because parameters with similar effects, such as two kinds of drift, may be correlated.
 
-Measurements are correlated within a block of time. The likelihood is weighted by their share of independent information
-(Pauli, Racugno, Ventura, "Bayesian composite marginal likelihoods", Statistica Sinica 21, 2011), and the covariance is that of the
-scores of the blocks (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986). Residuals have the
-soft-L1 loss (Charbonnier et al., "Two deterministic half-quadratic regularization algorithms for computed imaging", 1994).
+Measurements that are close in time have correlated errors. Time is therefore divided into blocks, which count as independent. The
+likelihood is multiplied by the fraction of independent information (Pauli, Racugno, Ventura, "Bayesian composite marginal
+likelihoods", Statistica Sinica 21, 2011). The covariance is computed from the scores (gradients of the log-likelihood) of the
+blocks (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986). Residuals have the soft-L1 loss
+(Charbonnier et al., "Two deterministic half-quadratic regularization algorithms for computed imaging", 1994).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,17 +20,18 @@ from factors.least_squares import minimum
 from factors.se2 import Array, Integers
 
 LOSS_SCALE = 2.0  # standard deviations at which the loss changes from quadratic to linear
-MAD_TO_SIGMA = 1.4826  # of a Gaussian
-ITERATIONS, CONVERGED, LARGEST = 30, 3e-3, 2.0  # steps in standard deviations of the prior
-STEP = 1e-4  # of numerical derivatives, in the same
-LEAST_SHARE = 1e-3
-DETERMINED = 0.7  # of the prior's standard deviation; above it the logs hardly determine a parameter
-CORRELATED = 0.8  # correlation of two parameters that is reported
+MAD_TO_SIGMA = 1.4826  # the standard deviation of a Gaussian divided by its median absolute deviation
+# maximum number of steps; smallest and largest step in sigmas of the prior
+ITERATIONS, CONVERGED, LARGEST = 30, 3e-3, 2.0
+STEP = 1e-4  # step of numerical derivatives, in standard deviations of the prior
+LEAST_SHARE = 1e-3  # minimum fraction of independent information
+DETERMINED = 0.7  # if the standard error exceeds this fraction of the prior's, the logs hardly determine the parameter
+CORRELATED = 0.8  # two parameters with a larger absolute correlation are reported
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter with a Gaussian prior, ``mean`` and ``sigma``, and bounds."""
+    """A scalar parameter with a Gaussian prior, ``mean`` and ``sigma``, and the bounds ``low`` and ``high``."""
 
     name: str
     mean: float
@@ -39,7 +41,8 @@ class Parameter:
 
 
 class LikelihoodTerms(NamedTuple):
-    """Negative log-likelihood ``cost``; its gradient in each block of time, ``scores`` (B, P), and the ``information`` (P, P)."""
+    """A likelihood at given values of P parameters. ``cost``: the negative log-likelihood. ``scores`` (B, P): its gradient in each
+    of B blocks of time. ``information`` (P, P): the Fisher information of all blocks together."""
 
     cost: float
     scores: Array
@@ -51,7 +54,9 @@ Likelihood = Callable[[Array], LikelihoodTerms]
 
 @dataclass(frozen=True)
 class Posterior:
-    """``values`` (P,) of maximal posterior density, their ``covariance`` (P, P), and the ``share`` of independent measurements."""
+    """The estimate of P parameters. ``values`` (P,): the maximum of the posterior density. ``covariance`` (P, P): that of their
+    errors.
+    ``share``: the fraction of independent information in the measurements, from 0 to 1."""
 
     parameters: tuple[Parameter, ...]
     values: Array
@@ -60,14 +65,14 @@ class Posterior:
 
     @property
     def errors(self) -> Array:
-        """Standard deviations (P,)."""
+        """The standard errors (P,) of the values."""
         return np.sqrt(np.diag(self.covariance))
 
     def as_dict(self) -> dict[str, float]:
         return {p.name: float(v) for p, v in zip(self.parameters, self.values, strict=True)}
 
     def correlations(self) -> list[tuple[str, str, float]]:
-        """The pairs of parameters with a correlation above :data:`CORRELATED`."""
+        """The pairs of parameters with an absolute correlation above :data:`CORRELATED`: two names and the correlation."""
         matrix = self.covariance / np.outer(self.errors, self.errors)
         rows, columns = np.nonzero(np.abs(np.triu(matrix, 1)) > CORRELATED)
         names = [p.name for p in self.parameters]
@@ -76,10 +81,12 @@ class Posterior:
 
 @dataclass(frozen=True)
 class FittedConstant:
-    """The result for one constant: its ``initial`` and ``fitted`` values, with its standard ``error``.
+    """The calibration result of one constant of a sensor.
 
-    ``prior``: standard deviation of its prior, None without one. ``per_log``: values of each log alone. ``uncertainty``: standard
-    deviation between logs, None if unknown.
+    ``initial``, ``fitted``: the values before and after the fit. ``error``: the standard error of the fitted value.
+    ``prior``: the standard deviation of the prior, or None if there is no prior.
+    ``per_log``: the values fitted to each log alone.
+    ``uncertainty``: the standard deviation of the constant between logs, or None if it is unknown.
     """
 
     sensor: str
@@ -93,7 +100,7 @@ class FittedConstant:
 
     @property
     def is_determined(self) -> bool:
-        """Whether the logs say much more than was known before."""
+        """True if the standard error is clearly smaller than the standard deviation of the prior, or if there is no prior."""
         return self.prior is None or self.error < DETERMINED * self.prior
 
 
@@ -103,9 +110,11 @@ def maximise(
     start: Mapping[str, float] | None = None,
     covariance: Array | None = None,
 ) -> Posterior:
-    """The maximum of the posterior density of ``parameters`` (P,), from ``start`` or the means of the priors.
+    """Estimate parameters by the maximum of their posterior density.
 
-    ``covariance`` (P, P) of the priors; without it they are independent.
+    ``parameters``: P parameters with priors. ``likelihood``: a function of their values (P,).
+    ``start``: initial values by name; the default is the mean of the prior.
+    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas of the parameters.
     """
     mean, sigma, low, high = (
         np.array([getattr(p, name) for p in parameters], dtype=float) for name in ("mean", "sigma", "low", "high")
@@ -130,10 +139,12 @@ def maximise(
 
 
 def independent_share(scores: Array, information: Array, precision: Array | float = 0.0) -> float:
-    """The weight, at most 1, at which a likelihood is as certain as its scores in B blocks of time (B, P) scatter.
+    """The fraction of independent information in correlated measurements, at most 1. A likelihood is multiplied by this fraction.
 
-    Without correlations the scores scatter as the ``information`` (P, P) says: Varin, Reid and Firth, "An overview of composite
-    likelihood methods", Statistica Sinica 21, 2011, section 2.2. ``precision``: of the prior.
+    ``scores`` (B, P): gradients of the log-likelihood in B blocks of time. ``information`` (P, P): the Fisher information of all.
+    ``precision`` (P, P): the inverse covariance of the prior. If measurements are independent, the covariance of the scores equals
+    the information. The fraction is the ratio of the two (Varin, Reid and Firth, "An overview of composite likelihood methods",
+    Statistica Sinica 21, 2011, section 2.2).
     """
     inverse = np.linalg.pinv(information + precision)
     ratio = np.trace(inverse @ information) / max(float(np.trace(inverse @ (scores.T @ scores))), 1e-12)
@@ -141,9 +152,9 @@ def independent_share(scores: Array, information: Array, precision: Array | floa
 
 
 def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Parameter], block: Integers) -> Likelihood:
-    """The likelihood of residuals ``whitened(values)`` (M, D) in standard deviations, with numerical derivatives and soft-L1 loss.
+    """Make a likelihood from a function of residuals, with numerical derivatives and the soft-L1 loss.
 
-    ``block`` (M,): the block of time of each row.
+    ``whitened(values)``: returns residuals (M, D) in standard deviations. ``block`` (M,): the number of each row's block of time.
     """
     steps = STEP * np.diag([p.sigma for p in parameters])
 
@@ -160,14 +171,16 @@ def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Param
 
 
 def by_block(scores: Array, block: Integers) -> Array:
-    """Sums (B, P) of the rows of ``scores`` (M, P) with the same ``block`` (M,)."""
+    """The sums (B, P) of the rows of ``scores`` (M, P) that have the same number in ``block`` (M,)."""
     out = np.zeros((int(block.max(initial=0)) + 1, scores.shape[1]))
     np.add.at(out, block, scores)
     return out
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """Number the blocks of ``length`` seconds of several logs consecutively, and return the block of each time."""
+    """Divide several logs into blocks of ``length`` seconds, which are numbered consecutively. ``times``: the times [s] of each
+    log.
+    Returns the block number of each time, for all logs in one array."""
     out: list[Integers] = []
     first = 0
     for t in times:
@@ -177,10 +190,11 @@ def blocks(times: Sequence[Array], length: float) -> Integers:
 
 
 def robust_sigma(values: Array) -> Array:
-    """Return the robust standard deviation (D,) about zero of the columns of ``values`` (M, D)."""
+    """The robust standard deviation (D,) about zero of the columns of ``values`` (M, D), from their median absolute value. NaN is
+    ignored."""
     return np.asarray(MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0))
 
 
 def centred(parameters: Sequence[Parameter], values: Mapping[str, float]) -> list[Parameter]:
-    """The parameters with priors about ``values``."""
+    """The parameters with ``values`` (by name) as the means of their priors."""
     return [replace(p, mean=values[p.name]) for p in parameters]

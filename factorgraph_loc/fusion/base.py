@@ -1,4 +1,4 @@
-"""The interface that all estimators share, and what they report."""
+"""The interface of all estimators."""
 
 from collections.abc import Container
 from typing import Protocol, runtime_checkable
@@ -16,47 +16,50 @@ class _Every:
         return True
 
 
-EVERY: Container[str] = _Every()  # modalities of an estimator that takes whatever sensor there is
+EVERY: Container[str] = _Every()  # the modalities of an estimator that accepts measurements of any sensor
 
 
 class Estimator(Protocol):
-    """An estimator. It is given measurements in the order of arrival and can be asked at any time.
+    """An estimator of the robot's pose. It processes measurements in the order of arrival, and returns estimates at any time.
 
-    Its class may say ``causal = False``, if its estimates are of no use before the end, and ``smoothed = False``, if its final
-    trajectory repeats the causal one.
+    A class has the attribute ``causal = False`` if its estimates are useful only after the last measurement. It has ``smoothed =
+    False`` if its final trajectory equals the estimates during the run.
 
-    Only what it is given changes it: whatever is asked, and however often, all later answers are the same to the last bit.
+    Only :meth:`initialize`, :meth:`process` and ``forget`` change an estimator. Requests for results never change later results,
+    not even their rounding errors.
     """
 
     diagnostics: Diagnostics
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian; before that every estimate is ``unlocalized``. Odometry of before the start may come earlier or
-        later than this, but not after the first measurement of another kind.
+        """Start from a Gaussian prior of the pose. Before this call every estimate is ``unlocalized``.
 
-        A prior without a heading needs an estimator for which :func:`finds_heading` is true. No estimate is ``localized``
-        before the observations determine the heading.
+        Odometry from before the start may arrive before or after this call, but not after the first measurement of another sensor.
+        A prior without a heading is allowed if :func:`finds_heading` is true for the estimator. Then no estimate is ``localized``
+        before the measurements determine the heading.
         """
 
     def process(self, measurement: Measurement) -> None:
-        """Take one measurement; one that is late by more than ``max_delay`` is counted and dropped."""
+        """Process one measurement. A measurement that is late by more than the setting ``max_delay`` is counted and ignored."""
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the newest time seen, from the measurements so far, or at ``t`` if that is later, as the odometry leads."""
+        """The pose at the time of the newest measurement, from all measurements so far. If ``t`` [s] is later, the pose is
+        predicted to ``t`` by odometry."""
 
     def belief(self, t: float | None = None) -> Belief:
-        """The whole belief behind :meth:`estimate`."""
+        """The whole probability distribution of the pose, at the time of :meth:`estimate`: its modes, and particles if there are
+        any."""
 
     def learnt(self) -> Learnt:
-        """Constants estimated from all measurements, consistent with :meth:`trajectory`."""
+        """The estimates of sensor constants and landmarks from all measurements, consistent with :meth:`trajectory`."""
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of the whole past, with covariances, at the stamps of the ticks."""
+        """The best estimate of all past poses, with covariances, at the times of the ticks."""
 
 
 @runtime_checkable
 class ConcludingEstimator(Protocol):
-    """An estimator that solves a separate problem for its final trajectory. That solution may add diagnostics."""
+    """An estimator that solves a separate problem for its final trajectory. The solution may produce additional diagnostics."""
 
     def final_diagnostics(self) -> Diagnostics:
         """The diagnostics of the run and of the final solution."""
@@ -64,13 +67,14 @@ class ConcludingEstimator(Protocol):
 
 @runtime_checkable
 class ForgettingEstimator(Protocol):
-    """An estimator that can run for as long as one likes."""
+    """An estimator whose memory can be limited, for runs of unlimited length."""
 
     def forget(self, until: float) -> None:
-        """Drop the trajectory until this time [s], except for the part that late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""
 
 
 def finds_heading(estimator: Estimator) -> bool:
-    """Whether the estimator can start at a position with an unknown heading: who finds its place finds its heading too."""
+    """True if the estimator can start at a known position with an unknown heading. This includes estimators that can start at an
+    unknown position."""
     names = ("supports_unknown_start", "supports_unknown_heading")
     return any(getattr(estimator, name, False) for name in names)

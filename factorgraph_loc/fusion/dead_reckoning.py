@@ -1,4 +1,4 @@
-"""Odometry alone: what every other estimator has to beat."""
+"""Dead reckoning: localization by odometry alone, the baseline for all estimators."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from factors.se2 import Array
 
 
 class DeadReckoningSettings(FilterSettings):
-    """Settings of dead reckoning, which has none of its own."""
+    """Settings of dead reckoning. It has only those of every filter."""
 
 
 class _PoseRecord(NamedTuple):
+    """The estimate at time ``t`` [s]."""
+
     t: float
     pose: Array
     covariance: Array  # body frame
@@ -33,7 +35,7 @@ class DeadReckoning(Filter):
     _state: tuple[Array, Array]  # pose (3,), and its body-frame covariance (3, 3)
 
     def trajectory(self) -> Trajectory:
-        """The same as the causal estimates: there is nothing to smooth."""
+        """The trajectory of the causal estimates. There is no smoothing, because no measurement corrects the odometry."""
         records: list[_PoseRecord] = self._records
         return at_ticks(
             self._ticks,
@@ -51,7 +53,7 @@ class DeadReckoning(Filter):
         self._state = se2.compose(pose, increment.delta), propagate(covariance, increment)
 
     def _see(self, m: Measurement) -> None:
-        raise AssertionError("dead reckoning has no sensor but odometry")
+        raise AssertionError("dead reckoning processes no measurements except odometry")
 
     def _estimate(self) -> PoseEstimate:
         pose, covariance = self._state

@@ -1,9 +1,9 @@
 """Extended Kalman filter on SE(2), with Rauch-Tung-Striebel smoothing for its final trajectory.
 
-The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by named blocks: the
-constants of odometry and sensors that are estimated, and the landmarks that the map lacks (EKF-SLAM: Smith, Self, Cheeseman, 1990).
-One correction serves all sensors. A residual whose innovation is too large has its noise widened instead of being dropped, so that
-the filter cannot lock itself out.
+The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by named blocks. A
+block has the estimated constants of the odometry or of a sensor, or a landmark that the map lacks (EKF-SLAM: Smith, Self,
+Cheeseman, 1990). A measurement whose innovation is too large is not rejected. Its noise is increased instead, so that a wrong
+estimate does not reject all further measurements.
 """
 
 from __future__ import annotations
@@ -31,10 +31,13 @@ from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
-NOWHERE = slice(POSE, POSE)  # the columns of a missing block
-MOST = 150  # components of the error state: above this number, uncertain positions of the map only add to the noise
-# Factor on the standard deviation of a heading from the search, at the start of a filter. The same measurements are processed
-# again, therefore a 16th of their information counts twice. Without any heading the filter would be linearised far from the truth.
+NOWHERE = slice(POSE, POSE)  # the slice of a block that does not exist
+# Maximum number of components of the error state. When it is reached, uncertain landmarks of the map are no longer estimated; their
+# covariances are added to the noise instead.
+MOST = 150
+# A heading from the search is the prior of the filter, with its standard deviation multiplied by this factor. The filter processes
+# the same measurements again, so that 1/16 of their information counts twice. Without this prior the filter would be linearised far
+# from the true heading.
 HEADING_WIDENED = 4.0
 
 
@@ -51,7 +54,8 @@ class EkfSettings(FilterSettings):
 
 
 class _State(NamedTuple):
-    """``pose`` (3,); ``rest`` (R,): the blocks of the ``layout``; ``covariance`` (3+R, 3+R) of the error state."""
+    """The state of the filter. ``pose`` (3,). ``rest`` (R,): the values of the blocks. ``covariance`` (3+R, 3+R): that of the error
+    state. ``layout``: the order of the blocks."""
 
     pose: Array
     rest: Array
@@ -59,16 +63,17 @@ class _State(NamedTuple):
     layout: Layout
 
     def plus(self, delta: Array, covariance: Array) -> _State:
+        """The state after a correction ``delta`` (3+R,), with a new ``covariance``."""
         return _State(se2.moved(self.pose, delta), self.rest + delta[POSE:], covariance, self.layout)
 
     def first(self, size: int) -> _State:
-        """The first ``size`` components of the error state: without blocks that came later."""
+        """The state with only the first ``size`` components of the error state, without blocks that were added later."""
         if size == len(self.covariance):
             return self
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def with_block(self, new: NewVariable) -> _State:
-        """The state with one more block."""
+        """The state with one more block, for a new variable that is correlated with the rest."""
         size, columns = len(self.covariance), self.layout.columns
         cross, own = new.joint(self.covariance, columns)
         end = size + len(new.mean)
@@ -80,7 +85,8 @@ class _State(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A prediction: the pose that it led to, the first rows (3, S) of its transition, and the covariance (3, 3) that it added."""
+    """A prediction step, for the smoother. ``pose`` (3,): the predicted pose. ``transition`` (3, S): the first three rows of the
+    transition matrix; the rest are those of the identity. ``noise`` (3, 3): the covariance added to the pose."""
 
     pose: Array
     transition: Array
@@ -88,12 +94,16 @@ class _Step(NamedTuple):
 
 
 class _Record(NamedTuple):
+    """The updated state at time ``t`` [s], and the prediction ``step`` from the previous record to it."""
+
     t: float
-    step: _Step  # from the record before
+    step: _Step
     updated: _State
 
 
 class _View(FilterView):
+    """The EKF's state as sensors read it."""
+
     localized = True
     _filter: Ekf
 
@@ -130,7 +140,8 @@ class Ekf(Filter):
         self._constants = constants_of(self._motion, self._sensors)
         finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
         slow = {name for name, sensor in finders.items() if sensor.finder and not sensor.finder.at_once}
-        # a start is known from one measurement; a lost pose is searched by the same sensors, and by those that weigh poses
+        # The search for a start or a lost pose uses sensors that find a pose from one measurement, and sensors that weigh
+        # particles.
         fast = {n: s for n, s in self._sensors.items() if n not in slow}
         self._search = Tracking(fast, self._motion, setup.rng, self.diagnostics)
         if self._search.possible:
@@ -141,7 +152,7 @@ class Ekf(Filter):
         self._step: _Step | None = None
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian; without a heading, once the search has found it."""
+        """Start from a Gaussian prior of the pose. If the prior has no heading, the filter starts when the search has found one."""
         if prior.has_heading:
             super().initialize(prior)
             return
@@ -159,7 +170,7 @@ class Ekf(Filter):
         return PosePrior(t, pose, covariance)
 
     def learnt(self) -> Learnt:
-        """The constants and landmarks that are estimated."""
+        """The estimated constants and landmarks."""
         if self._state is None:
             return Learnt()
         values, view = self._state.layout.values(self._state.rest), _View(self)
@@ -168,7 +179,7 @@ class Ekf(Filter):
         )
 
     def trajectory(self) -> Trajectory:
-        """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones with ``smooth`` off."""
+        """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones if the setting ``smooth`` is false."""
         records: list[_Record] = self._records
         if not records:  # an unknown start was never determined
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
@@ -182,7 +193,8 @@ class Ekf(Filter):
         return at_ticks(self._ticks, times, np.array(poses[::-1]), np.array(covariances[::-1]))
 
     def _smoothed(self, state: _State, step: _Step, later: _State) -> _State:
-        """The smoothed ``state``; ``step`` leads from it to ``later``, the next smoothed state."""
+        """One backward step of the smoother. ``step``: the prediction from ``state`` to the next record. ``later``: the smoothed
+        state of the next record. Returns the smoothed ``state``."""
         later = later.first(len(state.covariance))
         change = np.concatenate((se2.twist_to(step.pose, later.pose), later.rest - state.rest))
         return state.plus(*positive.smoothed(state.covariance, step.transition, step.noise, change, later.covariance))
@@ -234,7 +246,7 @@ class Ekf(Filter):
         self._doubt(tick)
 
     def _doubt(self, m: Measurement) -> None:
-        """Go on at another place where the search rejects the track."""
+        """Check whether the search rejects the track. If it does, continue at the pose that the search has found."""
         view = _View(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         best = self._search.best if refuted is not None else None
@@ -253,9 +265,9 @@ class Ekf(Filter):
         return self._start(self._search.brought(pose, self._odometry))
 
     def _jump(self, best: PosePrior, refuted: Refuted) -> None:
-        """Continue at another pose, which is not correlated with the rest of the state.
+        """Continue at the pose ``best``, which is not correlated with the rest of the state.
 
-        Constants return to their estimates before the track was wrong.
+        The constants return to their estimates from before the track became wrong, at ``refuted.since``.
         """
         self._search.begin_track(by_search=True)
         for sensor in self._sensors.values():
@@ -280,5 +292,5 @@ class Ekf(Filter):
         return _Record(self._t, step, self._state)
 
     def _standstill(self) -> _Step:
-        """The step to a second measurement of the same time."""
+        """The prediction step between two measurements of equal time: no motion and no noise."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))

@@ -1,4 +1,4 @@
-"""The common base of filters: prediction by odometry, checkpoints for late measurements, and the record of the run."""
+"""The common base of filters: prediction by odometry, checkpoints for late measurements, and a record of all estimates."""
 
 from __future__ import annotations
 
@@ -37,7 +37,11 @@ class FilterSettings(FileModel):
 
 
 class _Checkpoint(NamedTuple):
-    """The state of a filter: its own, time and odometry, and the numbers of records and ticks."""
+    """A copy of a filter's state, to return to if a late measurement arrives.
+
+    ``state``: the estimate. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time. ``records``, ``ticks``:
+    the numbers of records and ticks so far.
+    """
 
     state: Any
     t: float
@@ -47,7 +51,7 @@ class _Checkpoint(NamedTuple):
 
 
 class FilterView:
-    """The state of a filter as sensors read it, at the time of the filter."""
+    """The interface through which sensors read a filter's state, at the time of the filter."""
 
     offset = None
     newest = True
@@ -65,26 +69,28 @@ class FilterView:
     def value(self, name: str) -> Array | None: ...
 
     def poses_at(self, times: Array) -> Array:
+        """The robot's poses (N, 3) at ``times`` (N,) [s] in the frame of the filter's present pose."""
         constants = self.value(MOTION)
         values = np.zeros(0) if constants is None else constants
         return np.asarray(self._filter._motion.poses_at(self._filter._odometry, times, values))
 
     def earlier(self, t: float) -> EarlierPose | None:
+        """None, because filters have no estimates of earlier poses."""
         return None
 
     def track(self) -> Tracked:
-        """The newest pose of the track."""
+        """The present estimate of the pose, with the odometry at that time."""
         return Tracked(self._filter._odometry, self.pose, self.covariance)
 
     def pose_back(self, t: float, pose: Array) -> Array:
-        """Where the robot was at ``t``, if it is at ``pose`` (3,) now."""
+        """The robot's pose (3,) at an earlier time ``t`` [s], if the robot is at ``pose`` (3,) now."""
         return se2.compose(pose, self.poses_at(np.array([t]))[0])
 
 
 class Filter(Timeline):
-    """A recursive estimator: predicts along the odometry to each measurement's time, then updates.
+    """A recursive estimator. It predicts its state along the odometry to the time of each measurement, then updates the state.
 
-    The state is replaced, never changed in place, so that a checkpoint costs nothing.
+    A state is replaced and never changed in place, so that a checkpoint needs no copy.
     """
 
     supports_unknown_start = False
@@ -96,23 +102,23 @@ class Filter(Timeline):
         super().__init__(motion, diagnostics, settings.max_delay)
         self._smooth = settings.smooth
         self._state: Any = None
-        # the last requested prediction and its initial state: the next tick can continue from it
+        # the last requested prediction and the state it started from, so that the next tick can continue from the prediction
         self._ahead: tuple[Any, Filter] | None = None
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        # whether the odometry at the state's time is final; at a start earlier rows may still arrive
+        # False until the first measurement after a start: until then rows of odometry from before the start may arrive
         self._moves = False
         self._ticks: list[float] = []
         self._records: list[Any] = []
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian."""
+        """Start from a Gaussian prior of the pose."""
         self._t = self._begun = prior.t
         self._odometry, self._moves, self._seeking = self._motion.state(prior.t), False, None
         self._state = self._start(prior)
         self._taken.clear()
 
     def _wait(self, t: float) -> None:
-        """Begin at ``t`` without a state: measurements go to :meth:`_begin`."""
+        """Begin at time ``t`` [s] without a state. :meth:`_begin` gets the measurements until there is one."""
         self._t, self._begun, self._state = t, math.inf, None
         self._taken.clear()
 
@@ -121,11 +127,11 @@ class Filter(Timeline):
             self._ahead = None
 
     def learnt(self) -> Learnt:
-        """Nothing, unless the filter says otherwise."""
+        """An empty result. Filters that estimate constants or landmarks override this."""
         return Learnt()
 
     def forget(self, until: float) -> None:
-        """Forget the trajectory until this time, except for the part that late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""
         self._ahead = None
         t = min(until, self._t - self._max_delay)
         records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
@@ -139,45 +145,45 @@ class Filter(Timeline):
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
-        """The best estimate of the whole past at the stamps of the ticks."""
+        """The best estimate of all past poses, at the times of the ticks."""
 
     @abstractmethod
     def _start(self, prior: PosePrior) -> Any:
-        """The state that stands for the prior."""
+        """The filter's state for a Gaussian prior of the pose."""
 
     @abstractmethod
     def _predict(self, t: float) -> None:
-        """Move the state along to ``t``, and the odometry."""
+        """Predict the state to time ``t`` [s] along the odometry."""
 
     @abstractmethod
     def _see(self, m: Any) -> None:
-        """Update the state by a measurement at its time."""
+        """Update the state by a measurement. The state is already predicted to the measurement's time."""
 
     def _pass(self, tick: Tick) -> None:
-        """At a tick, once the state is there: go on with a search, if there is one."""
+        """Continue a search, if there is one. This is called at each tick, after the prediction."""
         return
 
     @abstractmethod
     def _estimate(self) -> PoseEstimate:
-        """Mean and covariance of the state."""
+        """The pose, covariance and status of the present state."""
 
     @abstractmethod
     def _record(self) -> Any:
-        """The data at this time that :meth:`trajectory` needs, with the time as ``t``."""
+        """The data that :meth:`trajectory` needs of the present state. An attribute ``t`` is the time [s]."""
 
     def _seek(self, m: Any) -> Any:
-        """The state from a measurement alone, at an unknown start. None if the measurement determines none."""
+        """A state from a measurement, at an unknown start. None if the pose is not yet determined."""
         return None
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
         return self._at(t)._estimate()
 
     def _at(self, t: float | None) -> Self:
-        """The filter itself, or one that was predicted to ``t``, which is there to be read."""
+        """The filter itself, or a copy that is predicted to ``t`` [s] if that is later. Use the copy for reading only."""
         if t is None or t <= self._t or self._state is None:
             return self
         self._ahead = None
-        ahead = object.__new__(type(self))  # as copy.copy does, in a third of the time
+        ahead = object.__new__(type(self))  # like copy.copy, in a third of the time
         vars(ahead).update(vars(self))
         ahead._anchor()
         ahead._move(t)
@@ -185,12 +191,12 @@ class Filter(Timeline):
         return ahead
 
     def _anchor(self) -> None:
-        """At the first measurement after a start: the odometry there is what has come by now."""
+        """Set the odometry at the start, at the first measurement after it. By then all earlier rows of odometry have arrived."""
         if not self._moves:
             self._odometry, self._moves = self._motion.state(self._t), True
 
     def _move(self, t: float) -> None:
-        """Go on to ``t``, or stay if that is now."""
+        """Predict to time ``t`` [s], or do nothing if the filter is already there."""
         if t <= self._t:
             return
         known, self._ahead = self._ahead, None
@@ -201,7 +207,8 @@ class Filter(Timeline):
         self._t = t
 
     def _begin(self, m: Measurement) -> None:
-        """Start without a prior, at the first measurement that gives a pose, or as the search finds it."""
+        """Process a measurement before the start. The filter starts at the first measurement that determines the pose, or when the
+        search has found the pose."""
         if self._seeking is not None:
             super()._begin(m)
         elif not isinstance(m, Tick):
@@ -242,14 +249,18 @@ class Filter(Timeline):
 
 
 def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:
-    """The trajectory at the stamps ``ticks``, of records at times ``t`` (N,): the last record of each stamp counts."""
+    """Make a trajectory at the times ``ticks`` from records at times ``t`` (N,).
+
+    ``poses`` (N, 3), ``body_covariances`` (N, 3, 3): the estimates, with covariances in the body frame. If several records have one
+    time, the last one is used.
+    """
     rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
     covariances = se2.body_to_world(poses[rows], body_covariances[rows])
     return Trajectory(np.unique(np.array(ticks)), poses[rows], covariances)
 
 
 def twin(rng: np.random.Generator) -> np.random.Generator:
-    """A generator that will draw the same numbers; a deep copy takes four times as long."""
+    """A copy of a random generator, which will draw the same numbers. A deep copy takes four times as long."""
     bits = type(rng.bit_generator)(0)
     bits.state = rng.bit_generator.state
     return np.random.Generator(bits)

@@ -1,4 +1,4 @@
-"""The boundary around an estimator: a numerical failure and an impossible result become an error of one line.
+"""Conversion of an estimator's numerical failures and impossible results to errors of one line.
 
 Every run calls its estimator through a :class:`Guard`. Valid measurements and settings can still make a matrix singular or a sum
 overflow. NumPy, GTSAM and compiled code raise different errors then. The guard converts them to a
@@ -24,30 +24,33 @@ from factorgraph_loc.text import plain
 from factors import positive
 from factors.se2 import Array
 
-# singular matrices, overflows, divisions by zero, arguments out of range; all errors of GTSAM
+# The exceptions of numerical failures: singular matrices, overflows, divisions by zero, arguments out of range, all errors of
+# GTSAM.
 FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
-ROUNDING = 1e-6  # least eigenvalue of a correlation matrix that rounding explains, negated
-LEAST = 1e-9  # eigenvalues are raised to this
+ROUNDING = 1e-6  # rounding explains eigenvalues of a correlation matrix down to minus this value
+LEAST = 1e-9  # smaller eigenvalues of a correlation matrix are raised to this value
 
 
 class Guard:
-    """Calls an estimator: ``guard.process(estimator, measurement)``, ``with guard.computing(what): ...``.
+    """Calls an estimator and converts its failures to a RunFailedError.
 
-    ``who``: the estimator and the log, or the estimator alone. Warnings of NumPy are silent inside, because :func:`sound` and
+    Use it as ``guard.process(estimator, measurement)`` or ``with guard.computing(what): ...``. ``who``: the name of the estimator,
+    and of the log if there is one, for messages. Warnings of NumPy are silenced inside, because :func:`sound` and
     :func:`sound_trajectory` check the results.
     """
 
     def __init__(self, who: str) -> None:
         self._who = who
         self._last: Measurement | None = None  # the last measurement
-        self._computing = ""  # the requested result
-        self._of: float | None = None  # the time [s] of that result
+        self._computing = ""  # the name of the requested result, empty while a measurement is processed
+        self._of: float | None = None  # s; the time of the requested result
         self._silence = np.errstate(all="ignore")
         self._is_quiet = False
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """A context that silences NumPy for a whole run, because one switch takes as long as one row of odometry."""
+        """A context that silences NumPy's warnings for a whole run. Switching warnings for each measurement takes as long as
+        processing one row of odometry."""
         with np.errstate(all="ignore"):
             self._is_quiet = True
             try:
@@ -56,13 +59,15 @@ class Guard:
                 self._is_quiet = False
 
     def process(self, estimator: Estimator, measurement: Measurement) -> None:
-        """Give a measurement to the estimator."""
+        """Let the estimator process a measurement. Raises RunFailedError if that fails."""
         self._last, self._computing, self._of = measurement, "", None
         with self:
             estimator.process(measurement)
 
     def computing(self, what: str, t: float | None = None) -> Self:
-        """A context for a request of ``what``, such as ``the estimate``, at a time [s] or without one."""
+        """A context for a request to the estimator. ``what``: the requested result, such as "the estimate", for messages. ``t``
+        [s]:
+        its time, or None."""
         self._computing, self._of = what, t
         return self
 
@@ -87,9 +92,12 @@ class Guard:
 
 
 def sound(estimate: PoseEstimate) -> PoseEstimate:
-    """The estimate, if it has a pose of finite numbers with a covariance that is symmetric and positive; of what rounding alone
-    took from that, the nearest that is. ValueError if not: it is asked inside of a :class:`Guard`. One that is ``unlocalized`` says
-    nothing."""
+    """Check an estimate. Returns it with a covariance that is symmetric and positive definite.
+
+    A covariance that is indefinite because of rounding is replaced by the nearest positive definite one. Raises ValueError if the
+    pose is not finite, or if the covariance cannot be repaired. An ``unlocalized`` estimate is returned unchecked. Call this inside
+    a :class:`Guard`, which converts the error.
+    """
     if estimate.status == "unlocalized":
         return estimate
     if estimate.pose.shape != (3,) or estimate.covariance.shape != (3, 3):
@@ -103,7 +111,7 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
 
 
 def sound_belief(belief: Belief) -> Belief:
-    """The same of each mode of a belief, and of its particles."""
+    """Check a belief as :func:`sound` checks an estimate: each mode, and that the particles are finite."""
     for values in (belief.particles, belief.weights):
         if values is not None and not np.all(np.isfinite(values)):
             raise ValueError("the particles are not finite")
@@ -114,7 +122,7 @@ def sound_belief(belief: Belief) -> Belief:
 
 
 def sound_trajectory(trajectory: Trajectory) -> Trajectory:
-    """The same of a trajectory; the error names the time of the first pose that is not so."""
+    """Check a trajectory as :func:`sound` checks an estimate. The error names the time of the first invalid pose."""
     finite = np.isfinite(trajectory.poses).all(axis=1)
     if not finite.all():
         raise ValueError(f"the pose at {trajectory.t[~finite][0]:.3f} s is not finite")
@@ -130,6 +138,8 @@ def sound_trajectory(trajectory: Trajectory) -> Trajectory:
 
 
 def _positive(covariance: Array, where: str = "") -> Array:
+    """The result of :func:`nearest_positive`. Raises ValueError instead of returning None. ``where``: is inserted in the
+    message."""
     repaired = nearest_positive(covariance)
     if repaired is None:
         why = "is not positive definite" if np.all(np.isfinite(covariance)) else "is not finite"
@@ -138,12 +148,12 @@ def _positive(covariance: Array, where: str = "") -> Array:
 
 
 def nearest_positive(covariance: Array) -> Array | None:
-    """The covariance (D, D), or the nearest symmetric positive definite one if only rounding makes it indefinite. None if it is
-    no covariance."""
+    """Return a covariance (D, D) unchanged if it is symmetric and positive definite. If only rounding prevents that, return the
+    nearest covariance that is. Otherwise return None."""
     sigmas = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(covariance)) and np.all(sigmas > 0.0)):
         return None
-    # by parts, as products of the largest and the smallest may be beyond numbers
+    # two divisions, because the product of the standard deviations may overflow
     shares = covariance / sigmas[:, None] / sigmas
     if not np.all(np.isfinite(shares)) or np.abs(shares - shares.T).max() > positive.SKEW:
         return None
@@ -162,6 +172,6 @@ def _named(measurement: Measurement) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of what an error says that says anything; its type where it says nothing."""
+    """The first line of an error's message that is not empty, or the name of the error's type if there is none."""
     lines = (" ".join(line.split()) for line in str(error).splitlines())
     return plain(next((line for line in lines if line), type(error).__name__))

@@ -1,4 +1,4 @@
-"""How many particles a density needs: KLD sampling (Fox, IJRR 22(12), 2003); and kernels as wide as befits their number."""
+"""The number of particles that a distribution needs, by KLD sampling (Fox, IJRR 22(12), 2003), and kernels around particles."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,21 +7,26 @@ from factorgraph_loc.fusion.cloud import cell_numbers
 from factors import se2
 from factors.se2 import Array
 
-ERROR, QUANTILE = 0.05, 2.326  # the largest Kullback-Leibler divergence, kept to with a probability of 99 %
-CELL = np.array((0.3, 0.3, 0.2))  # m, m, rad
-KERNEL = 0.25  # of the distance between particles
+# largest Kullback-Leibler divergence, and the normal quantile of a probability of 99 % to satisfy it
+ERROR, QUANTILE = 0.05, 2.326
+CELL = np.array((0.3, 0.3, 0.2))  # m, m, rad; size of the cells that are counted
+KERNEL = 0.25  # standard deviation of a kernel as a fraction of the distance between particles
 
 
 def enough(cells: Array | NDArray[np.int64]) -> Array:
-    """The particles that a density over so many occupied cells needs (Fox, 2003, eq. 7, by Wilson and Hilferty)."""
+    """The number of particles that a distribution needs if it occupies this number of ``cells`` (Fox, 2003, eq. 7, with the
+    approximation of Wilson and Hilferty)."""
     freedom = np.maximum(np.asarray(cells, dtype=float) - 1.0, 1.0)
     a = 2.0 / (9.0 * freedom)
     return np.asarray(freedom / (2.0 * ERROR) * (1.0 - a + np.sqrt(a) * QUANTILE) ** 3)
 
 
 def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int64]:
-    """Places among draws (N, 3) of as many as are enough, at least ``least``: in random order they are taken one by one until their
-    number is enough for the cells that they have occupied."""
+    """Select as many of ``poses`` (N, 3), drawn from a distribution, as KLD sampling needs, and at least ``least``.
+
+    Poses are added in random order until their number is :func:`enough` for the cells that they occupy. Returns the indices of the
+    selected poses.
+    """
     order = rng.permutation(len(poses))
     _, first = np.unique(cell_numbers(poses[order], CELL), return_index=True)
     occupied = np.searchsorted(np.sort(first), np.arange(1, len(poses) + 1), side="left")
@@ -31,9 +36,12 @@ def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int
 
 
 def jittered(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator, room: Array | float = 0.0) -> Array:
-    """Particles (K, 3) drawn from kernels on the particles ``rows`` (K,) of ``poses`` (N, 3), as wide as befits how densely those,
-    each of them once, lie in the cells; or, where they are farther apart, the ``room`` (K,), in cells, that each had for itself.
-    Of several modes each keeps its width."""
+    """Draw one particle from a Gaussian kernel around each of the particles ``rows`` (K,) of ``poses`` (N, 3). Returns (K, 3).
+
+    The kernel's width is proportional to the mean distance between the distinct particles in ``rows``, from the number of cells
+    that they occupy. ``room`` (K,): a lower limit of the volume per particle, in cells, for particles that are farther apart. The
+    kernel is much narrower than a mode, so several modes stay separate.
+    """
     chosen = poses[rows]
     cells = len(np.unique(cell_numbers(chosen, CELL)))
     width = KERNEL * np.cbrt(np.maximum(room, cells / len(np.unique(rows))))

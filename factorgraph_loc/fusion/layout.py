@@ -1,4 +1,7 @@
-"""Where named blocks stand in the error state of a filter, and what a run learns about them."""
+"""The layout of a filter's error state, which consists of the pose and named blocks, and the report of estimated blocks.
+
+A block is a vector of the state, such as the estimated constants of one sensor or the position of one landmark.
+"""
 
 from __future__ import annotations
 
@@ -15,23 +18,23 @@ from factorgraph_loc.sensors.base import Observation, Sensor, View
 from factorgraph_loc.sensors.motion import MOTION, Motion
 from factors.se2 import Array
 
-POSE = 3  # components of the error state that are the pose's
+POSE = 3  # number of components of the pose, which are the first ones of the error state
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The blocks of a state after its pose, by name, in their order: ``sizes``."""
+    """The layout of the blocks behind the pose. ``sizes``: the number of components of each block by name, in order."""
 
     sizes: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def of(constants: Mapping[str, Estimated]) -> Layout:
-        """The blocks of estimated constants, by name."""
+        """The layout of blocks of estimated constants. Blocks without constants are left out."""
         return Layout({name: len(block.names) for name, block in constants.items() if block.names})
 
     @cached_property
     def columns(self) -> Mapping[str, slice]:
-        """The columns of each block in the error state."""
+        """The indices of each block in the error state, as slices."""
         columns, start = {}, POSE
         for name, size in self.sizes.items():
             columns[name] = slice(start, start + size)
@@ -39,21 +42,22 @@ class Layout:
         return columns
 
     def plus(self, name: str, size: int) -> Layout:
-        """With one more block, which comes last."""
+        """The layout with one more block at the end."""
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:
-        """The blocks of a state by name. ``rest`` (R,): the state without the pose."""
+        """The values of the blocks by name. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}
 
 
 def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Estimated]:
-    """The estimated constants of the odometry and of the sensors, by block."""
+    """The estimated constants of the odometry and of the sensors, by the name of their block."""
     return {MOTION: motion.constants} | {name: sensor.constants for name, sensor in sensors.items()}
 
 
 def on_pose(observation: Observation, view: View) -> Observation:
-    """An observation of the pose alone, with its blocks where they are estimated to be."""
+    """Convert an observation to one that depends on the pose only. Its blocks are fixed at their estimates, and their covariances
+    are added to the noise."""
     values = {name: np.asarray(view.value(name)) for name in observation.blocks}
     return observation.on_pose(values, {name: view.block_covariance(name) for name in observation.blocks})
 
@@ -61,10 +65,12 @@ def on_pose(observation: Observation, view: View) -> Observation:
 def learnt_from(
     constants: Mapping[str, Estimated], blocks: Iterable[tuple[str, Array, Array]], points: PointMap | None = None
 ) -> Learnt:
-    """The ``constants`` by sensor, those of landmarks, and the landmarks ``KIND/NAME``, all from ``blocks``: names, means and
-    covariances.
+    """Make the report of estimated constants and landmarks.
 
-    Blocks of points in space are left out; ``points``: those that are not in the map."""
+    ``constants``: the estimated constants of each sensor. ``blocks``: name, mean and covariance of each block of the state. A block
+    is one of ``constants``, the constant of a landmark (1 component), or a landmark ``KIND/NAME`` (2 components). Larger blocks are
+    points in space and are left out. ``points``: a map of the points that were estimated, or None.
+    """
     values: dict[str, tuple[float, float]] = {}
     landmarks: dict[str, LearntPoint] = {}
     for name, mean, covariance in blocks:

@@ -1,13 +1,14 @@
 """Particle filter with systematic resampling, and backward simulation for its final trajectory.
 
-Sequential importance resampling (Gordon, Salmond, Smith, 1993) on log-weights; resampling when the effective sample size falls
-below a share of the particles, from their density instead of the particles themselves (regularised particle filter: Musso,
-Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapter 12), so that they do not deplete where the motion
-adds next to no noise. Constants of odometry and sensor that are estimated travel with each particle. Their reported covariance
-is slightly too small if landmarks contain little information on them, because resampling moves their mean at random.
+The filter is sequential importance resampling (Gordon, Salmond, Smith, 1993) with log-weights. It resamples when the effective
+sample size falls below a fraction of the number of particles. It draws new particles from a kernel density instead of copying
+particles (regularised particle filter: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapter
+12). The particles therefore stay distinct when the motion adds almost no noise. Each particle has its own estimated constants of
+odometry and sensors. Resampling moves their mean at random, so their reported covariance is slightly too small if landmarks hardly
+inform them.
 
-Particles move by the whole odometry since their last motion, at each observation and whenever a cloud is kept for smoothing. In
-between the estimate is the Gaussian of poses and constants, predicted as in the EKF.
+Particles move by odometry at each observation, and when a cloud (all particles at one time) is stored for smoothing. Between these
+times the estimate is the Gaussian of poses and constants, predicted as in the EKF.
 
 At an unknown start, and after the track is rejected, particles are drawn from the posterior of the search
 (:mod:`~factorgraph_loc.fusion.search`). A start with an unknown heading is an unknown start.
@@ -53,7 +54,8 @@ from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
-FEW, HEAVY = 500, 2_000_000  # particles, and work of weighing all, above which some are weighed first
+# If weighing all particles costs more than HEAVY (units of `Observation.work`), FEW particles are weighed first.
+FEW, HEAVY = 500, 2_000_000
 
 
 class ParticleFilterSettings(FilterSettings):
@@ -77,6 +79,8 @@ class ParticleFilterSettings(FilterSettings):
 
 
 class _CloudView(FilterView):
+    """The particle filter's state as sensors read it."""
+
     _filter: ParticleFilter
 
     @property
@@ -115,21 +119,22 @@ class ParticleFilter(Filter):
         super().__init__(setup, settings, diagnostics)
         self._settings = settings
         self._drawn_by = setup.rng
-        # trajectories are drawn by a generator of their own, whose state is kept: the same ones each time
+        # a separate generator, which is copied before use, so that each request draws the same trajectories
         (self._smoothing_rng,) = setup.rng.spawn(1)
         calibration: Calibration = "particles" if settings.self_calibration else "none"
         self._sensors = bound_sensors(Binding(setup, self._motion, self.diagnostics, calibration=calibration))
         self._constants = constants_of(self._motion, self._sensors)
         columns = Layout.of(self._constants).columns
-        # where they lie in the constants of the particles
+        # the columns of each block in the constants of the particles
         self._parts = {name: slice(part.start - POSE, part.stop - POSE) for name, part in columns.items()}
         self._search = Tracking(self._sensors, self._motion, setup.rng, self.diagnostics)
         self._search.remember()
         self._lost = False
-        self._changes: list[tuple[float, Change]] = []  # of the robot's place, each with when it was found out
+        # times [s] of rejections of the track, and when the robot was carried
+        self._changes: list[tuple[float, Change]] = []
 
     def belief(self, t: float | None = None) -> Belief:
-        """The particles with their weights, and the Gaussians of their modes. One Gaussian of all particles once localized."""
+        """The particles with weights, and the Gaussians of their modes, or one Gaussian of all particles if localized."""
         if self._state is None:
             return Belief(())
         predicted = self._at(t)
@@ -138,7 +143,7 @@ class ParticleFilter(Filter):
         return Belief(modes, cloud.poses, cloud.weights)
 
     def learnt(self) -> Learnt:
-        """The constants that are estimated."""
+        """The estimated constants."""
         if self._state is None:
             return Learnt()
         cloud = self._state
@@ -146,7 +151,7 @@ class ParticleFilter(Filter):
         return learnt_from(self._constants, ((name, *parts) for name, parts in moments.items()))
 
     def trajectory(self) -> Trajectory:
-        """Mean and covariance of trajectories drawn backwards, or the causal estimates with ``smooth`` off."""
+        """Mean and covariance of trajectories drawn backwards, or the causal estimates if the setting ``smooth`` is false."""
         last = {r.t: r for r in self._records}
         records = [last[t] for t in sorted(set(self._ticks))]
         if not self._smooth or not records:
@@ -168,7 +173,7 @@ class ParticleFilter(Filter):
         return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in moments]).reshape(-1, 3, 3))
 
     def forget(self, until: float) -> None:
-        """Forget the trajectory until the last cloud for smoothing at or before this time."""
+        """Delete the trajectory before the last cloud for smoothing that is not later than ``until`` [s]."""
         clouds = [r.t for r in self._records if r.cloud is not None and r.t <= until]
         super().forget(max(clouds, default=-math.inf) if self._smooth else until)
 
@@ -201,8 +206,9 @@ class ParticleFilter(Filter):
         return self._sampled_cloud(self._t) if self._search.look(m, self._odometry) else None
 
     def _sampled_cloud(self, since: float) -> Cloud | None:
-        """Particles drawn from the posterior of the search, None without one. A single pose of the search begins a track with the
-        measurements ``since`` then. The constants of the particles are those of the previous track, if there was one."""
+        """Draw particles from the posterior of the search; None if there is none yet. If the search has one clear pose, a track
+        begins, and sensors process measurements again from the time ``since`` [s]. The constants of the particles are those of the
+        previous track before ``since``, if there was one."""
         clouds = (r.cloud for r in reversed(self._records) if r.cloud is not None and r.t < since)
         previous = next((cloud for cloud in clouds if cloud.localized), None)
         sample = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
@@ -218,7 +224,7 @@ class ParticleFilter(Filter):
         return cloud
 
     def _cloud(self, poses: Array, previous: Cloud | None = None) -> Cloud:
-        """Particles at poses (N, 3). Their constants are drawn from the cloud ``previous``, or from the prior."""
+        """Particles of equal weight at poses (N, 3). Their constants are drawn from the cloud ``previous``, or from the prior."""
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
         log_weights = np.full(count, -np.log(count))
@@ -238,7 +244,7 @@ class ParticleFilter(Filter):
         self._odometry, _ = self._motion.travelled(self._odometry, t)
 
     def _moved_on(self, rng: np.random.Generator) -> Cloud:
-        """The particles where the robot is now."""
+        """The particles moved by odometry to the time of the filter."""
         cloud = self._state
         if cloud.odometry.t == self._t:
             return cloud
@@ -260,10 +266,10 @@ class ParticleFilter(Filter):
         return pose, se2.body_to_world_one(pose, body)
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
-        """Poses (N, 3) after the increment, each under its own constants, and with body-frame ``noise`` (N, 3), if any.
+        """Move particles by an odometry increment, each with its own constants, and with body-frame ``noise`` (N, 3) if not None.
 
-        Returns also their transition (3, 3+P) from body-frame perturbation and constants, linearised at the mean of the constants.
-        The constants of the particles differ little from their mean. The effect of this difference is added to the noise.
+        Returns the poses (N, 3), and the transition (3, 3+P) from body-frame perturbation and constants to the pose. Constants are
+        linearised at their mean. The effect of a particle's difference from the mean is added to the noise.
         """
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
@@ -313,11 +319,11 @@ class ParticleFilter(Filter):
             self._state = self._sampled_cloud(self._t) or self._state
 
     def _doubt(self, m: Measurement) -> None:
-        """Check whether the observations reject the particles. If they do, draw particles at the pose of the search."""
+        """Check whether the search rejects the track. If it does, draw particles from the search."""
         view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:
-            # for the final trajectory: the track was wrong since then
+            # for the final trajectory, mark the records since the track became wrong
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, "lost", LOST, why=refuted.why, since=refuted.since)
             self._lost = True
@@ -329,9 +335,9 @@ class ParticleFilter(Filter):
         self._changes = [(rejected, change) for rejected, change in self._changes if rejected <= self._t]
 
     def _weigh(self, observation: Observation) -> float:
-        """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`); returns the log of the mean of
-        the likelihood. Where that is much work, a few of them are corrected first, down to the last share, and all are drawn
-        from these."""
+        """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`). Returns the logarithm of the
+        mean likelihood. If weighing is costly, a few particles are corrected first, by most of the likelihood, and all particles
+        are drawn from these."""
         cloud, count, enough = self._state, self._settings.particles, self._settings.resample_below
 
         @in_one_step
@@ -348,7 +354,7 @@ class ParticleFilter(Filter):
 
         evidence, left = 0.0, 1.0
         if count > FEW and observation.work * count > HEAVY:
-            doubted = self._search.doubts  # a track in doubt is not worth more than the few
+            doubted = self._search.doubts  # while the track is in doubt, a few particles are enough
             few, evidence, left = correct(cloud.thinned(FEW), FEW, enough, left, to_end=doubted)
             if doubted:
                 self._state = few
@@ -382,7 +388,7 @@ class ParticleFilter(Filter):
         return Record(self._t, self._odometry, estimate.pose, estimate.covariance, self._state if keep else None)
 
     def _is_due(self) -> bool:
-        """Whether a cloud is to be kept for smoothing; also where the particles jump, as there is nothing to interpolate."""
+        """True if a cloud must be stored now for smoothing: after an interval, and after a jump of the particles."""
         if self.diagnostics.events and self.diagnostics.events[-1].t == self._t:
             return True
         last = next((r.t for r in reversed(self._records) if r.cloud is not None), -math.inf)

@@ -1,15 +1,16 @@
 """The final trajectory of a particle filter, by backward simulation.
 
-Trajectories are drawn backwards through the clouds that were kept (Godsill, Doucet, West, JASA 99(465), 2004). A robot at
-rest, and constants, have almost no noise between two clouds. Each particle would then have one possible ancestor, and the
-trajectories would soon coalesce. Therefore a cloud represents a density with Gaussian kernels (Musso, Oudjane, Le Gland, in
-"Sequential Monte Carlo Methods in Practice", 2001, section 12.2). The state is drawn from the kernel of the ancestor given the
-later state, by one step of Rauch, Tung and Striebel.
+A cloud is the set of weighted particles at one time. Trajectories are drawn backwards through the stored clouds (Godsill, Doucet,
+West, JASA 99(465), 2004): for each state of a trajectory, an ancestor is drawn among the particles of the previous cloud. A resting
+robot and constants have almost no noise between two clouds. Each state would then have one possible ancestor, and the trajectories
+would soon coalesce. Therefore each particle stands for a Gaussian kernel (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo
+Methods in Practice", 2001, section 12.2). The state is drawn from the kernel of the ancestor, given the later state, by one step of
+Rauch, Tung and Striebel.
 
-The ancestors are drawn in compiled code: in numpy it takes ten times as long, and most of the final result's time.
+The ancestors are drawn in compiled code, because NumPy takes ten times as long.
 
-If no particle explains a later pose, the filter was moved to another pose in between. If the filter was lost, the later pose is
-moved back by odometry. Otherwise the trajectory continues from the filter's own cloud.
+If no particle explains a later state, the filter jumped to another pose in between. If the earlier cloud was wrong, the later pose
+is moved back by odometry. Otherwise the trajectory continues with a particle of the earlier cloud.
 """
 
 from __future__ import annotations
@@ -27,12 +28,16 @@ from factors.compiled import compiled
 from factors.motion import ChainState, Increment
 from factors.se2 import Array, Integers
 
-BREAK = 100.0  # squared Mahalanobis distance from a pose to its ancestor: ten standard deviations
+BREAK = 100.0  # a state with a larger squared Mahalanobis distance from its ancestor does not follow from it
 
 
 @dataclass(frozen=True)
 class Record:
-    """A stamp of the run: the odometry there, the causal estimate, and the cloud where it is kept for smoothing."""
+    """The state of the filter at time ``t`` [s].
+
+    ``odometry``: the integrated odometry. ``mean`` (3,), ``covariance`` (3, 3): the causal estimate, in the world frame. ``cloud``:
+    the particles if they are stored for smoothing, otherwise None.
+    """
 
     t: float
     odometry: ChainState
@@ -41,15 +46,18 @@ class Record:
     cloud: Cloud | None
 
     def lost(self) -> Record:
-        """The same, its cloud known to have been elsewhere."""
+        """The record with its cloud marked as wrong."""
         return self if self.cloud is None else replace(self, cloud=replace(self.cloud, localized=False))
 
 
 class BackwardSimulation:
-    """``count`` trajectories through the clouds at the records ``kept``.
+    """Trajectories drawn backwards through the clouds of a particle filter.
 
-    ``increment(start, end)``: the motion between two records; ``moved(cloud, increment)``: poses (N, 3) after it, without noise,
-    and their transition (3, 3+P) from body-frame perturbation and constants. ``changes``: when the robot was carried elsewhere.
+    ``kept``: records with clouds, in order of time. ``count``: the number of trajectories.
+    ``increment(start, end)``: returns the odometry between two records.
+    ``moved(cloud, increment)``: returns the poses (N, 3) of a cloud after an increment, without noise, and their transition (3,
+    3+P) from body-frame perturbation and constants.
+    ``changes``: the intervals [s] in which the robot was carried to another place.
     """
 
     def __init__(
@@ -67,7 +75,7 @@ class BackwardSimulation:
         clouds = [r.cloud for r in kept if r.cloud is not None]
         cloud, kernel = clouds[-1].density()
         self._drawn = [cloud.drawn(systematic(cloud.weights, rng, count), kernel, rng)]
-        # what the noise of the motion must have been from each to the next
+        # the noise of the motion between consecutive clouds that each drawn trajectory implies
         self._missed: list[Array] = []
         for k in range(len(clouds) - 2, -1, -1):
             drawn, missed = self._step(clouds[k], increment(kept[k], kept[k + 1]), self._drawn[0])
@@ -75,10 +83,11 @@ class BackwardSimulation:
             self._missed.insert(0, missed)
 
     def at(self, record: Record) -> tuple[Array, Array]:
-        """Mean (3,) and covariance (3, 3) in the world's frame of the trajectories at a record between two kept ones."""
+        """The mean (3,) and covariance (3, 3), in the world frame, of the trajectories at any record. Between two clouds they are
+        interpolated along the odometry."""
         k = int(np.searchsorted(self._t, record.t, side="right")) - 1
         if any(self._t[k] < end <= record.t for _, end in self._changes):
-            # from the later cloud and the motion in between alone
+            # the robot was carried since the earlier cloud: move the later cloud back by odometry
             later, step = self._drawn[k + 1], self._increment(record, self._kept[k + 1])
             return _moments(se2.compose(later.poses, se2.inverse(step.delta)), step.covariance)
         since = self._increment(self._kept[k], record)
@@ -92,7 +101,8 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """The ancestors of the states ``later``, and the noise (M, 3) of the motion in between."""
+        """Draw an ancestor for each of the states ``later`` from the earlier ``cloud``. Returns these, and the noise (M, 3) of the
+        motion in between that they imply. ``increment``: the odometry in between."""
         smooth, kernel = cloud.density()
         later = replace(
             later, constants=later.constants[:, : cloud.constants.shape[1]]
@@ -133,7 +143,8 @@ class BackwardSimulation:
 
 
 def _moments(poses: Array, extra: Array) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3) in the world's frame of poses (N, 3), each with a body-frame covariance ``extra`` (3, 3)."""
+    """The mean (3,) and covariance (3, 3), in the world frame, of poses (N, 3). ``extra`` (3, 3): a body-frame covariance of each
+    pose, which is added."""
     mean, covariance = pose_moments(poses, np.full(len(poses), 1.0 / len(poses)))
     return mean, covariance + se2.body_to_world(mean, extra)
 
@@ -147,15 +158,20 @@ def draw_ancestors(
     covariance: Array,
     uniform: Array,
 ) -> Integers:
-    """One index (M,) into the N particles for each later state (Godsill et al., 2004, eq. 7): an ancestor is drawn with its weight
-    times the transition density.
+    """Draw an ancestor among N particles for each of M later states (Godsill et al., 2004, eq. 7). The probability of an ancestor
+    is proportional to its weight times the transition density to the later state.
 
-    ``predicted`` (N, 3): the particles moved without noise; ``constants`` (N, P): their constants; ``log_weights`` (N,);
-    ``later`` (M, 3) and ``later_constants`` (M, P): the later states; ``covariance`` (3+P, 3+P): of the pose's body-frame error and
-    of the constants; ``uniform`` (M,): draws from [0, 1).
+    ``predicted`` (N, 3): the particles' poses after the motion, without noise. ``constants`` (N, P), ``log_weights`` (N,): of the
+    particles.
+    ``later`` (M, 3), ``later_constants`` (M, P): the later states.
+    ``covariance`` (3+P, 3+P): that of the transition, for the body-frame error of the pose and for the constants.
+    ``uniform`` (M,): random numbers from [0, 1).
+
+    Returns the indices (M,) of the ancestors.
     """
     size = constants.shape[1]
-    order = [*range(3, 3 + size), 0, 1, 2]  # of the constants first: what they whiten to is known before the loop
+    # constants first, so that their part of the whitened states can be computed before the loop over all pairs
+    order = [*range(3, 3 + size), 0, 1, 2]
     whitener = np.linalg.inv(positive.root(covariance[np.ix_(order, order)]))
     by_constants = np.ascontiguousarray(whitener[:, :size].T)
     return np.asarray(
@@ -181,8 +197,8 @@ def _draw(
     whitener: Array,
     uniform: Array,
 ) -> Integers:
-    """``whitened`` (P+3, N) and ``whitened_later`` (P+3, M): the constants' part of the whitened states; ``whitener`` (3, 3): of
-    the pose's error given the constants."""
+    """The compiled loop of :func:`draw_ancestors`. ``whitened`` (P+3, N), ``whitened_later`` (P+3, M): the part of the whitened
+    states that depends on the constants. ``whitener`` (3, 3): the matrix that whitens the pose's error given the constants."""
     count = len(predicted)
     size = len(whitened) - 3
     cosine, sine = np.empty(count), np.empty(count)
@@ -191,7 +207,7 @@ def _draw(
     density = np.empty(count)
     rows = np.empty(len(later), np.int64)
     for j in range(len(later)):
-        # one loop per term: the compiler can then process several particles per instruction
+        # separate loops for each term, so that the compiler can vectorise them
         for i in range(count):
             dx, dy = later[j, 0] - predicted[i, 0], later[j, 1] - predicted[i, 1]
             along, lateral = cosine[i] * dx + sine[i] * dy, cosine[i] * dy - sine[i] * dx
@@ -213,13 +229,13 @@ def _draw(
         highest = -np.inf
         for i in range(count):
             highest = max(highest, density[i])
-        if not highest > -np.inf:  # so far away that no density is left: by the weights alone
+        if not highest > -np.inf:  # the transition density is zero for all particles: use the weights alone
             for i in range(count):
                 density[i] = log_weights[i]
                 highest = max(highest, density[i])
         total = 0.0
         for i in range(count):
-            # far below the highest nothing is drawn, and exp is what takes time
+            # a density far below the highest is practically never drawn, and exp takes most of the time
             density[i] = np.exp(density[i] - highest) if density[i] > highest - 20.0 else 0.0
             total += density[i]
         threshold = uniform[j] * total

@@ -16,9 +16,12 @@ from factorgraph_loc.text import quoted
 
 @dataclass(frozen=True)
 class Description:
-    """An estimator. ``about``: one sentence; ``sensors``: channels that it uses; ``causal``: whether it has estimates during a
-    run; ``smoothed``: whether its final trajectory uses all measurements; ``settings``: all its
-    settings."""
+    """The description of an estimator for users.
+
+    ``about``: one sentence. ``sensors``: the names of the sensor channels that the estimator uses.
+    ``causal``: True if the estimator has estimates during a run. ``smoothed``: True if its final trajectory uses all measurements.
+    ``settings``: all its settings.
+    """
 
     name: str
     about: str
@@ -29,20 +32,20 @@ class Description:
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
-    """The frozen settings of an estimator; ``overrides`` by dotted key without the estimator's name.
+    """The settings of an estimator. ``overrides``: values by dotted key, without the estimator's name; the rest are defaults.
 
-    Raises InputError for an unknown estimator, an unknown key or a value out of bounds.
+    Raises InputError if the estimator or a key is unknown, or if a value is out of bounds.
     """
     return parse_model(settings_type(name), overrides, f"settings of {name}")
 
 
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
-    """An estimator by name."""
+    """Construct the estimator with this name for a run."""
     return cast(Estimator, estimator_type(name)(setup, settings))
 
 
 def describe(name: str) -> Description:
-    """The description of an estimator; InputError for an unknown one."""
+    """The description of the estimator with this name. Raises InputError if the name is unknown."""
     kind = estimator_type(name)
     taken = tuple(channel.name for channel in channels().values() if _takes(kind, channel))
     return Description(
@@ -56,25 +59,27 @@ def describe(name: str) -> Description:
 
 
 def _takes(kind: type[Any], channel: Channel) -> bool:
+    """True if an estimator class uses the measurements of a channel."""
     modalities = getattr(kind, "modalities", EVERY)
     streams = channels()[parent_of(channel.name) or channel.name].streams
     return any(stream.kind.is_motion or stream.kind.modality in modalities for stream in streams)
 
 
 def check_names(names: Sequence[str]) -> None:
-    """InputError for the first name that is no estimator, with the nearest that is."""
+    """Raise InputError if a name is not that of an estimator. The message proposes the most similar name."""
     for name in names:
         if name not in ESTIMATORS:
             raise InputError(f"no estimator is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")
 
 
 def estimator_type(name: str) -> type[Any]:
-    """The class of an estimator; InputError for an unknown one."""
+    """The class of the estimator with this name. Raises InputError if the name is unknown."""
     check_names([name])
     return cast(type[Any], ESTIMATORS[name])
 
 
 def settings_type(name: str) -> type[FileModel]:
-    """The class of its settings in the same module, ``EkfSettings`` of ``Ekf``. InputError for an unknown estimator."""
+    """The settings class of the estimator with this name, such as ``EkfSettings`` in the module of ``Ekf``. Raises InputError if
+    the name is unknown."""
     check_names([name])
     return cast(type[FileModel], load(f"{ESTIMATORS.place(name)}Settings"))

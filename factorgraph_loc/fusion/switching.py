@@ -1,9 +1,9 @@
-"""The paper's fusion rule: RFID when tags are read, vision otherwise (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5).
+"""A fusion rule that uses RFID when tags are read, and vision otherwise (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5).
 
-A scan with a read of a mapped tag makes the particle filter active. A scan without one makes the EKF active, which uses all other
-sensors. The other filter processes odometry only. At a hand-over the new filter starts from mean and covariance of the pose.
-Therefore uncertain constants of the odometry count as noise in both. The final trajectory is smoothed over all hand-overs (Rauch,
-Tung, Striebel, 1965), from the causal estimates.
+An RFID scan with a read of a mapped tag makes a particle filter active. A scan without such a read makes an EKF active, which uses
+all sensors except RFID. The inactive filter processes odometry only. At a change, the newly active filter starts from the mean and
+covariance of the pose of the previous one. Only the pose is passed on, so uncertain constants of the odometry count as noise in
+both filters. The final trajectory is smoothed over all changes (Rauch, Tung, Striebel, 1965), from the causal estimates.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,8 @@ from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
 
 JUMPED = 50.0  # squared Mahalanobis distance: above it an estimate does not follow from the previous one
-LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2  # m, m, rad: identical particles have no proper covariance
+# Is added to covariances (standard deviations in m, m, rad), because identical particles have a singular covariance.
+LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2
 
 
 class SwitchingSettings(FilterSettings):
@@ -41,7 +42,8 @@ class SwitchingSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class _PoseBelief:
-    """The causal estimate at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3)."""
+    """The causal estimate at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3). ``odometry``: the integrated
+    odometry at that time."""
 
     odometry: ChainState
     pose: Array
@@ -77,20 +79,21 @@ class Switching:
         self._active: Filter = self._tags if scanning else self._vision
         self._newest_scan = -np.inf
         self._ticks: list[float] = []
-        self._records: dict[float, _PoseBelief] = {}  # by their times: the last one counts
+        self._records: dict[float, _PoseBelief] = {}  # the last estimate of each time [s]
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian."""
+        """Start from a Gaussian prior of the pose."""
         self._active.initialize(prior)
 
     def process(self, measurement: Measurement) -> None:
-        """Take one measurement, in time or late by at most ``max_delay``."""
+        """Process one measurement. If it is late by more than ``max_delay``, it is counted and ignored."""
         if measurement.is_motion:
             self._tags.process(measurement)
             counted = self.diagnostics.ignored, self.diagnostics.late
             previous = [dict(counts) for counts in counted]
             self._vision.process(measurement)
-            for counts, once in zip(counted, previous, strict=True):  # the second filter counted the same rows
+            # both filters counted the same rows: restore one count
+            for counts, once in zip(counted, previous, strict=True):
                 counts.clear()
                 counts.update(once)
             self._motion.add(measurement)
@@ -119,11 +122,11 @@ class Switching:
         return self._active.belief(t)
 
     def learnt(self) -> Learnt:
-        """Nothing."""
+        """An empty result, because no constants are estimated."""
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """The smoothed estimates at the ticks, or the causal ones with ``smooth`` off."""
+        """The smoothed estimates at the ticks, or the causal ones if the setting ``smooth`` is false."""
         times = sorted(self._records)
         records = [self._records[t] for t in times]
         track = [(r.pose, r.covariance) for r in records[-1:]]
@@ -136,14 +139,14 @@ class Switching:
         return at_ticks(ticks, np.array(times), poses, covariances)
 
     def forget(self, until: float) -> None:
-        """Forget the trajectory until this time, except for the part that the filters need for late measurements."""
+        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""
         for part in (self._tags, self._vision):
             part.forget(until)
         self._ticks = [t for t in self._ticks if t >= until]
         self._records = {t: record for t, record in self._records.items() if t >= until}
 
     def _hand_over(self, successor: Filter) -> None:
-        """Make ``successor`` the active filter, unless the present one has no pose."""
+        """Make ``successor`` the active filter, unless the present one is not localized."""
         if successor is self._active:
             return
         now = self._active.estimate()
@@ -160,7 +163,8 @@ class Switching:
 
 
 def _smoothed(record: _PoseBelief, step: Increment, later: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The smoothed ``record``; ``step`` leads from it to ``later``, the next smoothed pose with its covariance."""
+    """The smoothed pose (3,) and covariance (3, 3) of ``record``. ``step``: the motion to the next record. ``later``: the smoothed
+    pose and covariance of the next record. If the next pose does not follow from ``record``, ``record`` is not smoothed."""
     predicted = propagate(record.covariance, step)
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), later[0]))
     if positive.squared(error, predicted + later[1]) > JUMPED:

@@ -1,8 +1,8 @@
-"""The order of time in all estimators: measurements before the start, late ones, and replay.
+"""The order of measurements in time, for all estimators: measurements before the start, late measurements, and replay.
 
-A measurement that is late by more than ``max_delay`` is counted and dropped. For another late one a filter goes back to its state
-before then and processes the later measurements again; a graph adds a factor at its time. Before a start that is not known the
-measurements are kept until the search has found one pose, and then processed from the first on.
+A measurement that is late by more than ``max_delay`` is counted and ignored. If a measurement is less late, a filter restores its
+state from before that time and processes the later measurements again. A graph adds a factor at the measurement's time instead.
+If the start pose is unknown, measurements are kept until a search has found the pose. Then they are processed from the first on.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from factors.motion import Increment
 
 
 class Taken(NamedTuple):
-    """A processed measurement, the estimator's state before it (``checkpoint``), and its additions to the diagnostics."""
+    """A processed measurement. ``checkpoint``: the estimator's state before the measurement, None if it is not needed. ``added``:
+    what the measurement added to the diagnostics, to remove it again if the measurement is replayed."""
 
     measurement: Measurement
     checkpoint: Any = None
@@ -37,22 +38,23 @@ class Taken(NamedTuple):
 
 
 class Timeline(ABC):
-    """The order of time in an estimator; see the module."""
+    """The base of estimators that process measurements in the order of time. See the module."""
 
     deterministic = True
-    takes_rows = True  # of odometry, as one measurement
-    modalities: Container[str] = EVERY  # of measurements that may update it; others are counted as ignored
+    takes_rows = True  # several rows of odometry may arrive as one measurement
+    # the kinds of measurements that update the estimator; the rest is counted as ignored
+    modalities: Container[str] = EVERY
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics, max_delay: float) -> None:
         self.diagnostics, self._motion, self._max_delay = diagnostics, motion, max_delay
         self._sensors: dict[str, Sensor] = {}  # by name
-        self._t = -math.inf  # the newest time
-        self._begun = math.inf  # when the estimator started; infinite before
-        self._taken: deque[Taken] = deque()  # the last measurements, in their order of processing
-        self._seeking: Tracking | None = None  # finds the start with the measurements that are kept
+        self._t = -math.inf  # s; the time of the newest measurement or tick
+        self._begun = math.inf  # s; the time of the estimator's start, infinite before the start
+        self._taken: deque[Taken] = deque()  # the last measurements, in the order of processing
+        self._seeking: Tracking | None = None  # the search for the start pose, None if there is none
 
     def process(self, measurement: Measurement) -> None:
-        """Take one measurement, in time or late by at most ``max_delay``."""
+        """Process one measurement. If it is late by more than ``max_delay``, it is counted and ignored."""
         self._renew(measurement)
         if measurement.is_motion:
             self._motion.add(measurement)
@@ -66,10 +68,11 @@ class Timeline(ABC):
             self._process(measurement)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the time of the newest measurement or tick, or at ``t`` if that is later.
+        """The pose at the time of the newest measurement or tick, or at ``t`` [s] if that is later.
 
-        Before the start: the most likely hypothesis of the search, ``ambiguous``, or NaN if there is none. Later it is
-        ``ambiguous`` while a search is going on, and while the track does not explain the measurements.
+        Before the start, the estimate is the most likely hypothesis of the search with the status ``ambiguous``, or NaN with the
+        status ``unlocalized`` if there is none. After the start, the status is ``ambiguous`` while a search is in progress, and
+        while the estimated poses do not explain the measurements.
         """
         if self._begun < math.inf:
             estimate = self._estimate_at(t)
@@ -82,7 +85,8 @@ class Timeline(ABC):
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
 
     def belief(self, t: float | None = None) -> Belief:
-        """The belief behind :meth:`estimate`; before the start all hypotheses of the search, and its particles."""
+        """The probability distribution behind :meth:`estimate`. Before the start it has all hypotheses of the search, and the
+        search's particles."""
         if self._begun < math.inf or self._seeking is None:
             return gaussian_belief(self.estimate(t))
         at = self._t if t is None else max(t, self._t)
@@ -91,22 +95,22 @@ class Timeline(ABC):
 
     @abstractmethod
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian."""
+        """Start from a Gaussian prior of the pose."""
 
     @abstractmethod
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """:meth:`estimate` after the start."""
+        """Compute :meth:`estimate` after the start."""
 
     @abstractmethod
     def _process(self, m: Measurement) -> None:
-        """Process a measurement that is not too late."""
+        """Process a measurement that is not too late, after the start."""
 
     def _renew(self, m: Measurement) -> None:
-        """A measurement arrives: discard what was computed for questions before it."""
+        """Discard cached results of earlier requests, because a measurement arrives."""
         return
 
     def _uses(self, m: Measurement) -> bool:
-        """Whether a measurement may update the estimator."""
+        """True if the estimator uses the sensor of the measurement."""
         return m.source in self._sensors
 
     def _begin(self, m: Measurement) -> None:
@@ -115,12 +119,13 @@ class Timeline(ABC):
             self._seek_start(m, self._seeking)
 
     def _seek_heading(self, prior: PosePrior, search: Tracking) -> None:
-        """Search the heading at a known position."""
+        """Begin a search for the heading at a known position."""
         self._t, self._seeking = prior.t, search
         search.begin(KnownPosition(prior, self._motion))
 
     def _seek_start(self, m: Measurement, search: Tracking) -> None:
-        """Search with a measurement; if that gives one pose, start there and process all measurements again."""
+        """Update the search for the start pose by a measurement. If the search has one clear pose then, start the estimator and
+        process all kept measurements again."""
         start = search.start
         if start is not None:
             start.settle()
@@ -145,23 +150,26 @@ class Timeline(ABC):
         self._replay(again)
 
     def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
-        """The prior at ``t``. ``best``: the pose of the search; ``moved``: the motion from ``t`` to that pose; ``start``: the known
-        position at ``t``, if any."""
+        """The prior for a start at time ``t`` [s], from the result of the search.
+
+        ``best``: the pose that the search found, at a later time. ``moved``: the robot's motion from ``t`` to that time. ``start``:
+        the known position at ``t``, or None.
+        """
         raise NotImplementedError
 
     def _replay(self, measurements: Sequence[Measurement]) -> None:
-        """Process measurements again."""
+        """Process measurements again, in this order."""
         for m in measurements:
             self._process(m)
 
     def _remember(self, taken: Taken, span: float) -> None:
-        """Keep a measurement for ``span`` [s]."""
+        """Keep a processed measurement, and delete kept ones that are more than ``span`` [s] older."""
         self._taken.append(taken)
         while self._taken[0].measurement.t < taken.measurement.t - span:
             self._taken.popleft()
 
     def _take_back(self, t: float) -> list[Measurement]:
-        """Undo the measurements from ``t`` on; returned are these in the order of their times."""
+        """Undo all measurements from time ``t`` [s] on. Returns these measurements in the order of their times."""
         undone = [taken for taken in self._taken if taken.measurement.t >= t]
         self._taken = deque(taken for taken in self._taken if taken.measurement.t < t)
         for taken in reversed(undone):
@@ -170,7 +178,7 @@ class Timeline(ABC):
         return sorted((taken.measurement for taken in undone), key=lambda m: m.t)
 
     def _go_back(self, taken: Taken) -> None:
-        """Return to the state before a measurement."""
+        """Restore the estimator's state from before a measurement."""
         return
 
     def _drop_late(self, m: Measurement) -> None:
