@@ -1,4 +1,4 @@
-"""A cloud of weighted particles: its moments, its modes, its density, resampling, and the correction by a likelihood."""
+"""A cloud of weighted particles: moments, modes, kernel density, resampling, and the correction by a likelihood."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
 
-# of a cloud that has collapsed to one point: its covariance must still be one
+# Is added to the variances of poses, so that the covariance of identical particles is invertible.
 MINIMUM_VARIANCE = 1e-10
-LEAST_VARIANCE = 1e-30  # of constants, in their units: particles that all descend from one must not make them exact
-NOWHERE = np.zeros(3)
+LEAST_VARIANCE = 1e-30  # is added to the variances of constants, so that identical particles do not make them exact
+NOWHERE = np.zeros(3)  # a motion of zero
 NO_ODOMETRY = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-MODES = 5  # at most
-REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: from the middle of a mode to its ends
-BISECTIONS, SMALLEST = 8, 0.01  # steps to find the share of the remaining likelihood; least share of it
-LEAST = 1e-3  # least share of the whole likelihood: the steps end even if no particle explains it
-CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad: size of the cells among which the heaviest is sought
+MODES = 5  # maximum number of modes
+REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: half the size of a mode
+# Number of bisections to find the exponent of the next step of a correction, and its minimum relative to the remaining exponent.
+BISECTIONS, SMALLEST = 8, 0.01
+LEAST = 1e-3  # minimum exponent of a step, so that a correction ends even if no particle explains the measurement
+CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad: size of the cells, of which that with the largest weight begins a mode
 
 T = TypeVar("T")
-Steps = Generator[float, None, T]  # a computation in steps: it yields the work of each step and returns the result
+Steps = Generator[float, None, T]  # a computation in steps, which yields the cost of each step and returns the result
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """``poses`` (N, 3), ``constants`` (N, P) of odometry and sensor, and normalised ``log_weights`` (N,).
+    """N weighted particles at one time.
 
-    ``parts``: the columns of each block in them. ``localized``: the place is known. ``odometry``: that of when the particles were
-    there.
+    ``poses`` (N, 3). ``constants`` (N, P): each particle's estimated constants of odometry and sensors.
+    ``log_weights`` (N,): normalised. ``localized``: True if there is only one mode.
+    ``parts``: the columns of each named block in ``constants``. ``odometry``: the integrated odometry at the time of the particles.
     """
 
     poses: Array
@@ -52,54 +54,58 @@ class Cloud:
 
     @cached_property
     def moments(self) -> tuple[Array, Array]:
-        """Mean (3,) and covariance (3, 3) in the world's frame."""
+        """The mean (3,) and covariance (3, 3) of the poses in the world frame."""
         return pose_moments(self.poses, self.weights)
 
     @cached_property
     def joint(self) -> tuple[Array, Array]:
-        """Mean (P,) of the constants, and covariance (3+P, 3+P) of the pose's body-frame perturbation and of them."""
+        """The mean (P,) of the constants, and the covariance (3+P, 3+P) of the pose's body-frame perturbation and the constants."""
         _, mean, covariance = self._errors()
         return mean[3:], covariance
 
     def _errors(self) -> tuple[Array, Array, Array]:
-        """Of each particle the pose's body-frame perturbation from the mean pose, and the constants: (N, 3+P), with moments."""
+        """For each particle the body-frame perturbation of its pose from the mean pose, and its constants (N, 3+P). Also returns
+        their mean (3+P,) and covariance (3+P, 3+P)."""
         errors = np.concatenate((se2.twists_to(self.moments[0], self.poses), self.constants), axis=1)
         return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
-        """With one more block, drawn from a Gaussian with ``mean`` (d,) and ``covariance`` (d, d)."""
+        """The cloud with one more block of constants, drawn from a Gaussian with ``mean`` (d,) and ``covariance`` (d, d)."""
         first = self.constants.shape[1]
         drawn = mean + positive.draws(covariance, len(self.poses), rng)
         parts = {**self.parts, name: slice(first, first + len(mean))}
         return replace(self, constants=np.concatenate((self.constants, drawn), axis=1), parts=parts)
 
     def weighed(self, likelihood: Array, share: float) -> tuple[Cloud, float]:
-        """The particles after a share of a log-likelihood (N,), and the log of its mean."""
+        """Multiply the weights by a likelihood to the power of ``share``. ``likelihood`` (N,): its logarithm. Returns the new
+        cloud, and the logarithm of the mean of the factors."""
         weighed = self.log_weights + share * likelihood
         log_weights = normalised(weighed)
         heaviest = int(np.argmax(weighed))
         return replace(self, log_weights=log_weights), float(weighed[heaviest] - log_weights[heaviest])
 
     def thinned(self, count: int) -> Cloud:
-        """About so many of the particles, as far apart in their order as there is room."""
+        """About ``count`` of the particles, evenly spaced in their order."""
         some = slice(None, None, max(1, len(self.poses) // count))
         weights = normalised(self.log_weights[some])
         return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
 
     def density(self) -> tuple[Cloud, Array]:
-        """A kernel density with the moments of the sampled density: poses shrunk towards their mean, each with a Gaussian kernel
-        (Liu, West, in "Sequential Monte Carlo Methods in Practice", 2001, eq. 10.3.8). The kernel's width depends on the number
-        of particles (:func:`silverman`). Given the pose the constants are Gaussian. As particles few distinct constants would
-        survive, long before landmarks determine them.
+        """A kernel density with the same moments as the particles.
 
-        Returns the shrunk cloud and the kernel's covariance (3+P, 3+P), of the pose's body-frame perturbation and of the
-        constants. With several modes the kernel does not change the poses.
+        The poses are shrunk towards their mean, and each gets a Gaussian kernel (Liu, West, in "Sequential Monte Carlo Methods in
+        Practice", 2001, eq. 10.3.8), whose width depends on the number of particles (:func:`silverman`). The constants given the
+        pose are modelled as Gaussian. Otherwise resampling would leave few distinct constants long before landmarks determine them.
+
+        Returns the shrunk cloud, and the covariance (3+P, 3+P) of the kernel for the pose's body-frame perturbation and the
+        constants.
+        If the cloud has several modes, the kernel does not change the poses.
         """
         weights = self.weights
         middle, _ = self.moments
         errors, mean, covariance = self._errors()
-        # The covariance of a weighted sample is too small by the factor 1 - sum(w^2), and smaller still if many particles have few
-        # ancestors. Without a correction the constants would lose this share with each resampling.
+        # The covariance of a weighted sample is too small by the factor 1 - sum(w^2), and even smaller if particles have few
+        # ancestors. Without a correction the variance of the constants would shrink at each resampling.
         lost = float(weights @ weights)
         diagonal = range(3, len(covariance))
         covariance[diagonal, diagonal] += LEAST_VARIANCE
@@ -122,7 +128,8 @@ class Cloud:
         return cloud, kernel + _inflated(covariance - explained, lost)
 
     def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
-        """Particles of equal weight: those of ``rows`` (M,), each with a draw from a ``kernel`` (3+P, 3+P)."""
+        """Draw particles of equal weight from a kernel density. ``rows`` (M,): the indices of the particles to draw around.
+        ``kernel`` (3+P, 3+P): the covariance of the kernel."""
         noise = positive.draws(kernel, len(rows), rng)
         return replace(
             self,
@@ -132,7 +139,7 @@ class Cloud:
         )
 
     def modes(self) -> tuple[Mode, ...]:
-        """The modes, heaviest first, each with the moments of the particles around it."""
+        """The modes, in order of decreasing weight, each with the moments of the particles around its centre."""
         weights = self.weights
         modes: list[Mode] = []
         _, which = np.unique(cell_numbers(self.poses, CELL), return_inverse=True)
@@ -149,7 +156,8 @@ class Cloud:
 
 
 class Corrected(NamedTuple):
-    """Particles after a share of a likelihood, the log of its mean over them, and the share that is ``left``."""
+    """Particles after a correction. ``evidence``: the logarithm of the mean likelihood over the particles. ``left``: the exponent
+    of the likelihood that was not applied, 0 if it was applied completely."""
 
     cloud: Cloud
     evidence: float
@@ -167,12 +175,18 @@ def corrected(
     left: float = 1.0,
     to_end: bool = True,
 ) -> Steps[Corrected]:
-    """Progressive correction (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.4).
+    """Progressive correction of particles by a likelihood (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in
+    Practice", 2001, section 12.4).
 
-    The log-likelihood (N,) of a measurement at ``t`` is applied in shares. Each is the largest that keeps ``enough`` effective
-    particles. They are resampled after each share, after the last one only if fewer than ``below`` times N are effective.
-    ``left``: the part of the log-likelihood to apply. Without ``to_end`` the last share is not applied. RunFailedError if no
-    particle is possible.
+    The likelihood is written as a product of powers, whose exponents have the sum 1. The powers are applied one by one. Each
+    exponent is the largest that keeps enough effective particles. The particles are resampled after each step.
+
+    ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a resampled cloud.
+    ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the time of the measurement.
+    ``below``: after the last step, the particles are resampled only if the effective number is below this fraction of N.
+    ``left``: the sum of the exponents to apply. ``to_end``: if False, the last step is left out.
+
+    Raises RunFailedError if the likelihood is not finite for all particles with a weight.
     """
     evidence = 0.0
     while left > 0.0:
@@ -188,7 +202,7 @@ def corrected(
 
 
 def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
-    """A function of particles as a computation of one step, whose work is not counted."""
+    """Convert a function of particles to a computation of one step, with cost 0."""
 
     def steps(cloud: Cloud) -> Steps[T]:
         yield 0.0
@@ -198,7 +212,7 @@ def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
 
 
 def finished(steps: Steps[T]) -> T:
-    """The result of a computation in steps."""
+    """Run a computation in steps to its end and return the result."""
     while True:
         try:
             next(steps)
@@ -208,7 +222,8 @@ def finished(steps: Steps[T]) -> T:
 
 
 def systematic(weights: Array, rng: np.random.Generator, count: int | None = None) -> NDArray[np.int64]:
-    """Indices of ``count`` draws (as many as weights by default) by systematic resampling (Kitagawa, 1996)."""
+    """Draw ``count`` indices with probabilities proportional to ``weights`` (N,), by systematic resampling (Kitagawa, 1996). The
+    default count is N."""
     count = len(weights) if count is None else count
     positions = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
@@ -216,7 +231,7 @@ def systematic(weights: Array, rng: np.random.Generator, count: int | None = Non
 
 
 def around(poses: Array, middle: Array) -> NDArray[np.bool_]:
-    """Which of the poses (N, 3) belong to a mode with this ``middle`` (3,)."""
+    """A mask (N,) of the poses (N, 3) that belong to a mode with the centre ``middle`` (3,)."""
     difference = np.abs(poses - middle)
     difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
     return np.asarray(np.all(difference < REACH, axis=1))
@@ -231,8 +246,11 @@ def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
 
 
 def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
-    """The largest share of the log-likelihood (N,), at most ``left``, that keeps ``enough`` effective particles.
-    It is at least :data:`LEAST`, so that a likelihood is applied in a few hundred shares at most."""
+    """The largest exponent of a likelihood, at most ``left``, that keeps ``enough`` effective particles.
+
+    ``log_weights`` (N,): of the particles. ``likelihood`` (N,): the log-likelihood. The result is at least :data:`LEAST`, so that a
+    correction has at most a few hundred steps.
+    """
 
     def effective(share: float) -> float:
         weighed = log_weights + share * likelihood
@@ -249,54 +267,55 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 
 
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
-    """A log-likelihood (N,) at time ``t`` [s] with -inf in place of NaN, for particles with ``log_weights`` (N,).
+    """Replace values of a log-likelihood (N,) that are not finite by ``-inf``, which gives these particles no weight.
 
-    Such particles are impossible. RunFailedError if all particles are.
+    ``log_weights`` (N,): of the particles. ``t`` [s]: the time of the measurement, for the message. Raises RunFailedError if no
+    particle with a weight has a finite value.
     """
     possible = np.isfinite(likelihood)
     if possible.all():
         return likelihood
     if not np.isfinite(log_weights[possible]).any():
-        raise RunFailedError(
-            f"at {t:.3f} s the likelihood of a measurement is a finite number for none of the particles"
-        )
+        raise RunFailedError(f"the likelihood of the measurement at {t:.3f} s is not finite for any of the particles")
     return np.where(possible, likelihood, -np.inf)
 
 
 def effective_size(log_weights: Array) -> float:
-    """Of normalised log-weights (N,) (Kong, Liu, Wong, 1994)."""
+    """The effective number of particles with normalised log-weights (N,) (Kong, Liu, Wong, 1994)."""
     return float(1.0 / np.sum(np.exp(2.0 * log_weights)))
 
 
 def normalised(log_weights: Array) -> Array:
-    """Log-weights (N,) whose weights sum to one."""
+    """Normalise log-weights (N,), so that the weights have the sum 1."""
     log_weights = log_weights - log_weights.max()
     return np.asarray(log_weights - np.log(np.sum(np.exp(log_weights))))
 
 
 def silverman(count: int, size: int) -> float:
-    """Bandwidth, as a share of the standard deviation, of Gaussian kernels on ``count`` points in ``size`` dimensions
-    (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
+    """The bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions, as a fraction of the points' standard
+    deviation (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
     return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
 
 
 def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """Weighted mean (3,), circular in heading, and covariance (3, 3) of poses (N, 3) in the world's frame."""
+    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) in the world frame.
+    ``weights`` (N,): must have the sum 1."""
     mean, covariance = se2.moments(poses, weights)
     return mean, covariance + np.diag(np.full(3, MINIMUM_VARIANCE))
 
 
 def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
-    """Weighted mean (P,) and covariance (P, P) of vectors (N, P)."""
+    """The weighted mean (P,) and covariance (P, P) of vectors (N, P). ``weights`` (N,): must have the sum 1."""
     mean = weights @ values
     error = values - mean
     return mean, (weights[:, None] * error).T @ error
 
 
 def _inflated(covariance: Array, lost: float) -> Array:
-    """A covariance that has lost this share."""
+    """Correct a covariance that is too small by the factor ``1 - lost``."""
     return covariance / max(1.0 - lost, 0.5)
 
 
 def _normalised_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
+    """:func:`pose_moments` with weights of any sum."""
     return pose_moments(poses, weights / weights.sum())

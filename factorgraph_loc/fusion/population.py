@@ -1,12 +1,13 @@
-"""The particles of a search: poses anywhere in the map, weighed by the observations of all sensors.
+"""The particles of a global search: poses anywhere in the map, weighed by the observations of all sensors.
 
-They begin evenly over the bounds of the map, over its free space, or with any heading at a known position. Each observation is
-applied by progressive correction (:func:`~factorgraph_loc.fusion.cloud.corrected`), so that few particles find narrow modes.
-Resampling draws from kernels whose width in a large map is that of the first particles' distances. The number of particles follows
-the size of the posterior (KLD sampling: Fox, IJRR 22(12), 2003, eq. 7). Each resampling also draws some particles anywhere, and
-some near others, with little weight. They recover a pose that was lost because tags were silent or misplaced.
+The first particles are uniform over the bounds of the map, over its free space, or over all headings at a known position. Each
+observation is applied by progressive correction (:func:`~factorgraph_loc.fusion.cloud.corrected`), so that few particles can find
+narrow modes. Resampling draws new particles from kernels around old ones. In a large map the first kernels are as wide as the
+distances between the particles. The number of particles follows from the size of the posterior (KLD sampling: Fox, IJRR 22(12),
+2003, eq. 7). Each resampling also draws some particles anywhere, and some near existing particles, with little weight. These
+recover a pose that was lost because of missed or misplaced tags.
 
-Observations wait in a queue and are processed in slices of fixed work, so that results do not depend on the machine.
+Observations wait in a queue and are processed in slices of fixed cost, so that results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -30,35 +31,39 @@ from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
 
-DENSITY = 25.0  # particles per m^2 and rad at first
+DENSITY = 25.0  # initial number of particles per m^2 and rad
+# minimum of the initial number, maximum, and minimum of later numbers
 FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
-GROWTH = 4  # largest factor on the number of particles in one resampling
-RESAMPLE_BELOW, ENOUGH = 0.5, 0.2  # relative effective sizes: when to resample; what a share of a likelihood leaves
-FRESH, ELSEWHERE = 2000, 1e-3  # new particles at a resampling, and their total weight
-ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))  # number of these near other particles, and their distance: m, m, rad
-NOISE = 2.0  # factor on the covariance of the odometry, for its constants, which are not estimated here
-OUTSIDE = -1.0  # log-weight per motion of a particle outside of free space
+GROWTH = 4  # largest factor by which one resampling increases the number of particles
+# Effective sizes as fractions of the number of particles: the limit for resampling, and the minimum after a step of a correction.
+RESAMPLE_BELOW, ENOUGH = 0.5, 0.2
+FRESH, ELSEWHERE = 2000, 1e-3  # number of additional particles at each resampling, and their total weight
+# number of these that are near existing particles, and their distance: m, m, rad
+ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))
+NOISE = 2.0  # factor of the covariance of odometry, because its constants are not estimated here
+OUTSIDE = -1.0  # change of the log-weight, at each motion, of a particle outside of free space
 
-NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2  # weight at a pose that is denied; m, m, rad
+# The particles reject a pose if less than this weight is within REACH standard deviations of the pose. Its covariance is increased
+# first, by standard deviations in m, m, rad.
+NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2
+REACH = 5.0
 
-# A pose is clear once one of these probabilities that the robot is so near, m and rad, has lasted for its time, s.
+# A pose is clear if the probability that the robot is within these distances of the pose [m, rad] has exceeded one of the following
+# limits for the time [s] of that limit.
 NEAR_POSITION, NEAR_HEADING = 0.5, math.radians(15.0)
 CLEAR = ((0.95, 1.0), (0.85, 3.0))
-CLEAR_OBSERVATIONS, CLEAR_THINGS = (
-    3,
-    2,
-)  # least number of observations with detections, and of different detected things
-REACH = 5.0  # standard deviations, within which weight counts for a pose that is denied
+# A clear pose needs at least this many observations with detections, and this many different tags or landmarks.
+CLEAR_OBSERVATIONS, CLEAR_THINGS = 3, 2
 
-# Work: that of one tag for one particle, some nanoseconds, is 1.
-CHUNK = 500_000  # of one step
-PARTICLE = 25  # of a particle, besides what the observation says
+# Costs, in units of the cost of one tag for one particle, which is some nanoseconds.
+CHUNK = 500_000  # of one step of a computation
+PARTICLE = 25  # of a particle, in addition to the cost of the observation
 RESAMPLED = 60  # of a particle in each half of a resampling
-BEGUN = 80  # of a particle at first, with what the sensors make for the search
+BEGUN = 80  # of an initial particle, including the preparation of the sensors for the search
 
 
 class Evidence(Protocol):
-    """An observation as far as particles need it; see :class:`~factorgraph_loc.sensors.base.Observation`."""
+    """The part of an :class:`~factorgraph_loc.sensors.base.Observation` that particles need."""
 
     @property
     def found(self) -> int: ...
@@ -70,7 +75,8 @@ class Evidence(Protocol):
 
 
 class WeighedObservation(NamedTuple):
-    """An observation with the odometry at its time, and its log-probability under the track (``evidence``), if there is one."""
+    """An observation with the integrated ``odometry`` at its time. ``evidence``: its log-probability given the track, zero if there
+    is no track."""
 
     odometry: ChainState
     observation: Evidence
@@ -78,10 +84,14 @@ class WeighedObservation(NamedTuple):
 
 
 class Population:
-    """Particles anywhere; see the module. The robot is within ``bounds`` (2, 2): lower and upper corner [m]; ``start``: at a known
-    position; ``space``: in free space. ``fewest``: least number of particles, at least :data:`ASTRAY`.
+    """The particles of a global search. See the module.
 
-    ``rival_evidence``: log-probability of all observations under the track that the population competes with.
+    ``motion``: the odometry. ``bounds`` (2, 2) [m]: the lower and upper corner of the area in which the robot is.
+    ``start``: a known start position, or None. ``space``: the free space in which the robot is, or None.
+    ``fewest``: the minimum number of particles, at least :data:`ASTRAY`.
+
+    Attributes: ``log_evidence``, the log-probability of all observations for a robot that began anywhere; ``rival_evidence``, that
+    of the same observations given the track; ``newest``, the integrated odometry at the last processed observation.
     """
 
     at_once = False
@@ -98,12 +108,12 @@ class Population:
         self._motion, self._bounds, self._rng, self._start = motion, bounds, rng, start
         self._space, self._fewest = space, max(fewest, ASTRAY)
         self._cloud: Cloud | None = None
-        self._room = np.empty(0)  # of each particle for itself, in cells, when it was drawn
-        self._begun: ChainState | None = None  # at the last observation that left the queue
+        self._room = np.empty(0)  # the volume per particle, in cells, when each particle was drawn
+        self._begun: ChainState | None = None  # the odometry at the last observation that left the queue
         self._hypotheses: tuple[Mode, ...] | None = ()
-        self._informative = 0  # observations with detections
-        self._things: set[Hashable] = set()
-        self._since = [math.inf for _ in CLEAR]  # since when the pose has had these probabilities
+        self._informative = 0  # number of observations with detections
+        self._things: set[Hashable] = set()  # the detected tags and landmarks
+        self._since = [math.inf for _ in CLEAR]  # s; since when the probability has exceeded each limit of CLEAR
         self._waiting: deque[WeighedObservation] = deque()
         self._running: Steps[None] | None = None
         self.newest: ChainState | None = None  # the odometry at the last observation that was processed
@@ -112,19 +122,19 @@ class Population:
 
     @property
     def waits(self) -> bool:
-        """Whether an observation is not yet processed."""
+        """True if an observation is not yet processed completely."""
         return self._running is not None or bool(self._waiting)
 
     @property
     def hypotheses(self) -> Sequence[Mode]:
-        """The modes at the last observation, most likely first."""
+        """The modes of the particles at the last observation, most likely first."""
         if self._hypotheses is None:
             self._hypotheses = self._cloud.modes() if self._cloud is not None else ()
         return self._hypotheses
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last observation if one mode is clear, else None."""
+        """The robot's pose at the last observation if one mode is clear, otherwise None."""
         at = self.newest
         if at is None or all(at.t < since + lasts for since, (_, lasts) in zip(self._since, CLEAR, strict=True)):
             return None
@@ -133,11 +143,11 @@ class Population:
 
     @property
     def particles(self) -> tuple[Array, Array]:
-        """Poses (N, 3) at the last observation and weights (N,); none before the first observation."""
+        """The particles' poses (N, 3) at the last observation and weights (N,). Both are empty before the first observation."""
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
-        """Queue a :class:`WeighedObservation`; False if it is older than the last one and is left out."""
+        """Queue an observation, see :class:`WeighedObservation`. Returns False if it is older than the last one and is ignored."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
         if newest is not None and odometry.t < newest.t:
             return False
@@ -145,7 +155,7 @@ class Population:
         return True
 
     def advance(self, work: float = math.inf) -> bool:
-        """Process the queue for this much ``work``; whether an observation was completed."""
+        """Process the queue until the cost exceeds ``work``. Returns True if an observation was completed."""
         done = False
         while work > 0.0 and (self._running is not None or self._waiting):
             if self._running is None:
@@ -159,8 +169,8 @@ class Population:
         return done
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) at the last observation, drawn from all modes, or from the one that is clear; none before the first
-        observation."""
+        """Draw ``count`` poses (N, 3) at the last observation, from the clear mode, or from all modes if none is clear. Empty
+        before the first observation."""
         if self._cloud is None:
             return np.empty((0, 3))
         best, weights = self.best, self._cloud.weights
@@ -168,7 +178,7 @@ class Population:
         return kld.jittered(self._cloud.poses, rows, rng)
 
     def denies(self, place: PosePrior) -> bool:
-        """Whether the observations exclude a pose at the time of the last one."""
+        """True if the particles reject the pose ``place``, which must be at the time of the last observation."""
         if self._informative < CLEAR_OBSERVATIONS or self.newest is None or place.t != self.newest.t:
             return False
         assert self._cloud is not None
@@ -179,7 +189,7 @@ class Population:
         return float(self._cloud.weights[near].sum()) < NEGLIGIBLE
 
     def _processed(self, new: WeighedObservation) -> Steps[None]:
-        """Predict to an observation and apply it."""
+        """Predict the particles to the time of an observation and apply it, in steps."""
         odometry, observation = new.odometry, new.observation
         if self._cloud is None or self.newest is None:
             count = int(np.clip(DENSITY * self._volume, FEWEST_AT_FIRST, MOST))
@@ -210,7 +220,7 @@ class Population:
         ]
 
     def _weight_of_best(self) -> float:
-        """The probability that the robot is near the heaviest mode; 0 with too few observations."""
+        """The probability that the robot is near the mode with the largest weight, or 0 if there are too few observations."""
         if self._informative < CLEAR_OBSERVATIONS or len(self._things) < CLEAR_THINGS or self._cloud is None:
             return 0.0
         error = self._cloud.poses - self.hypotheses[0].pose
@@ -247,12 +257,12 @@ class Population:
         return float(area) * 2.0 * math.pi
 
     def _room_of(self, count: int) -> Array:
-        """The room (N,) of each of ``count`` particles that are drawn anywhere, in cells; none around a known position."""
+        """The volume (N,) per particle, in cells, of ``count`` particles drawn anywhere; zero if the start position is known."""
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:
-        """Poses (N, 3) where the robot may be ``now``: from its start, evenly over free space, or evenly over the bounds, one in
-        each layer of each axis (Latin hypercube)."""
+        """Draw poses (N, 3) without any information from observations. They are around the known start position moved to ``now``,
+        or uniform over free space, or uniform over the bounds as a Latin hypercube."""
         if self._start is not None:
             return self._start.drawn(self._rng, count, now)
         if self._space is not None:
@@ -264,11 +274,12 @@ class Population:
 
 
 def _cloud(poses: Array, log_weights: Array) -> Cloud:
+    """Particles without constants, which may have several modes."""
     return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
 
 
 def _likelihood(observation: Evidence, cloud: Cloud) -> Steps[Array]:
-    """The log-likelihood (N,) of the particles, in chunks."""
+    """The log-likelihood (N,) of the particles, computed in steps of about equal cost."""
     each = PARTICLE + observation.work
     count = max(1, CHUNK // each)
     parts = []

@@ -1,9 +1,10 @@
-"""The search for the robot's pose where no track gives it: unknown start, unknown heading, lost track, active localization.
+"""The global search for the robot's pose: at an unknown start, with an unknown heading, after a lost track, in active localization.
 
-Sensors that find a pose from their own measurements propose it (:class:`~factorgraph_loc.sensors.base.Finder`). Others, such as
-RFID, only weigh poses: then particles anywhere in the map (:mod:`.population`) are weighed by all sensors, so that their evidence
-adds up. Particles are weighed in slices of fixed work (:meth:`Search.advance`), so that no measurement waits for them.
-:mod:`.tracking` compares a track with its observations, and starts a search if they contradict it.
+Some sensors can find a pose from their own measurements (:class:`~factorgraph_loc.sensors.base.Finder`). Other sensors, such as
+RFID, can only weigh given poses. For these, particles anywhere in the map (:mod:`.population`) are weighed by the measurements of
+all sensors together. The particles are weighed in slices of fixed cost (:meth:`Search.advance`), so that measurements are not
+delayed.
+:mod:`.tracking` compares the estimated poses with their observations, and starts a search if they contradict each other.
 """
 
 from __future__ import annotations
@@ -25,14 +26,17 @@ from factors import se2
 from factors.motion import ChainState
 from factors.se2 import Array
 
-DURATION = 60.0  # s of observations that are kept
-SLICE = 2_500_000  # work (:mod:`.population`) of one slice
-PAUSE = 0.05  # least s between two slices: a measurement and a tick often arrive together
+DURATION = 60.0  # s: observations of this duration are kept
+SLICE = 2_500_000  # cost of one slice, in the units of `population`
+PAUSE = 0.05  # s: minimum time between two slices, because a measurement and a tick often arrive together
 
 
 class Search:
-    """The search; see the module. ``sensors``: by name. ``space``: where the robot may be, by default
-    within the bounds of the sensors; ``fewest``: least number of particles; ``work``: of one slice."""
+    """A global search for the robot's pose. See the module.
+
+    ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space in which the robot may be; None means the
+    bounds of the sensors' maps. ``fewest``: the minimum number of particles. ``work``: the cost of one slice.
+    """
 
     def __init__(
         self,
@@ -48,31 +52,31 @@ class Search:
         bounds = [s.bounds for s in sensors.values() if s.bounds is not None]
         if space is not None:
             bounds = [np.array((space.centres.min(axis=0), space.centres.max(axis=0)))]
-        self._weighs = bool(bounds)  # whether particles are weighed
+        self._weighs = bool(bounds)  # True if the search uses particles
         within = np.array((np.min(bounds, axis=0)[0], np.max(bounds, axis=0)[1])) if bounds else np.zeros((2, 2))
         self._new_population = partial(Population, motion, within, rng, space=space, fewest=fewest)
         self._population = self._new_population() if self._weighs else None
-        self._last: dict[str, float] = {}  # time of each sensor's last evidence
-        self._advanced = -math.inf  # time of the last slice
+        self._last: dict[str, float] = {}  # the time [s] of the last observation of each sensor that the particles got
+        self._advanced = -math.inf  # s; the time of the last slice
         self._horizon = motion.horizon
         self.newest: ChainState | None = None  # the odometry at the last informative measurement
         self.start: KnownPosition | None = None
 
     @property
     def possible(self) -> bool:
-        """Whether any measurement could give a pose."""
+        """True if the sensors can determine a pose."""
         return bool(self._finders) or self._weighs
 
     def serves(self, sensor: Sensor) -> bool:
-        """Whether the search uses a sensor."""
+        """True if the search uses this sensor."""
         return sensor.name in self._sensors
 
     def remember(self) -> None:
-        """Keep the odometry for a later search."""
+        """Keep odometry for longer than usual, for a later search."""
         self._motion.horizon = self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:
-        """Search the heading at a known position; None ends that."""
+        """Begin a search for the heading at a known position ``start``. None ends the restriction to a position."""
         self.start = start
         for finder in self._finders.values():
             finder.start = start
@@ -81,7 +85,8 @@ class Search:
             self._population = self._new_population(start)
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process a measurement while the pose is unknown; False if it is uninformative."""
+        """Process a measurement while the pose is unknown. ``odometry``: the integrated odometry at its time. Returns True if the
+        measurement was informative, or if the particles completed an observation."""
         sensor, finder = self._sensors.get(m.source), self._finders.get(m.source)
         if sensor is None:
             return False
@@ -95,15 +100,16 @@ class Search:
         return self.advance(odometry.t) or is_informative
 
     def queue(self, observation: Evidence, odometry: ChainState) -> None:
-        """Queue an observation that is not from the search's own sensors, such as the free lengths of a proximity sensor.
+        """Queue an observation that does not come from the search's sensors, such as the free distances of a proximity sensor.
 
-        :meth:`advance` weighs the particles by it. No effect before the particles have processed their first observation.
+        :meth:`advance` then weighs the particles by it. The observation is ignored before the particles have processed their first
+        one.
         """
         if self._population is not None and self._population.newest is not None:
             self._population.add(odometry, observation)
 
     def advance(self, t: float) -> bool:
-        """Weigh the particles for one slice of work at ``t``; whether an observation was completed."""
+        """Weigh the particles for one slice of work at time ``t`` [s]. Returns True if an observation was completed."""
         if self._population is None or (t < self._advanced + PAUSE and self._work < math.inf):
             return False
         self._advanced = t
@@ -116,7 +122,7 @@ class Search:
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose, at its time, if one is clear; else None."""
+        """The robot's pose at the time of the last observation, or None if no pose is clear yet."""
         for finder in self._finders.values():
             best = finder.best
             if best is not None and not self._denied(best):
@@ -125,15 +131,16 @@ class Search:
 
     @property
     def waits(self) -> bool:
-        """Whether an observation is not yet weighed."""
+        """True if the particles have not yet processed all queued observations."""
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """Whether the particles reject this pose, or have not processed the measurement it came from."""
+        """True if the particles reject this pose, or have not yet processed the measurement that it came from."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
-        """Hypotheses of the pose at ``t``, most likely first; at least one for a known start position."""
+        """The hypotheses of the pose at time ``t`` [s], most likely first. The list is empty if nothing is known. At a known start
+        position there is at least one."""
         now, leading = self._motion.state(t), self._leading
         if leading is None or leading.newest is None or not leading.hypotheses:
             return [] if self.start is None else [self.start.mode(now)]
@@ -144,7 +151,7 @@ class Search:
         ]
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
-        """Poses (N, 3) at ``t`` and weights (N,) of the particles, if these lead the search."""
+        """The particles' poses (N, 3) at time ``t`` [s] and weights (N,). None if the present result is not from particles."""
         leading = self._leading
         if not isinstance(leading, Population) or leading.newest is None:
             return None
@@ -152,7 +159,8 @@ class Search:
         return se2.compose(poses, self._motion.relative(leading.newest, self._motion.state(t)).delta), weights
 
     def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> tuple[Array, ChainState] | None:
-        """Random poses (N, 3), and the odometry there, not later than ``now``; None before any informative measurement."""
+        """Draw ``count`` poses from the result of the search. Returns poses (N, 3) and the integrated odometry at their time, which
+        is not later than ``now``. Returns None before the first informative measurement."""
         leading = self._leading
         if leading is None:
             return None
@@ -160,7 +168,7 @@ class Search:
         return poses, now if reached is None or reached.t >= now.t else reached
 
     def end(self) -> None:
-        """The pose is known: forget the measurements of the search."""
+        """End the search and delete its measurements, because the pose is known."""
         self.begin(None)
         for finder in self._finders.values():
             finder.clear()
@@ -168,7 +176,9 @@ class Search:
 
     @property
     def _leading(self) -> Finder | Population | None:
-        """Which source leads: a finder that one measurement is enough for, else the particles, else any finder."""
+        """The source of the present result: a finder that needs only one measurement, otherwise the particles, otherwise any
+        finder.
+        None if no source is informative yet."""
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):
@@ -178,7 +188,7 @@ class Search:
         return next(iter(informative), None)
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
-        """Whether a sensor's last evidence is long enough ago."""
+        """True if the particles should get an observation of this sensor at time ``t`` [s]: the last one is long enough ago."""
         last = self._last.get(sensor.name, -math.inf)
         if t <= last or t < last + sensor.evidence_every:
             return False

@@ -1,14 +1,17 @@
-"""Whether the observations contradict a track: the robot is elsewhere, or the odometry is wrong.
+"""Detection of observations that contradict the track: the robot is at another pose, or the odometry is wrong.
 
-While a track lasts, recent observations are kept with their log-probabilities under the track. Once a sensor doubts the track, the
-particles of the search begin with these observations. The track is rejected when the log-odds of another pose exceed
-:data:`REFUTING`.
+A track is the sequence of estimated poses since the last (re)start of the estimator. Recent observations are kept with their
+log-probabilities given the track. When a sensor doubts the track, a search with particles begins with these observations. The track
+is rejected when the log-odds of another pose exceed :data:`REFUTING`.
 
-The odometry is wrong where the wheels slip, or where the robot is carried. One observation that contradicts the track may be wrong.
-Several that agree on another way of the robot are not. So two hypotheses compete with the track and with the odometry for the same
-observations, by their robust likelihoods: the robot goes another share of the way that the odometry reports, or, if the wheels are
-at rest, it moves at a constant velocity. When one of them wins the motion is unknown. That ends when the odometry explains the
-observations better than the hypotheses.
+The odometry is wrong if the wheels slip, or if the robot is carried. One observation that contradicts the track may be an outlier.
+Several observations that agree on a different motion are not. Two alternatives are therefore compared with the track and with the
+odometry, by the robust likelihoods of the same observations:
+
+- the robot has moved a different fraction of the distance that the odometry reports;
+- the wheels are at rest, but the robot moves with a constant velocity.
+
+If one alternative is clearly more likely, the motion counts as unknown, until the odometry explains the observations better again.
 """
 
 from __future__ import annotations
@@ -34,37 +37,39 @@ from factors.motion import ChainState, Increment
 from factors.se2 import Array
 from factors.update import Correction
 
-REFUTING = 8.0  # log-odds against a track that reject it: kidnappings are rare
-BEFORE = 2.0  # s: a change is at most this much earlier than a suspicion or its evidence
-UNSURE = 5.0  # largest difference of a possible change's log-likelihood from the highest
+REFUTING = 8.0  # log-odds against a track that reject it; high, because robots are rarely carried
+BEFORE = 2.0  # s: the robot left the track at most this long before the first doubt, or before evidence of that
+# times at which the robot may have left the track have a log-likelihood within this difference of the highest
+UNSURE = 5.0
 NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
 CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known with variances of its position below this sum
-PROBATION = 5.0  # s after the rejection of a track: further measurements may contradict the next one
-# m, m, rad: standard deviations of the prior at a pose of the search. They are wide: the same measurements enter a graph as
-# factors, and the odometry that moved the particles of the search may have failed.
+PROBATION = 5.0  # s; for this time after a rejection the new track is not yet reported as localized
+# Covariance that is added to a pose from the search (standard deviations in m, m, rad). It is large, because the same measurements
+# are also factors of a graph, and because the odometry that moved the search's particles may have failed.
 FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 APART = 16.0  # squared Mahalanobis distance: above it a pose differs from the track
-WINDOW = 3.0  # s: duration of the compared observations
-ONSETS = (0.75, 1.5, 3.0)  # s ago: possible times of the begin or end of wheel slip
-SHARES = (0.0, 0.33, 0.67, 1.5)  # possible shares of the reported distance that the robot has driven
-SURPRISING = 2.0  # standard deviations of the sum of surprises that starts a comparison
-ENOUGH = 2  # a comparison needs more observations
-STILL, SPEED = 0.05, 0.5  # m: largest reported distance of wheels at rest; m/s: speed of a carried robot
+WINDOW = 3.0  # s: observations of this duration are compared
+ONSETS = (0.75, 1.5, 3.0)  # s: possible times since the begin or end of wheel slip
+SHARES = (0.0, 0.33, 0.67, 1.5)  # alternatives for the fraction of the reported distance that the robot has moved
+SURPRISING = 2.0  # a comparison starts if the mean of K surprises exceeds this value divided by the square root of K
+ENOUGH = 2  # a comparison needs more observations than this
+STILL, SPEED = 0.05, 0.5  # m: largest reported distance of wheels at rest; m/s: assumed speed of a carried robot
 _ANGLES = np.arange(8) * math.pi / 4.0
-# velocities (9, 3) of a robot whose wheels are at rest: none, or carried in some direction
+# Alternatives (9, 3) for the velocity of a robot whose wheels are at rest: none, or SPEED in one of eight directions.
 CARRIED = np.concatenate((np.zeros((1, 3)), SPEED * np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(8)))))
-CLEAR = 3.0  # least length of the motion, in standard deviations of its start
-RARE, MOST = 7.0, 3.0  # least log-odds of a hypothesis: odometry is seldom wrong; most that one observation adds
-EVERY, HOLDS = 1.0, 1.0  # s between comparisons while the wheels slip; log-odds that end a slip
-# s: the last time of a carried robot at its old place (-inf if it never was there), and the first time at the new one. Between them
-# the pose is unknown and the final trajectory has no poses. Scoring does not interpolate over gaps longer than MAX_GAP, and thus
-# not over this one.
+CLEAR = 3.0  # a comparison needs a motion of this many standard deviations of the start position
+# Log-odds above which an alternative is accepted, high because odometry is rarely wrong; largest contribution of one observation.
+RARE, MOST = 7.0, 3.0
+EVERY, HOLDS = 1.0, 1.0  # s: interval between comparisons during a slip; log-odds for the odometry that end a slip
+# The times [s] between which a robot was carried: the last time at its old pose (-inf if it never was there), and the first time at
+# the new pose. In between the pose is unknown, and the final trajectory has no poses. The gap in the trajectory is at least MAX_GAP
+# long, because scoring interpolates over shorter gaps.
 Change = tuple[float, float]
-SPARE = 1e-3  # s: by this much a gap exceeds MAX_GAP
+SPARE = 1e-3  # s: a gap exceeds MAX_GAP by at least this much
 
 
 def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
-    """Whether the pose of the robot is known at times ``t`` (N,)."""
+    """A mask (N,) of the times ``t`` (N,) [s] at which the robot's pose is known: False while the robot was carried."""
     known = np.ones(len(t), dtype=bool)
     for last, first in changes:
         more = 0.5 * max(MAX_GAP + SPARE - (first - last), 0.0)
@@ -72,14 +77,15 @@ def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
     return known
 
 
-# sentences of events
+# messages of events
 LOST = "lost: {why} since {since:.1f} s"
 JUMPED = f"{LOST}; goes on at another place"
 SLIPS = "the odometry contradicts the observations since {since:.1f} s: the motion is not known"
 
 
 class Tracked(NamedTuple):
-    """The newest pose of a track: the odometry there, and ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+    """The newest estimate of a track: ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the integrated ``odometry`` at its
+    time."""
 
     odometry: ChainState
     pose: Array
@@ -87,8 +93,11 @@ class Tracked(NamedTuple):
 
 
 class Refuted(NamedTuple):
-    """The reason for the rejection of a track, and the time since which it is wrong. ``change``: the robot left the track between
-    these times; ``extra_covariance`` (3, 3): added to the covariance of the new pose."""
+    """The rejection of a track.
+
+    ``why``: the reason, for messages. ``since`` [s]: the track is wrong from this time on. ``change``: the interval in which the
+    robot left the track. ``extra_covariance`` (3, 3): must be added to the body-frame covariance of the new pose.
+    """
 
     why: str
     since: float
@@ -97,7 +106,7 @@ class Refuted(NamedTuple):
 
 
 class Tracking(Search):
-    """A search that compares a track with its observations; see the module. ``sensors``: by name."""
+    """A search that also compares a track with its observations. See the module. ``sensors``: the sensors by name."""
 
     def __init__(
         self, sensors: Mapping[str, Sensor], motion: Motion, rng: np.random.Generator, diagnostics: Diagnostics
@@ -105,25 +114,28 @@ class Tracking(Search):
         super().__init__(sensors, motion, rng)
         self.slips = SlipMonitor(motion, diagnostics)
         self._kept: deque[WeighedObservation] = deque()
-        self._looked: deque[float] = deque()  # times of observations of sensors with a finder
-        self._since = -math.inf
-        self._rejected = -math.inf  # time of the last rejection of a track by particles
+        self._looked: deque[float] = deque()  # times [s] of observations of sensors that can find a pose
+        self._since = -math.inf  # s; time of the first doubt about the track
+        self._rejected = -math.inf  # s; time of the last rejection of a track by particles
 
     def is_unsure(self, t: float, covariance: Array) -> bool:
-        """Whether the pose of a track at ``t``, with ``covariance`` (3, 3), is not known to :data:`NEAR` with probability
-        :data:`SURE`, its motion is unknown, or the last track was rejected less than :data:`PROBATION` ago."""
+        """True if the pose of a track at ``t`` [s] should not be reported as localized. ``covariance`` (3, 3): that of the pose.
+
+        This is so if the position error exceeds :data:`NEAR` with a probability above 1 - :data:`SURE`, if the motion is unknown,
+        or if the previous track was rejected less than :data:`PROBATION` ago.
+        """
         if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True
-        # the probability is at most that of a circle as wide as the trace
+        # cheap test first: the probability is at most that of a circular Gaussian with the same sum of variances
         return bool(covariance[0, 0] + covariance[1, 1] > CERTAIN and beyond(covariance, NEAR) > 1.0 - SURE)
 
     @property
     def doubts(self) -> bool:
-        """Whether a sensor doubts the track."""
+        """True if any sensor doubts the track."""
         return is_doubted(self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
-        """Record an observation that is about to be applied to a track."""
+        """Report an observation before it is applied to a track. Sensors that can find a pose use it to check the track."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
             self._looked.append(odometry.t)
@@ -133,7 +145,8 @@ class Tracking(Search):
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
-        """Keep an observation that was applied to a track; ``evidence()``: its log-probability under the track."""
+        """Store an observation after it was applied to a track, for a later search. ``evidence()``: returns its log-probability
+        given the track."""
         current = observation.at_its_time() if self._weighs else None
         if current is None or not self._is_due(sensor, odometry.t):
             return
@@ -144,9 +157,12 @@ class Tracking(Search):
             self._population.add(*self._kept[-1])
 
     def refuted(self, m: Any, track: Callable[[], Tracked], pose_at: Callable[[float, Array], Array]) -> Refuted | None:
-        """Why a track is wrong, if it is, after a measurement was applied to it, or at a tick; :attr:`best` is where the robot is.
+        """Check whether the track must be rejected. Call this after each measurement and at each tick.
 
-        ``track()``: the track at the measurement. ``pose_at(t, best)``: where the robot was at ``t`` if it is at ``best`` (3,) now.
+        ``m``: the measurement or tick. ``track()``: returns the track's estimate at that time. ``pose_at(t, best)``: returns the
+        robot's pose (3,) at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now. Returns None if the track is not
+        rejected.
+        If it is rejected, :attr:`best` is the robot's pose.
         """
         if isinstance(m, Tick) and not self.waits:
             return None
@@ -186,7 +202,7 @@ class Tracking(Search):
         return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at), FOUND)
 
     def brought(self, best: PosePrior, now: ChainState) -> PosePrior:
-        """A pose moved to where the odometry is ``now``."""
+        """Move a pose of the search by odometry to the later time of the odometry state ``now``."""
         if best.t >= now.t:
             return best
         since = self._motion.relative(self._motion.state(best.t), now)
@@ -194,8 +210,11 @@ class Tracking(Search):
         return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
 
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> tuple[float, Change]:
-        """The most likely time of the change, and the interval that contains it. Before the change the observations are more likely
-        on the track, from then on at the other pose."""
+        """Find when the robot left the track. Returns the most likely time [s], and the interval that contains it.
+
+        ``best``: the robot's present pose. Observations before that time are more likely given the track, later ones given
+        ``best``.
+        """
         times: list[float] = []
         likelihoods: list[float] = []  # logarithms, of a change just before each time
         total, highest, earliest = 0.0, -math.inf, self._since
@@ -214,7 +233,8 @@ class Tracking(Search):
         return times[int(np.argmax(likelihoods))], (last, times[possible[0]])
 
     def begin_track(self, *, by_search: bool) -> None:
-        """Begin a track: at the pose of the search (``by_search``), with its observations again, or at a given prior."""
+        """Begin a new track. ``by_search``: True if it begins at the pose of the search, whose observations are processed again;
+        False if it begins at a given prior."""
         self.end()
         if by_search:
             self._kept.clear()
@@ -222,9 +242,11 @@ class Tracking(Search):
 
 
 class _Compared(NamedTuple):
-    """An observation and its correction of a predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3).
+    """An observation that was applied to a track, for the comparison of motions.
 
-    ``observed()`` computes the observation. The robot has moved by ``offset`` from ``pose``; ``odometry``: at the observation.
+    ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation as a function of the pose at its
+    time, or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``: the motion
+    from that pose to the observation, or None. ``correction``: the correction of the pose by the observation.
     """
 
     odometry: ChainState
@@ -235,35 +257,39 @@ class _Compared(NamedTuple):
     correction: Correction
 
     def fit(self, observation: Observation) -> float:
-        """The log-likelihood of the observation at the corrected pose, less half the squared Mahalanobis distance that it moved."""
+        """The log-likelihood of the observation given the track: at the corrected pose, minus half the squared Mahalanobis distance
+        of the correction."""
         delta = self.correction.delta[:3]
         moved = float(positive.squared(delta, self.covariance))
         return float(observation.log_likelihood(self.corrected()[None], {})[0]) - 0.5 * moved
 
     def corrected(self) -> Array:
-        """The pose (3,) of the robot after the correction."""
+        """The corrected pose (3,) of the robot at the time of the observation."""
         pose = se2.moved(self.pose, self.correction.delta[:3])
         return pose if self.offset is None else se2.compose(pose, self.offset.delta)
 
 
 class SlipMonitor:
-    """Detects from the observations of a track that the odometry is wrong, and marks the ``motion`` as unknown.
-
-    An event records each time.
-    """
+    """Detects from a track's observations that the odometry is wrong. It then marks the ``motion`` as unknown and adds an event to
+    the
+    ``diagnostics``."""
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
         self._rows: deque[_Compared] = deque()
-        self._compared = -math.inf  # s: when the wheels were last compared, while they slip
+        self._compared = -math.inf  # s; time of the last comparison during a slip
 
     def add(
         self, observed: Callable[[], Observation | None], odometry: ChainState, view: View, correction: Correction
     ) -> None:
-        """Process an observation and the correction of a track by it. ``observed()``: the observation of the pose alone at its own
-        time; None if there is none."""
+        """Process an observation that has corrected a track.
+
+        ``observed()``: returns the observation as a function of the pose at its own time, or None. ``odometry``: the integrated
+        odometry at that time. ``view``: the estimator's state before the correction.
+        """
         t = odometry.t
-        while self._rows and self._rows[-1].odometry.t > t:  # late measurements are processed again
+        # later observations will be processed again after a late one
+        while self._rows and self._rows[-1].odometry.t > t:
             self._rows.pop()
         while self._rows and self._rows[0].odometry.t < t - WINDOW:
             self._rows.popleft()
@@ -283,13 +309,13 @@ class SlipMonitor:
                 self._compared = t
 
     def _are_surprising(self, t: float) -> bool:
-        """Whether the observations of the last seconds together are more surprising than chance allows."""
+        """True if the observations of the last seconds together are more surprising than random errors explain."""
         newest = [surprise(row.correction) for row in self._rows if row.odometry.t >= t - WINDOW / 2.0]
         return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """The log-odds that the odometry is wrong since the first observation after ``begin`` that is not surprising, and its time.
-        The odds are zero if the pose is not known well enough there."""
+        """The log-odds that the odometry is wrong since about the time ``begin`` [s], and the exact time assumed. That is the time
+        of the first observation after ``begin`` that is not surprising. The log-odds are zero if too little is known."""
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > 1.0:
             del rows[0]
@@ -312,32 +338,36 @@ class SlipMonitor:
         by_share = np.array([observations[i].log_likelihood(poses[:, i], {}) for i in range(1, len(rows))])
         holds, slips = by_share[:, :1], by_share[:, 1:]
         odds = np.minimum(slips - holds, MOST).sum(axis=0)
-        if odds.max() > RARE and not self._motion.is_slipping:  # else the track follows the observations
+        # during a slip the track follows the observations anyway
+        if odds.max() > RARE and not self._motion.is_slipping:
             track = np.array([rows[i].fit(observations[i]) for i in range(1, len(rows))])
             odds = np.minimum(odds, np.minimum(slips - track[:, None], MOST).sum(axis=0))
         return float(odds.max()), rows[0].odometry.t
 
 
 def surprise(correction: Correction) -> float:
-    """By how many standard deviations an innovation exceeds its expected size."""
+    """The number of standard deviations by which the innovation of a correction exceeds its expected size."""
     if correction.dof:
         return (correction.nis - correction.dof) / math.sqrt(2.0 * correction.dof)
     return correction.excess_nll / math.sqrt(correction.variance) if correction.variance > 0.0 else 0.0
 
 
 def is_doubted(sensors: Iterable[Sensor]) -> bool:
-    """Whether one of the sensors doubts the track, or detects nothing where it should."""
+    """True if one of the sensors doubts the track, or detects nothing although it should."""
     return any(sensor.suspicious_since is not None or sensor.silent for sensor in sensors)
 
 
 def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
+    """True if the pose ``best`` differs from a track's ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
     error = se2.log(se2.between(pose, best.pose))
     combined = covariance + se2.world_to_body(best.pose, best.covariance)
     return float(error @ positive.solve(combined, error[:, None])[:, 0]) > APART
 
 
 def beyond(covariance: Array, distance: float) -> float:
-    """The probability that a Gaussian of this ``covariance`` (3, 3) is farther from its mean position than ``distance`` [m]."""
+    """The probability that the position of a Gaussian pose differs from its mean by more than ``distance`` [m]. ``covariance`` (3,
+    3):
+    that of the pose."""
     angle = math.pi * np.arange(180) / 180.0
     direction = np.column_stack((np.cos(angle), np.sin(angle)))
     curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)
@@ -346,8 +376,11 @@ def beyond(covariance: Array, distance: float) -> float:
 
 
 def laplace_evidence(observation: Observation, pose: Array, covariance: Array, correction: Correction) -> float:
-    """The log of the probability of an observation of the pose alone, by Laplace's method: at its correction of a Gaussian, with
-    ``pose`` (3,) and body-frame ``covariance`` (3, 3)."""
+    """The marginal log-likelihood of an observation under a Gaussian prediction, by Laplace's method.
+
+    ``observation``: depends on the pose only. ``pose`` (3,), ``covariance`` (3, 3): the prediction and its body-frame covariance.
+    ``correction``: the correction of this prediction by the observation.
+    """
     if correction.evidence is not None:
         return correction.evidence
     delta = correction.delta[:3]
