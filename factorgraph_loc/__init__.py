@@ -1,8 +1,8 @@
 """Indoor robot localization from wheel odometry, RFID tags, landmarks and cameras.
 
 The public names are imported from this package. They are the commands as functions, such as ``factorgraph_loc.run(log, "ekf")``,
-the types of their arguments and results, functions that read and write files, and the online ``Localizer``. ``__init__.pyi``
-lists them with their modules, which are imported when a name is first used.
+the types of their arguments and results, functions that read and write files, and the online ``Localizer``. The file
+``__init__.pyi`` lists the public names and their modules. A module is imported when one of its names is first used.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""Exceptions caused by user input. The command line prints their message as one line and exits with their code."""
+"""Exceptions for the user. The command line prints the message of such an exception as one line and exits with its code."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class InputError(FglocError):
 
 
 class RunFailedError(FglocError):
-    """The input is valid, but the run gave no usable result."""
+    """The input is valid, but the run has no usable result."""
 
     exit_code = 1
 
 
 def bad_field(file: object, field: str, value: object, expected: str, *, row: int | None = None) -> InputError:
-    """The error for an invalid field: file, row (as line number), field, value and the expected value."""
+    """Return the error for an invalid value: "FILE:ROW: FIELD is VALUE, expected EXPECTED". ``row``: a line number, or None."""
     where = f"{plain(file)}:{row}" if row is not None else plain(file)
     return InputError(f"{where}: {plain(field)} is {quoted(value)}, expected {expected}")
 
@@ -46,15 +46,17 @@ def require(
     values: NDArray[Any],
     expected: str,
 ) -> None:
-    """The error of :func:`bad_field` at the first of ``values`` (N, ...) that is not ``valid`` (N,); ``rows`` (N,): line numbers in
-    ``file``."""
+    """Raise the error of :func:`bad_field` at the first invalid value, if any.
+
+    ``valid`` (N,): a mask of the valid ones of ``values`` (N, ...). ``rows`` (N,): line numbers of the values in ``file``.
+    """
     if not valid.all():
         i = int(valid.argmin())
         raise bad_field(file, field, values[i].tolist(), expected, row=int(rows[i]))
 
 
 def message_of(error: FglocError | OSError | UnicodeEncodeError) -> str:
-    """The message of an error on one line; for a text that the encoding of the system lacks, also the remedy."""
+    """Return the message of an error on one line. If the system's encoding lacks a character, the message has a remedy."""
     if isinstance(error, UnicodeEncodeError):
         text = quoted(error.object[error.start : error.end])
         return f"{text} cannot be written in {error.encoding}, the encoding of this system: set PYTHONUTF8=1"

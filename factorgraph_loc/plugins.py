@@ -1,8 +1,8 @@
-"""Registries of sensors, estimators, readers and mappers by name, loaded lazily.
+"""Registries of sensors, estimators, readers and mappers by name. An object is imported when it is first used.
 
-Those of this project are listed in :mod:`factorgraph_loc.builtin`. Other packages register theirs by entry points of the groups
-``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and ``factorgraph_loc.mappers``. Further
-names that commands offer are here too, because this module is imported fast.
+The module :mod:`factorgraph_loc.builtin` registers the objects of this project. Other packages register objects by entry points of
+the groups ``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and
+``factorgraph_loc.mappers``. This module also has the other names that commands accept, because it is fast to import.
 """
 
 from __future__ import annotations
@@ -18,29 +18,31 @@ Place = str  # "package.module:name", or "package.module"
 
 
 def load(place: Place) -> Any:
-    """Import the object at ``place``. ImportError or AttributeError if it does not exist."""
+    """Import and return the object at ``place``. Raises ImportError or AttributeError if it does not exist."""
     module, _, name = place.partition(":")
     loaded = importlib.import_module(module)
     return getattr(loaded, name) if name else loaded
 
 
 class Group(Mapping[str, Any]):
-    """A registry of one kind of plug-in: name to loaded object, built-in ones first.
+    """A registry of one kind of plug-in. ``group[name]`` imports and returns an object. Built-in objects come first.
 
-    ``kind``: the kind's name; ``own``: places of the built-in ones; ``needs``: attributes that each must have. InputError if an
-    object of another package cannot be loaded, lacks a required attribute, or has a name that is taken.
+    ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in objects by name. ``needs``: attributes
+    that an object must have. Raises InputError if an object of another package cannot be imported, lacks such an attribute, or has
+    a name that another object has.
     """
 
     def __init__(self, kind: str, *needs: str) -> None:
         self.kind, self.needs = kind, needs
         self.own: dict[str, Place] = {}
-        self._others: dict[str, tuple[Place, str]] | None = None  # place and name of the package
+        self._others: dict[str, tuple[Place, str]] | None = None  # import path and package of objects of other packages
 
     def place(self, name: str) -> Place:
-        """The place of a name; KeyError if it is unknown."""
+        """Return the import path of the object with this name. Raises KeyError if the name is unknown."""
         return self.own[name] if name in self.own else self._installed()[name][0]
 
     def _installed(self) -> dict[str, tuple[Place, str]]:
+        """Return the import path and the package of each object that other packages register, by name."""
         if self._others is None:
             from importlib.metadata import entry_points  # noqa: PLC0415 - most commands need built-in ones only
 
@@ -70,7 +72,7 @@ class Group(Mapping[str, Any]):
         return loaded
 
     def __contains__(self, name: object) -> bool:
-        """Whether a name is registered; nothing is loaded."""
+        """True if a name is registered. Imports nothing."""
         return name in self.own or name in self._installed()
 
     def __iter__(self) -> Iterator[str]:
@@ -85,21 +87,21 @@ ESTIMATORS = Group("estimators", "process", "estimate")
 READERS = Group("readers", "Options", "read")
 MAPPERS = Group("mappers")
 
-FEATURES = ("colour", "sift", "orb")  # of images
-MAP_ESTIMATORS = ("batch", "smoother", "ekf")  # those that estimate landmarks
-ACTIVE_ESTIMATORS = ("active_mcl", "particle_filter", "smoother")  # of robots that plan their paths
-PRESETS = {  # of simulations, each with its world
+FEATURES = ("colour", "sift", "orb")  # kinds of point features of images
+MAP_ESTIMATORS = ("batch", "smoother", "ekf")  # estimators that can estimate landmarks
+ACTIVE_ESTIMATORS = ("active_mcl", "particle_filter", "smoother")  # estimators of `fgloc active`
+PRESETS = {  # simulated worlds, with their descriptions
     "office": "Rooms on both sides of a corridor, doors, furniture; tags on walls and furniture.",
-    "sparse": "The same with fewer tags.",
-    "bursty": "The same as office; each antenna loses each tag for 2 s on average, a fifth of the time.",
-    "corridor": "One corridor, the same from both ends; tags evenly on both sides.",
+    "sparse": "The world of office with fewer tags.",
+    "bursty": "The world of office; each antenna loses each tag a fifth of the time, for 2 s on average.",
+    "corridor": "One corridor that is the same from both ends; tags at equal distances on both sides.",
     "warehouse": "Rows of shelves with tags.",
     "symmetric": "Corridors in the shape of an H with a half-turn symmetry; three tags hang in them.",
 }
-POLICIES = {  # of active robots, each with the path that it chooses
-    "information": "The largest expected reduction of entropy minus the cost.",
-    "paper_literal": "The same with the sign as printed in the paper.",
-    "random": "Any of the arcs, short straight paths and turns in place, to its end.",
-    "patrol": "Straight on until a wall is near, then where most is free; back only if nothing else is free.",
-    "nearest_tags": "Towards the nearest tags, on average over the belief.",
+POLICIES = {  # policies of `fgloc active`, with the path that each chooses
+    "information": "The path with the largest expected reduction of entropy minus the cost.",
+    "paper_literal": "As information, but with the sign as printed in the paper, which prefers the least informative path.",
+    "random": "A random arc, short straight path or turn in place, driven to its end.",
+    "patrol": "Straight on until a wall is near, then the direction with most free space; back if nothing else is free.",
+    "nearest_tags": "The path towards the nearest tags, on average over the belief.",
 }

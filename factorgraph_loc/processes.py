@@ -1,6 +1,6 @@
-"""Child processes that always end with their parent, however it ends.
+"""Child processes that always end with their parent process, also if the parent is killed.
 
-This module must import light modules only: a new process loads it before it is tied to its parent.
+This module must import only modules that load fast, because a new process can outlive its parent until it has loaded them.
 """
 
 import ctypes
@@ -27,7 +27,7 @@ from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.threads import use_one_thread
 
 BEAT = 0.3  # s between two calls of the heartbeat function
-READY = "ready"
+READY = "ready"  # message of a worker process that has loaded its modules
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that end a command
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
@@ -40,7 +40,7 @@ class ProcessDiedError(RunFailedError):
 
 
 class Child(SpawnProcess):
-    """A spawned process that ends with its parent, and searches for garbage as rarely; its own children end with it."""
+    """A spawned process that ends when its parent ends. It has the garbage collection thresholds of its parent."""
 
     def start(self) -> None:
         self._threshold = gc.get_threshold()
@@ -49,13 +49,17 @@ class Child(SpawnProcess):
     def run(self) -> None:
         _end_with_parent()
         gc.set_threshold(*self._threshold)
-        self.daemon = False  # a daemon could not start processes of its own
+        self.daemon = False  # a daemonic process may not start processes
         super().run()
 
 
 @dataclass(eq=False)
 class Worker:
-    """A worker process, the parent's end of its connection, whether it has loaded its modules, and its current job or None."""
+    """A worker process of :func:`run_each`.
+
+    ``connection``: the parent's end of the connection to the process. ``ready``: whether the process has loaded its modules.
+    ``job``: the current job, or None.
+    """
 
     process: Child
     connection: Connection
@@ -63,12 +67,15 @@ class Worker:
     job: Any = None
 
     def send(self, content: object) -> None:
-        """Send the function first, then a job at a time."""
-        with suppress(OSError):  # it has died; the next `hear` reports that
+        """Send an object to the process: first the function that it calls, then one job at a time."""
+        with suppress(OSError):  # if the process has died, the next call of `hear` reports that
             self.connection.send(content)
 
     def hear(self) -> Any:
-        """Receive ``READY``, a value, or the exception of the job; a ProcessDiedError if the process has ended."""
+        """Receive the next answer of the process: ``READY``, the value of the job, or the exception that the job raised.
+
+        Return a ProcessDiedError if the process has ended.
+        """
         try:
             answer, traceback_text = self.connection.recv()
         except (EOFError, OSError):
@@ -86,10 +93,10 @@ class Worker:
 
 
 def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]:
-    """Spawn a process that calls ``function(connection, *args)``. Returns the process and the parent's end of the connection.
+    """Spawn a process that calls ``function(connection, *args)``. Return the process and the parent's end of the connection.
 
-    The process does not import the script that starts it, so ``function`` must be of a module. That must be light, because the
-    process is tied to this one only after loading it. The process ignores keyboard interrupts.
+    The process does not import the running script, so ``function`` must be defined in a module. The module must load fast, because
+    the process can outlive its parent until it has loaded the module. The process ignores keyboard interrupts.
     """
     use_one_thread()
     parent_end, child_end = Pipe()
@@ -107,10 +114,11 @@ def run_each(
     *,
     beat: Callable[[], None] | None = None,
 ) -> Iterator[tuple[int, Value | Exception]]:
-    """Call ``function`` on each job in at most ``workers`` processes. Yields (index, value or exception) as jobs finish.
+    """Call ``function`` on each job in at most ``workers`` parallel processes.
 
-    Each job runs in a process of its own, so a crash affects that job only and peak memory is measured per job. ``beat`` is
-    called every :data:`BEAT` seconds. Closing the iterator ends the processes. Function, jobs and values must be picklable, and of
+    Yields the index of a job and its value, or the exception that it raised, in the order in which jobs finish. Each job runs in a
+    new process. Thus a crash affects only one job, and peak memory can be measured per job. ``beat`` is called about every
+    :data:`BEAT` seconds. Closing the iterator ends the processes. Function, jobs and values must be picklable, and defined in
     modules that can be imported.
     """
     waiting = deque(range(len(jobs)))
@@ -124,7 +132,9 @@ def run_each(
             for connection in wait([worker.connection for worker in team], None if beat is None else BEAT):
                 worker = next(worker for worker in team if worker.connection is connection)
                 answer = worker.hear()
-                if isinstance(answer, ProcessDiedError) and worker.job is None and waiting:  # died before its first job
+                if (
+                    isinstance(answer, ProcessDiedError) and worker.job is None and waiting
+                ):  # it died before its first job
                     worker.job = waiting.popleft()
                 at, worker.job = worker.job, None
                 if isinstance(answer, ProcessDiedError) or at is not None:
@@ -143,14 +153,17 @@ def run_each(
 
 
 class RemoteError(Exception):
-    """The traceback of an exception from another process, attached as its cause."""
+    """The traceback of an exception that another process raised. It is attached to the exception as its cause."""
 
     def __str__(self) -> str:
         return f'\n"""\n{self.args[0]}"""'
 
 
 def serve(connection: Connection, *modules: str) -> None:
-    """Main loop of a worker: import ``modules``, receive a function, then answer each job with its value or exception."""
+    """Run the main loop of a worker process. ``modules``: names of modules that are imported first.
+
+    The loop receives a function, and then jobs. It answers each job with the value of the function, or the exception it raised.
+    """
     for name in modules:
         importlib.import_module(name)
     function = connection.recv()
@@ -162,7 +175,7 @@ def serve(connection: Connection, *modules: str) -> None:
             return
         try:
             answer = function(job), ""
-        except Exception as error:  # a failure is the job's outcome
+        except Exception as error:  # the parent handles failures of jobs
             answer = _portable(error), "".join(traceback.format_exception(error))
         try:
             connection.send(answer)
@@ -175,7 +188,7 @@ def serve(connection: Connection, *modules: str) -> None:
 
 
 def _portable(error: Exception) -> Exception:
-    """The exception if it can be pickled, else a RuntimeError with the same message."""
+    """Return the exception if it can be pickled, or else a RuntimeError with the same message."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # constructors of foreign exceptions may raise anything
@@ -184,8 +197,10 @@ def _portable(error: Exception) -> Exception:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent ends: by a waiting thread, and on Linux by the kernel, as native code may block the
-    thread."""
+    """Let this process end when its parent ends.
+
+    A thread waits for the end of the parent. Native code may block that thread, so on Linux the kernel kills the process too.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
     if sys.platform == "linux":
@@ -202,7 +217,10 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _without_script() -> Iterator[None]:
-    """Start processes that do not import the script that is running: it needs no ``if __name__ == "__main__"``."""
+    """Let processes that start in this block not import the script that is running.
+
+    Therefore the script needs no ``if __name__ == "__main__"``.
+    """
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -213,8 +231,8 @@ def _without_script() -> Iterator[None]:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Start processes that ignore keyboard interrupts; signals to this process are deferred until the block ends."""
-    resource_tracker.ensure_running()  # otherwise it is started with the first process, and unblocks interrupts
+    """Let processes that start in this block ignore keyboard interrupts. Signals to this process are deferred until its end."""
+    resource_tracker.ensure_running()  # otherwise it starts with the first process, and unblocks interrupts
     came: list[int] = []
     replaced = {}
     if threading.current_thread() is threading.main_thread():

@@ -1,4 +1,7 @@
-"""Notices, and the safe display of names and values of foreign origin: bounded length, one line, no control characters."""
+"""Warnings as values (:class:`Notice`), and the safe display of names and values from files or other programs.
+
+A displayed text has a bounded length, is on one line, and contains no control characters.
+"""
 
 import json
 import math
@@ -8,19 +11,23 @@ from dataclasses import dataclass, is_dataclass
 from string import Formatter
 from typing import Any
 
-MESSAGE = 300  # characters of a message at most
-NAME = 120  # characters of a name, a path or a foreign message
+# maximum sizes of displayed texts
+MESSAGE = 300  # characters of a message
+NAME = 120  # characters of a name, a path or a message of another library
 VALUE = 80  # characters of a value
-LISTED = 10  # names shown of a list
-ITEMS = 5  # items shown of a value that is a list or a table
-DEPTH = 3  # nesting levels shown of a value
-LONG_NUMBER = 40  # digits above which an integer is described instead of printed
-CUT = "..."
+LISTED = 10  # names of a list
+ITEMS = 5  # items of a value that is a list or a table
+DEPTH = 3  # nesting levels of a value
+LONG_NUMBER = 40  # digits of an integer; larger ones are described
+CUT = "..."  # replaces the middle of a text that is too long
 
 
 @dataclass(frozen=True)
 class Notice:
-    """A warning or note of a ``kind``, such as ``late_rows``. Printed, it is its ``sentence`` with the ``fields`` in the braces."""
+    """A warning or note. ``str(notice)`` is the ``sentence``, in which the names in braces are replaced by ``fields``.
+
+    ``kind``: identifies the warning for programs, such as ``late_rows``.
+    """
 
     kind: str
     sentence: str
@@ -33,12 +40,12 @@ class Notice:
         return hash(str(self))
 
     def about(self, name: str) -> "Notice":
-        """The notice with the ``name`` of its log or file in front."""
+        """Return the notice with a ``name``, such as that of its log or file, in front of the sentence."""
         return Notice(self.kind, "{about}: " + self.sentence, {"about": name, **self.fields})
 
 
 def notice(kind: str, sentence: str, *values: object) -> Notice:
-    """A notice with the ``values`` of its fields, numbers and texts, in the order of the names in the ``sentence``."""
+    """Return a :class:`Notice`. ``values``: the values of the names in the braces of ``sentence``, in order of appearance."""
     names = dict.fromkeys(name for _, name, _, _ in Formatter().parse(sentence) if name)
     numbers = (value.item() if hasattr(value, "item") else value for value in values)
     plainly = (value if isinstance(value, int | float | str) else str(value) for value in numbers)
@@ -46,12 +53,15 @@ def notice(kind: str, sentence: str, *values: object) -> Notice:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A number with that many decimals; a dash if there is none, or it is not finite."""
+    """Return a number as text with so many ``digits`` after the point. Return "-" if it is None or not finite."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def significant(value: float, *, sign: bool = False) -> str:
-    """A number with three significant digits, without exponent, and with a plus if ``sign``; a dash if it is not finite."""
+    """Return a number as text with three significant digits and without exponent. Return "–" if it is not finite.
+
+    ``sign``: whether a positive number has a plus sign.
+    """
     if not math.isfinite(value):
         return "–"
     if value == 0.0:
@@ -62,17 +72,20 @@ def significant(value: float, *, sign: bool = False) -> str:
 
 
 def plain(text: object, limit: int | None = NAME) -> str:
-    """``text`` on one line: non-printable characters are escaped, and the middle of a text above ``limit`` characters is cut."""
+    """Return ``text`` on one line. Non-printable characters are escaped.
+
+    The middle of a text of more than ``limit`` characters is replaced by "..."; None is no limit.
+    """
     whole = str(text)
     if limit is not None:
-        whole = shortened(whole, limit)  # first, so that little of a very long text is processed
+        whole = shortened(whole, limit)  # before escaping, to save time with a very long text
     if not whole.isprintable():
         whole = "".join(c if c.isprintable() else _escape(c) for c in whole)
     return whole if limit is None else shortened(whole, limit)
 
 
 class _Brief(reprlib.Repr):
-    """A ``repr`` that computes no more than is shown."""
+    """A ``repr`` of limited length. It does not compute the parts of a large value that are not displayed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -99,25 +112,28 @@ _BRIEF = _Brief()
 
 
 def quoted(value: object) -> str:
-    """The ``repr`` of ``value`` in at most :data:`VALUE` characters. Long texts, long lists and huge integers are abbreviated."""
+    """Return the ``repr`` of ``value`` in at most :data:`VALUE` characters, for messages. Long values are abbreviated."""
     return plain(_BRIEF.repr(value), VALUE)
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:
-    """``a, b, c``: the first ``most`` names, and the number of the others."""
+    """Return the first ``most`` names, separated by commas, and the number of further names: "a, b and 3 more"."""
     every = list(names)
     shown = ", ".join(plain(name) for name in every[:most])
     return shown if len(every) <= most else f"{shown} and {len(every) - most} more"
 
 
 def error_text(error: BaseException) -> str:
-    """The message of a foreign exception on one line, or its class name if it has none."""
+    """Return the message of an exception of another library on one line, or its class name if it has no message."""
     says = " ".join(str(getattr(error, "strerror", None) or error).split())
     return plain(says or type(error).__name__)
 
 
 def plain_values(value: Any) -> Any:
-    """A value as in JSON: dictionaries for data classes and mappings, lists for arrays and tuples, null for NaN and infinity."""
+    """Convert a value to types that JSON has.
+
+    Data classes and mappings become dictionaries, arrays and tuples become lists, and NaN and infinity become None.
+    """
     if is_dataclass(value):
         return {name: plain_values(getattr(value, name)) for name in value.__dataclass_fields__}
     if hasattr(value, "tolist"):  # an array
@@ -130,27 +146,30 @@ def plain_values(value: Any) -> Any:
 
 
 def json_text(content: Any) -> str:
-    """The text of a JSON file; see :func:`plain_values`."""
+    """Return ``content`` as the text of a JSON file, after conversion by :func:`plain_values`."""
     return json.dumps(plain_values(content), indent=2, allow_nan=False) + "\n"
 
 
 def well_formed(text: str) -> str:
-    """``text`` with lone surrogates (undecodable bytes of file names) escaped, so that it can be encoded as UTF-8."""
+    """Return ``text`` with lone UTF-16 surrogates escaped, so that it can be encoded in UTF-8.
+
+    Python represents undecodable bytes of file names by such surrogates.
+    """
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def one_line(message: str) -> str:
-    """A message on one line, with at most :data:`MESSAGE` characters."""
+    """Return a message on one line, shortened to at most :data:`MESSAGE` characters."""
     return plain(message.strip(), MESSAGE)
 
 
 def plain_lines(text: str) -> str:
-    """A text of several lines with non-printable characters escaped, except for line ends, for files that people print."""
+    """Return a text of several lines with non-printable characters escaped, except for line ends."""
     return "\n".join(plain(line, None) for line in text.split("\n"))
 
 
 def shortened(text: str, limit: int) -> str:
-    """``text``, with the middle cut out if it has more than ``limit`` characters."""
+    """Return ``text``. If it has more than ``limit`` characters, its middle is replaced by "..."."""
     if len(text) <= limit:
         return text
     end = (limit - len(CUT)) * 2 // 5
@@ -158,6 +177,6 @@ def shortened(text: str, limit: int) -> str:
 
 
 def _escape(character: str) -> str:
-    """Escape a character as in Python; beyond ASCII as in JSON and TOML."""
+    """Return the escape sequence of a character: that of Python for ASCII, and that of JSON and TOML for other characters."""
     code = ord(character)
     return repr(character)[1:-1] if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

@@ -1,6 +1,6 @@
 """Limits the linear algebra of a process to one thread, which is fastest for small matrices and for parallel runs.
 
-This module must be importable without numpy; call the function before numpy is imported.
+This module imports no numpy, because its function must be called before numpy is imported.
 """
 
 import os
@@ -9,6 +9,9 @@ _VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUM
 
 
 def use_one_thread() -> None:
-    """Set one thread for BLAS, OpenMP and numba, unless the environment says otherwise; child processes inherit it."""
+    """Limit BLAS, OpenMP and numba to one thread by environment variables, which child processes inherit.
+
+    Variables that are already set are not changed.
+    """
     for variable in _VARIABLES:
         os.environ.setdefault(variable, "1")

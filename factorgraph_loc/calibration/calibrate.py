@@ -1,4 +1,5 @@
-"""Calibration of a complete rig: learn it along references, test it on held-out logs, and keep the input rig if it is worse."""
+"""Calibration of a complete rig: estimate it from logs with a reference, test it on held-out logs, and keep the input rig if the
+estimated rig is worse."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -20,8 +21,10 @@ from factorgraph_loc.text import Notice, listed, notice
 class Calibration:
     """Result of a calibration.
 
-    ``rig``: the learnt one, or the ``input_rig`` if it was ``refused`` for this reason. ``knowledge``: of all logs. ``trials``:
-    scores on held-out logs, empty if logs have no reference or are too short. ``doubts``: warnings.
+    ``logs``: names of the logs. ``input_rig``: the rig before the calibration.
+    ``rig``: the learnt rig, or ``input_rig`` if the learnt rig is refused. ``refused``: the reason of the refusal, "" if none.
+    ``knowledge``: the rig and the constants that are learnt from all logs.
+    ``trials``: scores on held-out logs, empty if the logs have no reference or are too short. ``doubts``: warnings.
     """
 
     logs: tuple[str, ...]
@@ -41,12 +44,14 @@ def calibrate(
     *,
     grids: Path | None = None,
 ) -> Calibration:
-    """Calibrate a rig from ``logs``, with priors about the values of ``rig``, by default that of the first log.
+    """Calibrate a rig from ``logs``. If no log has a reference, smoothing and learning alternate.
 
-    ``run`` runs an estimator. If no log has a reference, smoothing and learning take turns. ``progress`` is called with the number
-    of steps done and of all steps. ``grids``: path prefix of the files of learnt detection grids; needed for logs with tag reads.
-    Raises InputError if a log lacks a reference or odometry, has neither exteroceptive measurements nor a reference with headings,
-    is too short, or differs in kind from the others.
+    ``run``: runs an estimator on a log. ``rig``: its values are the means of the priors; None for the rig of the first log.
+    ``progress``: called with the number of steps done and the number of all steps.
+    ``grids``: path prefix of the files of learnt detection grids, required for logs with tag reads.
+
+    Raises InputError if a log lacks a reference or odometry, is too short, or has other sensors than the first log. Also if it has
+    neither exteroceptive measurements nor a reference with headings.
     """
     report = progress or (lambda _done, _total: None)
     blind = bool(logs) and all(log.reference is None for log in logs)
@@ -60,7 +65,7 @@ def calibrate(
     report(1, len(folds) + 1)
     trials: list[Trial] = []
     for i, (train, tests) in enumerate(folds):
-        with suppress(InputError):  # too short
+        with suppress(InputError):  # if these logs are too short
             prefix = None if grids is None else grids.with_name(f"{grids.name}.fold{i}")
             unseen = learn([Traced(log) for log in train], start, grids=prefix, like=knowledge).rig
             trials += trials_of(tests, start, unseen, run)
@@ -80,7 +85,7 @@ def calibrate(
 
 
 def _doubted(trials: Sequence[Trial]) -> list[Notice]:
-    """Elements of the map that the smoother doubts on held-out logs, a warning for each kind."""
+    """Return warnings about landmarks or tags that the smoother considers moved or dead on held-out logs, one for each kind."""
     doubted: dict[str, dict[str, None]] = {}
     for trial in trials:
         for kind, names in trial.doubted.items() if trial.estimator == "smoother" else ():
@@ -90,8 +95,10 @@ def _doubted(trials: Sequence[Trial]) -> list[Notice]:
 
 
 def check(logs: Sequence[Log], *, blind: bool = False) -> None:
-    """Raise InputError if logs are not of one kind, if a log has too little to learn from, or no reference and they are not
-    ``blind``."""
+    """Raise InputError if logs cannot be calibrated together.
+
+    The reasons are a missing reference unless ``blind`` is set, missing odometry or measurements, or different sensors.
+    """
     if not logs:
         raise InputError("there is no log to calibrate from")
     for log in logs:
@@ -112,7 +119,7 @@ def check(logs: Sequence[Log], *, blind: bool = False) -> None:
 
 
 def _check_alike(first: Log, log: Log) -> None:
-    """Raise InputError if two logs have other sensors, or streams of other kinds."""
+    """Raise InputError if two logs differ in their sensors, in the kinds of their streams, or in the headings of the reference."""
     for sensor in senses(first.rig):
         for one_log, other_log in ((first, log), (log, first)):
             if _has(one_log, sensor) and not _has(other_log, sensor):
@@ -128,4 +135,5 @@ def _check_alike(first: Log, log: Log) -> None:
 
 
 def _has(log: Log, sensor: str) -> bool:
+    """True if a log has measurements of a sensor."""
     return sensor in log.streams and len(log.streams[sensor].t) > 0

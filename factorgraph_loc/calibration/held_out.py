@@ -1,4 +1,7 @@
-"""Errors of estimators on held-out logs, or parts of a log, with the input rig and with rigs that were learnt from the rest."""
+"""Test of a calibration by cross-validation: errors of estimators on held-out logs, or parts of a log.
+
+Each held-out part is run with the input rig, and with a rig that is learnt from the remaining parts.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -20,16 +23,16 @@ from factorgraph_loc.sensors.smoothed import recordings
 
 ESTIMATORS = ("ekf", "smoother")
 RIGS = ("input", "learnt")
-LONGEST = 150.0  # s of each stretch that is run
-MOST = 4  # stretches of a log
-FEWEST_POSES = 20  # poses of the reference that a stretch needs
-WORSE, WORST = 1.02, 1.10  # growth of the pooled error, and of that of a log, with which a rig is refused
+LONGEST = 150.0  # s; maximum duration of a held-out section of a log
+MOST = 4  # maximum number of sections of a log
+FEWEST_POSES = 20  # minimum number of poses of the reference in a section
+WORSE, WORST = 1.02, 1.10  # a rig is refused if its error grows by more: pooled over all logs, or on one log
 
 Scores = Mapping[str, Any]
 
 
 class Scored(Protocol):
-    """The ``result`` of an estimator, and its ``scores`` as of :func:`factorgraph_loc.evaluation.metrics.score`."""
+    """The ``result`` of a run, and its ``scores``, which :func:`factorgraph_loc.evaluation.metrics.score` computes."""
 
     @property
     def result(self) -> RunResult: ...
@@ -43,8 +46,12 @@ Run = Callable[[Log, str], Scored]
 
 @dataclass(frozen=True)
 class Trial:
-    """The ``scores`` of an ``estimator`` on a held-out stretch of ``log``, with the rigs of :data:`RIGS`; None if it failed.
-    ``doubted``: elements of the map that the run with the learnt rig doubts, with their probabilities, by kind of doubt."""
+    """The runs of an estimator on one held-out section of a log.
+
+    ``log``: name of the log. ``scores``: the scores of the run by rig (:data:`RIGS`), None if the run failed.
+    ``doubted``: of the run with the learnt rig, the landmarks or tags that are probably moved or dead. By kind of doubt and name
+    it has their probabilities.
+    """
 
     log: str
     estimator: str
@@ -53,7 +60,10 @@ class Trial:
 
 
 def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
-    """Logs to learn from, and held-out stretches, for each recording, or for each half of a single one."""
+    """Return the folds of a cross-validation: for each fold, the logs to learn from and the held-out sections.
+
+    Each recording is held out once. The two halves of a single recording count as two recordings.
+    """
     parts = list(zip(recordings(logs), logs, strict=True))
     if len({number for number, _ in parts}) == 1:
         halves = [(half, _share(log, half / 2, (half + 1) / 2)) for half in range(2) for log in logs]
@@ -61,7 +71,7 @@ def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
     return [
         (
             [log for part, log in parts if part != number],
-            [stretch for part, log in parts if part == number for stretch in _stretches(log)],
+            [section for part, log in parts if part == number for section in _sections(log)],
         )
         for number in dict.fromkeys(number for number, _ in parts)
         if any(part != number for part, _ in parts)
@@ -69,7 +79,10 @@ def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
 
 
 def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list[Trial]:
-    """Both estimators on held-out stretches, with both rigs. A rig that lacks what its sensors need is not tried."""
+    """Run all :data:`ESTIMATORS` on the held-out sections ``tests``, with the rigs ``initial`` and ``learnt``.
+
+    ``run``: runs an estimator on a log. The rig ``initial`` is omitted if it lacks settings that its sensors need.
+    """
     complete = all(calibrator.is_complete(initial) for calibrator in calibrators(initial).values())
     rigs = {"learnt": learnt} | ({"input": initial} if complete else {})
     out = []
@@ -86,8 +99,11 @@ def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list
 
 
 def pooled(trials: Sequence[Trial], rig: str, key: str) -> float:
-    """The root mean square over poses of stretches with a ``rig`` of :data:`RIGS`, or the mean for ``anees``; NaN if there are
-    none. Stretches without scores of both rigs count only if all are such."""
+    """Return a score pooled over held-out sections, weighted by their numbers of poses: root mean square, or mean for ANEES.
+
+    ``rig``: one of :data:`RIGS`. ``key``: name of the score, such as "final.position_rmse". Only sections with a score of both rigs
+    are used, if there are any. Returns NaN if no section has the score.
+    """
     kind = key.partition(".")[0]
     known = [t for t in trials if _is_known(t, key)]
     scores = [t.scores[rig] for t in known or trials]
@@ -101,17 +117,24 @@ def pooled(trials: Sequence[Trial], rig: str, key: str) -> float:
 
 
 def _is_known(trial: Trial, key: str) -> bool:
+    """True if a trial has the score ``key`` with every rig."""
     return all(scores is not None and scores.get(key) is not None for scores in trial.scores.values())
 
 
 def growth(trials: Sequence[Trial]) -> float:
-    """Position error with the learnt rig divided by that with the input rig: geometric mean over estimators, causal and final
-    poses; NaN if unknown."""
+    """Return the ratio of the position errors with the learnt rig to those with the input rig.
+
+    It is the geometric mean over the estimators and over causal and final trajectories. Returns NaN if it is unknown.
+    """
     return _ratio(trials, lambda mine, rig, kind: pooled(mine, rig, f"{kind}.position_rmse"))
 
 
 def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
-    """The ``loss`` with the learnt rig divided by that with the input rig, as the geometric mean over estimators and poses."""
+    """Return the ratio of a loss with the learnt rig to that with the input rig.
+
+    ``loss``: a function of trials, the rig and "causal" or "final". The ratio is the geometric mean over the estimators and over
+    causal and final trajectories, or NaN if no trial has scores of both rigs.
+    """
     ratios = [
         loss(mine, "learnt", kind) / max(loss(mine, "input", kind), 1e-9)
         for estimator in ESTIMATORS
@@ -122,23 +145,23 @@ def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], 
 
 
 def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    """The factor between ANEES and its ideal, the number of dimensions, in whichever direction."""
+    """Return the ratio (at least 1) between the ANEES and its ideal value, the number of dimensions, or its reciprocal."""
     dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
     factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
     return max(factor, 1.0 / factor)
 
 
 def refusal(trials: Sequence[Trial]) -> str:
-    """The reason to refuse the learnt rig; empty if there is none."""
+    """Return the reason to refuse the learnt rig, or "" if there is none."""
     failed = [t for t in trials if t.scores["learnt"] is None and t.scores["input"] is not None]
     if failed:
-        return f"the {failed[0].estimator} fails on {failed[0].log} with what was learnt from the rest"
+        return f"the {failed[0].estimator} fails on {failed[0].log} with the rig that is learnt from the other data"
     if (pooled_growth := growth(trials)) > WORSE:
         return f"errors on held-out logs are {pooled_growth:.2f} times those with the input rig"
     for log in dict.fromkeys(t.log for t in trials):
         if (own := growth([t for t in trials if t.log == log])) > WORST:
             return f"errors on {log}, held out, are {own:.2f} times those with the input rig"
-    # ANEES is a ratio of squares: standard deviations may be worse by WORST, unless errors are smaller by that
+    # standard deviations may be worse by the factor WORST, and ANEES by its square, because it is a ratio of squares
     if (away := _ratio(trials, _anees_factor)) > WORST**2 and pooled_growth > 1.0 / WORST:
         ratio = f"{pooled_growth:.2f} times those with the input rig"
         return f"errors on held-out logs are {ratio}, but ANEES is {away:.2f} times as far from its ideal"
@@ -146,17 +169,20 @@ def refusal(trials: Sequence[Trial]) -> str:
 
 
 def _share(log: Log, begin: float, end: float) -> Log | None:
-    """The part of a log between two fractions of the time that has both odometry and reference; None if it has none of these."""
+    """Cut a section from a log. ``begin``, ``end``: fractions of the time span that odometry and reference have in common.
+
+    Returns None if the section has no measurements, or lacks odometry or the reference.
+    """
     first, last = overlap(log)
-    with suppress(InputError):  # no measurements there
+    with suppress(InputError):  # if the section has no measurements
         part = cut(log, first + begin * (last - first), first + end * (last - first))
         if part.reference is not None and len(odometry_of(part).t):
             return part
     return None
 
 
-def _stretches(log: Log) -> list[Log]:
-    """Stretches of a log with enough poses of the reference."""
+def _sections(log: Log) -> list[Log]:
+    """Return sections of a log, evenly spread over it, that have at least :data:`FEWEST_POSES` poses of the reference."""
     first, last = overlap(log)
     edges = np.linspace(0.0, 1.0, min(MOST, max(1, round((last - first) / LONGEST))) + 1)
     out = []

@@ -1,9 +1,9 @@
-"""Learning of a rig from logs along given trajectories, by the calibrators of all sensors; without a reference by turns.
+"""Learning of a rig from logs by the calibrators of all sensors, along reference trajectories or smoothed ones.
 
-Each turn smooths the logs with the current rig, and learns a rig from the smoothed trajectories and their covariances:
-expectation-maximisation (Dempster, Laird and Rubin, JRSS B 39, 1977; with a smoother: Shumway and Stoffer, "An approach to time
-series smoothing and forecasting using the EM algorithm", 1982). It ends when a turn changes all values by less than a fraction of
-their standard errors.
+Without a reference, smoothing and learning alternate (expectation-maximisation: Dempster, Laird and Rubin, JRSS B 39, 1977; with a
+smoother: Shumway and Stoffer, "An approach to time series smoothing and forecasting using the EM algorithm", 1982). Each turn
+smooths the logs with the current rig, and learns a rig from the smoothed trajectories and their covariances. The iteration ends
+when a turn changes all values by less than a fraction of their standard errors.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,9 +26,9 @@ from factorgraph_loc.text import Notice, notice
 Smooth = Callable[[Log], RunResult]
 """Runs the smoother on a log, with the log's rig."""
 
-SETTLED = 0.3  # standard errors that the last turn may change
-TURNS = 8
-TOO_VAGUE = 1.0  # m; a trajectory with a larger standard deviation is not used
+SETTLED = 0.3  # the iteration ends if no value changes by more, in standard errors
+TURNS = 8  # maximum number of turns of smoothing and learning
+TOO_VAGUE = 1.0  # m; a smoothed trajectory with a larger median standard deviation is not used
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Knowledge:
     """A learnt ``rig``, and the results of its ``sensors`` by name.
 
     ``turns``: for logs without a reference, the largest change of a constant in each turn of smoothing and learning, in standard
-    errors.
+    errors. Empty for logs with a reference.
     """
 
     rig: Rig
@@ -45,11 +45,12 @@ class Knowledge:
 
     @property
     def constants(self) -> tuple[FittedConstant, ...]:
+        """The learnt constants of all sensors."""
         return tuple(constant for sensor in self.sensors.values() for constant in sensor.constants)
 
     @property
     def notes(self) -> tuple[Notice, ...]:
-        """The warnings."""
+        """The warnings of all sensors, and one if the alternation of smoothing and learning has not converged."""
         notes = [note for sensor in self.sensors.values() for note in sensor.notes]
         if self.turns and self.turns[-1] >= SETTLED:
             change = "The last of {turns} turns still changed a value by {change:.1f} standard errors: "
@@ -58,7 +59,7 @@ class Knowledge:
 
 
 def calibrators(rig: Rig) -> Mapping[str, Calibrator]:
-    """The calibrators of all sensors that have one, by name; each of several of a kind in the ``rig`` has its own."""
+    """Return the calibrators of the sensors that can be calibrated, by sensor. Each of several sensors of a kind has its own."""
     return {
         name: calibrator if kind_of(name) == name else OneOfSeveral(calibrator, name)
         for name, calibrator in functions("calibrator", rig)
@@ -66,7 +67,7 @@ def calibrators(rig: Rig) -> Mapping[str, Calibrator]:
 
 
 def senses(rig: Rig) -> tuple[str, ...]:
-    """The exteroceptive channels that can be calibrated."""
+    """Return the names of the exteroceptive streams that can be calibrated, such as ``bearing_range``."""
     return tuple(calibrator.channel for calibrator in calibrators(rig).values() if calibrator.senses)
 
 
@@ -77,9 +78,12 @@ def learn(
     grids: Path | None = None,
     like: Knowledge | None = None,
 ) -> Knowledge:
-    """Learn a rig from logs along their trajectories, starting from ``rig``: see
-    :meth:`~factorgraph_loc.sensors.calibrating.Calibrator.learn`. Along a given trajectory the sensors are independent, so
-    that each is a problem of its own."""
+    """Learn a rig from logs along their trajectories. Given the trajectory, the sensors are independent and are learnt separately.
+
+    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first turn of smoothing and learning,
+    None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written. ``like``: a result from more
+    logs, whose choices between models are kept. Raises InputError if a log is too short.
+    """
     traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]
     sensors, learnt = {}, rig
     for name, calibrator in calibrators(rig).items():
@@ -90,7 +94,7 @@ def learn(
 
 
 def sensing(rig: Rig, log: Log) -> Rig:
-    """``rig`` with exactly the exteroceptive sensors that the log has, among those that are used."""
+    """Return ``rig`` with a new list of used sensors: of the exteroceptive sensors those that the log has, and all others."""
     sensed = senses(rig)
     kept = [name for name in rig.sensors if name not in sensed or name in log.streams]
     added = [name for name in sensed if name in log.streams and name not in kept]
@@ -98,7 +102,7 @@ def sensing(rig: Rig, log: Log) -> Rig:
 
 
 def has_heading(log: Log) -> bool:
-    """Whether the log's reference has meaningful headings."""
+    """True if the log has a reference with meaningful headings."""
     return log.reference is not None and log.reference.has_heading
 
 
@@ -109,11 +113,11 @@ def learn_by_turns(
     grids: Path | None = None,
     progress: Callable[[float, float], None] | None = None,
 ) -> Knowledge:
-    """Learn a rig from ``logs`` without their references: smooth all logs and learn from the result, in turns.
+    """Learn a rig from ``logs`` without reference trajectories: alternately smooth all logs and learn from the result.
 
-    ``start``: the rig of the first turn. ``grids``: path and name prefix of the detection grids that may be written; ``progress``:
-    called with the number of smoothed logs so far, and the largest number possible. InputError if a log contains too little
-    information.
+    ``start``: the rig of the first turn. ``smooth``: runs the smoother on a log. ``grids``: path and name prefix of files of
+    detection grids that may be written. ``progress``: called with the number of smoothed logs so far and its maximum. Raises
+    InputError if a log contains too little information.
     """
     rig, turns, fitted = start, list[float](), dict[tuple[str, str], float]()
     while True:
@@ -127,8 +131,8 @@ def learn_by_turns(
         knowledge = learn(smoothed, rig, start, grids)
         if not knowledge.constants and not knowledge.notes:
             raise InputError(
-                f"{logs[0].name}: nothing of the rig {start.name} can be learnt without a reference: it has no detection model, "
-                "and no constant with an uncertainty, that the log's sensors use"
+                f"{logs[0].name}: nothing of the rig {start.name} can be learnt without a reference: for the sensors of the log it "
+                "has no detection model, and no constant with an uncertainty"
             )
         rig = knowledge.rig
         turns.append(max((_change(constant, fitted) for constant in knowledge.constants), default=0.0))
@@ -138,17 +142,20 @@ def learn_by_turns(
 
 
 def _smoothed(log: Log, smooth: Smooth) -> Traced:
-    """The log with its smoothed trajectory as reference."""
+    """Smooth a log, and return it with the smoothed trajectory as reference.
+
+    Raises InputError if the robot is not localized, or the trajectory is less certain than :data:`TOO_VAGUE`.
+    """
     result = smooth(log)
     final = result.final
     if result.first_localized() is None or len(final) < 2 or final.covariances is None:
         raise InputError(
             f"{log.name}: the smoother did not localize the robot, so that nothing can be learnt without a reference"
         )
-    vague = float(np.sqrt(np.median(np.trace(final.covariances[:, :2, :2], axis1=1, axis2=2))))
-    if vague > TOO_VAGUE:
+    sigma = float(np.sqrt(np.median(np.trace(final.covariances[:, :2, :2], axis1=1, axis2=2))))
+    if sigma > TOO_VAGUE:
         raise InputError(
-            f"{log.name}: the smoother estimates the position with a standard deviation of {vague:.1f} m (median), expected "
+            f"{log.name}: the smoother estimates the position with a standard deviation of {sigma:.1f} m (median), expected "
             f"{TOO_VAGUE:g} m or less to learn from it without a reference"
         )
     doubted = frozenset[str]().union(*result.diagnostics.doubted.values())
@@ -156,6 +163,6 @@ def _smoothed(log: Log, smooth: Smooth) -> Traced:
 
 
 def _change(constant: FittedConstant, fitted: Mapping[tuple[str, str], float]) -> float:
-    """The change of a constant in a turn, in standard errors."""
+    """Return the change of a constant in a turn, in standard errors. ``fitted``: the values of the previous turn."""
     change = abs(constant.fitted - fitted.get((constant.sensor, constant.name), constant.initial))
     return change / constant.error if change > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""The report of a calibration: a few lines, a self-contained HTML page, and a document for programs."""
+"""The report of a calibration: a few lines of text, an HTML page, and a dictionary for JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,14 +21,17 @@ from factorgraph_loc.sensors.calibrating import Residuals
 from factorgraph_loc.text import listed, number
 
 FIGURES = {"position RMSE [m]": ("position_rmse", 3), "heading RMSE [rad]": ("heading_rmse", 4), "ANEES": ("anees", 1)}
-MOST = 5  # lines of constants
-CLEAR = 2.0  # standard deviations; smaller changes are within chance
-DOTS = 3000  # per log and panel
+MOST = 5  # maximum number of constants that the summary lists
+CLEAR = 2.0  # standard deviations; smaller changes of a constant may be chance
+DOTS = 3000  # residuals of a log that are drawn in a panel, approximately
 VIEW = 5.0  # standard deviations; larger residuals are drawn at the edge
 
 
 def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = ()) -> Rows:
-    """The initial and learnt constants, their standard deviations and those of the priors, and the values of single ``logs``."""
+    """Return a table with the initial and the learnt value of each constant, its standard deviation and that of the prior.
+
+    ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log alone.
+    """
     header = ("constant", "input rig", "learnt", "standard deviation", "prior", "", *logs)
     rows = []
     for c in constants:
@@ -39,7 +42,10 @@ def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = (
 
 
 def accuracy_table(calibration: Calibration) -> Rows:
-    """Errors on each held-out log, and pooled, with the input rig and with a rig learnt from the rest."""
+    """Return a table of the errors on each held-out log and over all logs, with the input rig and with the learnt rig.
+
+    The learnt rig of a held-out log is learnt from the other data.
+    """
     header = ("held-out log", "estimator", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
     rows = []
     logs = dict.fromkeys(t.log for t in calibration.trials)
@@ -53,7 +59,7 @@ def accuracy_table(calibration: Calibration) -> Rows:
 
 
 def summary(calibration: Calibration) -> list[str]:
-    """The result in about ten lines: changed constants, undetermined ones, correlations, and held-out errors."""
+    """Return the result as about ten lines: changed and undetermined constants, correlations, and errors on held-out logs."""
     constants = calibration.knowledge.constants
     clear = [c for c in constants if c.is_determined and abs(c.fitted - c.initial) > CLEAR * c.error]
     same = [_name(c) for c in constants if c.is_determined and c not in clear]
@@ -82,12 +88,12 @@ def summary(calibration: Calibration) -> list[str]:
     elif math.isfinite(ratio := growth(calibration.trials)):
         lines.append(f"the position errors are {number(ratio, 2)} times those with the input rig")
     else:
-        lines.append("the input rig lacks what its sensors need, so that its errors are not known")
+        lines.append("the errors of the input rig are unknown, because it lacks settings that its sensors need")
     return lines
 
 
 def document(calibration: Calibration) -> dict[str, Any]:
-    """The report as plain values."""
+    """Return the report as a dictionary of values for JSON."""
     wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
     return {
         "logs": list(calibration.logs),
@@ -108,7 +114,7 @@ def document(calibration: Calibration) -> dict[str, Any]:
 
 
 def page(calibration: Calibration) -> str:
-    """The report as one HTML page with embedded plots."""
+    """Return the report as one HTML page with embedded plots."""
     logs = calibration.logs if len(calibration.logs) > 1 else ()
     content: dict[str, list[Part]] = {
         "Summary": list(summary(calibration)),
@@ -116,8 +122,8 @@ def page(calibration: Calibration) -> str:
     }
     if calibration.trials:
         explained = (
-            "Each log is held out, or each half of a single one: the learnt rig is that of the rest. ANEES is ideal at 3 (at 2 "
-            "without the reference's heading); above it the estimator is overconfident."
+            "Each log, or each half of a single log, is held out once. There the learnt rig is learnt from the other data. The "
+            "ideal ANEES is 3, or 2 without headings in the reference. Above it the estimator is overconfident."
         )
         content["Accuracy"] = [explained, accuracy_table(calibration)]
     for name, sensor in calibration.knowledge.sensors.items():
@@ -131,12 +137,12 @@ def page(calibration: Calibration) -> str:
 
 
 def _how(calibration: Calibration) -> str:
-    """The method of the calibration."""
+    """Return a paragraph about the method of the calibration."""
     if calibration.knowledge.turns:
         turns = ", ".join(number(change, 1) for change in calibration.knowledge.turns)
         return (
-            "Smoothing the logs, and learning from the smoothed trajectories, took turns. Largest change in each turn, in "
-            f"standard deviations: {turns}."
+            "The logs were smoothed, and constants were learnt from the smoothed trajectories, in turns. Largest change of a "
+            f"constant in each turn, in standard deviations: {turns}."
         )
     return (
         "All constants of a sensor are estimated together from all logs, with priors about the input rig. A constant is "
@@ -145,7 +151,7 @@ def _how(calibration: Calibration) -> str:
 
 
 def _tables(figures: Mapping[str, Any]) -> list[Part]:
-    """A table of plain values, and one for each list of such."""
+    """Return a table of the single values in ``figures``, and one table for each list of rows in it."""
     single = [{"figure": name, "value": value} for name, value in figures.items() if not isinstance(value, list)]
     tables: list[Part] = []
     for rows in filter(None, (single, *(value for value in figures.values() if isinstance(value, list)))):
@@ -155,7 +161,7 @@ def _tables(figures: Mapping[str, Any]) -> list[Part]:
 
 
 def _residuals_figure(logs: Sequence[Residuals]) -> Picture:
-    """The distribution of residuals, and their size over distance and time, by column."""
+    """Draw the residuals of a sensor: their distribution, and their size over distance and time, a row of panels per column."""
     known = [i for i in range(len(logs[0].units)) if any(np.isfinite(log.errors[:, i]).any() for log in logs)]
     figure, axes = grid(len(known), 3, 4.0 * len(known))
     for panels, column in zip(axes, known, strict=True):
@@ -180,6 +186,7 @@ def _residuals_figure(logs: Sequence[Residuals]) -> Picture:
 
 
 def _correlations(calibration: Calibration) -> list[tuple[str, str, float]]:
+    """Return pairs of constants that are strongly correlated, with their correlation."""
     known = {name: calibrator.section for name, calibrator in calibrators(calibration.rig).items()}
     return [
         (f"{known[name]}.{a}", f"{known[name]}.{b}", rho)
@@ -189,6 +196,7 @@ def _correlations(calibration: Calibration) -> list[tuple[str, str, float]]:
 
 
 def _change(trials: Sequence[Trial], key: str, digits: int = 3) -> str:
+    """Return the pooled score ``key`` with the input rig and with the learnt rig: "0.123 -> 0.098"."""
     return " -> ".join(number(pooled(trials, rig, key), digits) for rig in RIGS)
 
 
@@ -197,6 +205,7 @@ def _name(c: FittedConstant) -> str:
 
 
 def _label(c: FittedConstant) -> str:
+    """Return the name of a constant with its unit."""
     settings = settings_in(load(sections()[kind_of(c.sensor)].kind))
     unit = next((setting.unit for setting in settings if setting.key == c.name), "")
     return f"{_name(c)} [{unit}]" if unit else _name(c)

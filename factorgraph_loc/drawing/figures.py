@@ -1,6 +1,6 @@
 """The common style of all plots.
 
-Colours: Okabe and Ito, "Color Universal Design", 2008, distinguishable by colour-blind readers.
+Colour-blind readers can distinguish the colours (Okabe and Ito, "Color Universal Design", 2008).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-CORNERS = 32  # of the polygon of an ellipse
+CORNERS = 32  # number of corners of the polygon that approximates an ellipse
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
 _CIRCLE = np.column_stack((np.cos(_ANGLES), np.sin(_ANGLES)))
-_STYLES = ("-", "--", ":", "-.")  # distinguish curves without colour
-_WIDTH, _DPI = 16.0, 100
+_STYLES = ("-", "--", ":", "-.")  # line styles, which distinguish curves in print without colour
+_WIDTH, _DPI = 16.0, 100  # width of a figure in units of 100 px, and pixels per unit
 _TITLE, _LINES = 80, 3  # maximum length of a line of text, and number of lines
-_LABEL, _LEGEND, _SIGN = 60, 190, 13  # maximum length of a label, and of a line of the legend with its signs
+_LABEL, _LEGEND, _SIGN = 60, 190, 13  # characters: maximum of a label, of a line of the legend, width of a line sample
 
 
 def empty(height: float, title: str = "") -> Figure:
-    """A figure without axes, ``height`` in units of 100 px."""
+    """Return a figure without axes. ``height``: in units of 100 px."""
     # Figure without pyplot: no global state, no display, and matplotlib is imported only when something is plotted
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -48,7 +48,10 @@ def empty(height: float, title: str = "") -> Figure:
 
 
 def grid(rows: int, columns: int, height: float, title: str = "", *, shared: bool = False) -> tuple[Figure, Any]:
-    """Return a figure and its axes (rows, columns); ``shared``: columns have one x axis, rows one y axis."""
+    """Return a figure and its array of axes (rows, columns). ``height``: of the figure, in units of 100 px.
+
+    ``shared``: whether all axes in a column have the same x range, and all axes in a row the same y range.
+    """
     figure = empty(height, title)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=shared and "col", sharey=shared and "row")
     dress(axes.flat)
@@ -67,21 +70,23 @@ def dress(axes: Iterable[Axes]) -> None:
 
 
 def styles() -> Iterator[dict[str, Any]]:
-    """Yield the colour and line style of the first, second, ... estimator."""
+    """Yield a colour and a line style for each curve of a plot, such as one per estimator, without end."""
     for colour, line in zip(cycle(COLOURS), cycle(_STYLES), strict=False):
         yield {"color": colour, "linestyle": line}
 
 
 def ellipses(centres: Array, covariances: Array, scale: float) -> Array:
-    """Closed outlines (K, CORNERS + 1, 2) of Gaussians with ``centres`` (K, 2) and ``covariances`` (K, 2, 2), ``scale`` standard
-    deviations from their centres."""
+    """Return the covariance ellipses of K planar Gaussians as closed polygons (K, CORNERS + 1, 2).
+
+    ``centres`` (K, 2): means. ``covariances`` (K, 2, 2). ``scale``: number of standard deviations from the mean.
+    """
     variances, axes = np.linalg.eigh(covariances)
     lengths = scale * np.sqrt(np.maximum(variances, 0.0))
     return np.asarray(centres[:, None] + np.einsum("kij,kj,cj->kci", axes, lengths, _CIRCLE))
 
 
 def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
-    """Add one legend below all ``axes``; its ``markers`` are scaled by that factor."""
+    """Add one legend below all ``axes`` of a figure. ``markers``: size of markers in the legend, relative to the plot."""
     entries: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
@@ -95,10 +100,10 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
 
 @contextmanager
 def drawing(figure: Figure) -> Iterator[None]:
-    """Context for drawing a figure.
+    """Prepare the texts of a figure, and suppress warnings while it is drawn in this block.
 
-    A ``$`` in a name is printed, not read as mathematics. Long lines are shortened. Warnings about missing glyphs, and about
-    labels that leave no room, are suppressed.
+    A ``$`` in a text is drawn and does not start a formula. Long lines are shortened. The suppressed warnings are about missing
+    glyphs and about labels that leave no room for the axes.
     """
     named = [text for axis in figure.axes for text in (axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts)]
     for text in (*figure.texts, *named, *(text for legend in figure.legends for text in legend.get_texts())):
@@ -115,7 +120,7 @@ def png(figure: Figure) -> Picture:
 
 
 def svg(figure: Figure) -> Picture:
-    """Return the figure as an SVG image for a page; the same figure gives the same bytes."""
+    """Return the figure as an SVG image for a page. The same figure always gives the same bytes."""
     from matplotlib import rc_context  # noqa: PLC0415
 
     out = io.BytesIO()
@@ -126,9 +131,9 @@ def svg(figure: Figure) -> Picture:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """A PNG with a palette, a third of the size of one in full colour.
+    """Return the figure as a PNG with a palette of 256 colours, which has a third of the size of one in full colour.
 
-    The octree quantizer keeps the colours of thin lines, which the default (median cut) blends.
+    Colours are reduced by the octree method, because Pillow's default (median cut) changes the colours of thin lines.
     """
     from PIL.Image import Dither, Quantize  # noqa: PLC0415
 
@@ -138,7 +143,7 @@ def png_bytes(figure: Figure) -> bytes:
 
 
 def _drawn(figure: Figure) -> Image:
-    """The figure as an image in full colour."""
+    """Return the figure as an image in full colour."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from PIL.Image import fromarray  # noqa: PLC0415
 
@@ -151,10 +156,10 @@ def _drawn(figure: Figure) -> Image:
 
 
 def _lay_out(figure: Figure) -> None:
-    """Place the axes between the title and the legend. The constrained layout of matplotlib takes up to four times as long."""
+    """Place the axes between the title and the legend. This takes a quarter of the time of matplotlib's constrained layout."""
     aspects = [(axis, axis.get_aspect()) for axis in figure.axes]
     for axis in figure.axes:
-        axis.set_aspect("auto")  # as large as there is room: labels outside of that would have none
+        axis.set_aspect("auto")  # tight_layout makes room for labels only if the axes fill their cells
     figure.tight_layout()
     for axis, aspect in aspects:
         axis.set_aspect(aspect)

@@ -1,7 +1,7 @@
 """HTML pages from the Jinja2 templates in ``templates``. All values are escaped.
 
-A page loads nothing: style, script, data and pictures are included, and its content security policy forbids everything else, so
-that an unescaped string could not run. The same values give the same bytes.
+A page loads nothing: style, script, data and pictures are embedded. Its content security policy forbids other scripts, so a value
+that is not escaped by mistake cannot run. The same values give the same bytes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 
 class Cell(NamedTuple):
-    """A cell of a table: a ``value``, smaller ``lines`` below it, its CSS class ``kind``, and the number of its ``colour``."""
+    """A cell of a table. ``value``: main text. ``lines``: smaller lines below it. ``kind``: CSS class, "" for none.
+
+    ``colour``: index of the colour of a mark in the cell, None for no mark.
+    """
 
     value: str
     lines: Sequence[str] = ()
@@ -30,18 +33,18 @@ class Cell(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """An image, as a data URI."""
+    """An image that is embedded in a page as a data URI."""
 
     uri: str
 
     @classmethod
     def of(cls, kind: str, content: bytes) -> Picture:
-        """The image in a file of the given media type."""
+        """Return the image with the bytes ``content``. ``kind``: media type, such as "image/png"."""
         return cls(f"data:{kind};base64,{base64.b64encode(content).decode()}")
 
 
 Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
-"""Header and rows of a table of texts. The first cell of each row is its header."""
+"""Header and rows of a table of texts. The first cell of each row is a label of the row."""
 Table = tuple[Sequence[str | Cell], Sequence[Sequence[str | int | Cell]]]
 """Header and rows of any table."""
 Part = str | Rows | Picture
@@ -49,18 +52,18 @@ Part = str | Rows | Picture
 
 
 def render(template: str, **values: Any) -> str:
-    """Return the page of a template in ``templates`` with these values."""
+    """Return the HTML page that a template in ``templates`` gives with these values. ``template``: the name of its file."""
     return _environment().get_template(template).render(version=__version__, **values)
 
 
 def sectioned(title: str, lead: str, doubts: Sequence[Notice], sections: Mapping[str, Sequence[Part]]) -> str:
-    """Return a page with a ``lead`` paragraph, highlighted ``doubts``, and ``sections`` by their title."""
+    """Return an HTML page with an introduction ``lead``, highlighted warnings ``doubts``, and ``sections`` by title."""
     names = {f"section-{i}": name for i, name in enumerate(sections)}
     parts = dict(zip(names, sections.values(), strict=True))
     return render("sectioned.html", title=title, lead=lead, doubts=doubts, sections=names, parts=parts)
 
 
-# control characters but line breaks and tabs, and those that turn the direction of text
+# control characters except line breaks and tabs, and characters that change the direction of text
 CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 
@@ -82,12 +85,12 @@ def _environment() -> Environment:
 
 
 def _without_controls(value: Any) -> Any:
-    """A text whose control characters, which a terminal would obey, are escaped; any other value itself."""
+    """Return a text with its control characters escaped, because a terminal would execute them. Return other values unchanged."""
     if not isinstance(value, str) or not CONTROL.search(value):
         return value
     return type(value)(CONTROL.sub(lambda found: plain(found[0]), value))
 
 
 def _digest(content: str) -> str:
-    """The hash of a style or script, as in a content security policy."""
+    """Return the hash of a style or script in the form that a content security policy requires."""
     return base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()

@@ -1,4 +1,4 @@
-"""Evaluation of results: metrics, statistics, tables and plots."""
+"""Evaluation of logs and of results of runs: metrics, statistics, tables, plots and reports."""
 
 __all__ = [
     "features",

@@ -1,9 +1,10 @@
-"""The plotted data of a run, common parts of its plots, and the plot of its consistency: NEES of its poses, NIS of its predictions.
+"""The plotted data of a run, common parts of its plots, and the plot of its consistency.
 
-Both are chi-square distributed for a consistent estimator (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking
-and Navigation", 2001, section 5.4). Errors of consecutive poses are correlated, so the NEES is compared with the interval of a
-single value. Innovations are independent, so the running mean of the NIS is compared with the interval of the mean. Colours: Okabe
-and Ito, "Color Universal Design", 2008, distinguishable by colour-blind readers.
+The consistency of an estimator is judged by the normalised estimation error squared (NEES) of the poses and the normalised
+innovation squared (NIS) of the predicted measurements. Both are chi-square distributed for a consistent estimator (Bar-Shalom, Li,
+Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4). Errors of consecutive poses are
+correlated, so the NEES is compared with the interval of a single value. Innovations are independent, so the running mean of the NIS
+is compared with the interval of the mean.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WINDOW = 20.0  # s, of running means
+WINDOW = 20.0  # s; duration of the window of running means
 _TAILS = ((1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0)
 _BAND: dict[str, Any] = {
     "color": COLOURS[5],
@@ -46,9 +47,11 @@ _IDEAL: dict[str, Any] = {"color": "black", "linewidth": 1.0, "label": "ideal"}
 class Track:
     """The plotted data of one run.
 
-    ``causal`` (None if never localized), ``final`` (may be empty); ``nis``: by sensor, rows
-    (K, 3) of time, normalised innovation squared and degrees of freedom; ``events``: time and text; ``max_gap`` [s]: largest
-    interval between estimates that is interpolated for errors. ``reliability``: of the sensors' models, by sensor.
+    ``causal``: trajectory of the estimates at each time, None if the robot was never localized.
+    ``final``: trajectory after the run, which may be empty.
+    ``nis``: by sensor, rows (K, 3) of time [s], normalised innovation squared, and degrees of freedom.
+    ``events``: time [s] and description of each event. ``max_gap`` [s]: errors are not interpolated across longer gaps.
+    ``reliability``: by sensor, the observed and the predicted numbers of detections.
     """
 
     causal: Trajectory | None
@@ -60,21 +63,22 @@ class Track:
 
     @classmethod
     def of(cls, result: RunResult) -> Track:
-        """The plotted data of a run, from its result in memory."""
+        """Return the plotted data of a run from its result in memory."""
         nis = {s: np.array(rows, dtype=float).reshape(-1, 3) for s, rows in result.diagnostics.nis.items()}
         events = tuple((event.t, str(event)) for event in result.diagnostics.events)
         return cls(result.causal(), result.final, nis, events, result.max_gap, result.reliability)
 
     @classmethod
     def read(cls, files: ResultFiles, max_gap: float = MAX_GAP) -> Track:
-        """The plotted data of a run, read from its result files. ``reliability`` stays empty: no file has it.
+        """Read the plotted data of a run from its result files. ``reliability`` is empty, because no file contains it.
 
-        ``max_gap`` [s]: see the class."""
+        ``max_gap`` [s]: errors are not interpolated across longer gaps between estimates.
+        """
         causal, final = (estimates.trajectory for estimates in files.estimates().values())
         return cls(causal if len(causal) else None, final, files.innovations(), files.events(), max_gap)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
-        """Both trajectories by name, None if there is nothing to plot."""
+        """Return the names and trajectories of the causal and the final estimates; None for a trajectory without poses."""
         return ("causal", self.causal), ("final", self.final if len(self.final) else None)
 
 
@@ -84,29 +88,29 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 
 def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:
-    """Mark events by dashed vertical lines."""
+    """Mark events, given as time [s] and description, by dashed vertical lines."""
     for i, (t, _) in enumerate(events):
         label = "event (see events.csv)" if i == 0 else None
         axis.axvline(t, color=COLOURS[3], linestyle="--", linewidth=1.0, label=label, zorder=1.5)
 
 
 def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
-    """Times (N,) and values (N, ...) with a row of NaN in each gap, which interrupts the line."""
+    """Insert a row of NaN into each gap of times (N,) and values (N, ...), so that a plotted line is interrupted there."""
     breaks = pauses(t)
     return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
 
 def gapped_path(trajectory: Trajectory) -> Array:
-    """The positions (N, 2) of a trajectory, with a row of NaN in each gap."""
+    """Return the positions (M, 2) [m] of a trajectory, with a row of NaN in each gap."""
     return with_pauses(trajectory.t, trajectory.poses[:, :2])[1]
 
 
 def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
-    """NEES of the causal and final poses, if there is a reference, and NIS per degree of freedom of each sensor, over time.
+    """Plot the NEES of the causal and final poses, and the NIS per degree of freedom of each sensor, over time.
 
-    None if there is neither.
+    The NEES is plotted only if the log has a reference. Returns None if there is neither NEES nor NIS.
     """
-    # empty innovations have no degrees of freedom
+    # innovations without any component have no degrees of freedom and are omitted
     innovations = {s: rows[(rows[:, 2] > 0.0) & np.isfinite(rows[:, 1])] for s, rows in track.nis.items()}
     sensors = sorted(sensor for sensor, values in innovations.items() if len(values))
     rows: list[Any] = [["causal", "final"]] if log.reference is not None else []
@@ -133,9 +137,10 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
 
 
 def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]:
-    """Weighted running mean of ``values`` around each ``t`` (N,), ascending, and the sums of weights.
+    """Return the running means (N,) in windows of :data:`WINDOW` seconds around each time, and the sums of weights (N,) in them.
 
-    The mean is the sum of ``values`` over that of ``weights`` within ``WINDOW`` seconds; NaN if a window has no weight.
+    ``t`` (N,): ascending times [s]. ``values`` (N,): values that are already multiplied by their ``weights`` (N,). The mean is NaN
+    if the sum of weights is 0.
     """
     first = np.searchsorted(t, t - WINDOW / 2.0, side="left")
     last = np.searchsorted(t, t + WINDOW / 2.0, side="right")
@@ -147,6 +152,7 @@ def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]
 
 
 def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Trajectory, max_gap: float) -> None:
+    """Plot the NEES of a trajectory. ``kind``: "causal" or "final", for labels."""
     dof = 3 if reference.has_heading else 2
     axis.set(title=f"{kind} poses", ylabel="NEES of x, y, heading" if dof == 3 else "NEES of x, y", yscale="log")
     low, high = chi_squared.quantile(_TAILS, dof)
@@ -163,11 +169,12 @@ def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Traje
 
 
 def _nis(axis: Axes, sensor: str, rows: Array) -> None:
+    """Plot the NIS of a sensor. ``rows`` (K, 3): time [s], NIS, and degrees of freedom."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     t, nis, dof = rows.T
     mean, total = running_mean(t, nis, dof)
     axis.set(title=f"innovations of {sensor}", ylabel="NIS per degree of freedom", yscale="log")
-    mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # no line across a gap
+    mean[np.diff(t, append=t[-1]) > WINDOW] = np.nan  # interrupts the line in a gap
     low, high = (np.where(np.isnan(mean), np.nan, chi_squared.quantile(tail, total) / total) for tail in _TAILS)
     axis.fill_between(t, low, high, **_BAND)
     axis.axhline(1.0, **_IDEAL)
@@ -175,7 +182,8 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
 
 
 def _draw(axis: Axes, t: Array, single: Array, mean: tuple[Array, Array], low: float) -> None:
+    """Draw single values (N,) over time and their running ``mean``. ``low``: a quarter of it is the lower end of the axis."""
     axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
     axis.plot(*mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
-    # cut off the smallest values
+    # the smallest values are not in the range of the axis
     axis.set_ylim(low / 4.0, 2.0 * max(float(np.nanmax(single)), 20.0 * low))

@@ -1,8 +1,7 @@
-"""Statistical inference on the scores of many runs: pooled figures, differences, significance and effect size.
+"""Statistical inference on the scores of many runs: pooled scores, differences, significance and effect size.
 
-Runs are paired by log and seed, and logs are the units: with six logs or more there is an interval and a test over logs. With one
-log and six seeds or more both are over its seeds, and hold for this log only. In between, the results of each log are listed
-without a test.
+Runs are paired by log and seed. With six logs or more, intervals and tests are over logs. With a single log and six seeds or more,
+they are over seeds, and are valid for this log only. Otherwise there is neither interval nor test.
 
 Test: Wilcoxon, "Individual comparisons by ranking methods", Biometrics Bulletin 1(6), 1945, with zeros as of Pratt, "Remarks on
 zeros and ties in the Wilcoxon signed rank procedures", JASA 54(287), 1959. Effect: matched-pairs rank-biserial correlation,
@@ -28,25 +27,28 @@ from factorgraph_loc.evaluation.warned import Row
 from factors import chi_squared
 from factors.se2 import Array
 
-SIGNIFICANT = 1.0 - CONFIDENCE
-_EXACT = 60  # largest number of pairs with an exact distribution
+SIGNIFICANT = 1.0 - CONFIDENCE  # p values below are significant
+_EXACT = 60  # maximum number of pairs for which the signed-rank distribution is computed exactly
 
-# columns of a difference, with their types, as there may be no rows
+# columns of the table of differences, with their types, which a table without rows needs
 DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("metric", "a", "b", "log"), str),
     **dict.fromkeys(("value_a", "value_b", "difference", "low", "high"), float),
     **dict.fromkeys(("pairs", "left_out"), int),
 }
 
-Seeds = Mapping[int, float | None]  # the score of each seed, None where a run has none
-ByLog = Mapping[str, Seeds]
+Seeds = Mapping[int, float | None]  # by seed, the score of the run, None if it has no score
+ByLog = Mapping[str, Seeds]  # by log
 Units = Literal["logs", "seeds"]
 
 
 @dataclass(frozen=True)
 class Pooled:
-    """A figure over logs. ``low`` and ``high``: 95 % interval over ``units``, None if these are too few; ``least`` and ``most``:
-    the range over its ``count`` units, which are the logs, or the seeds of a single log."""
+    """A score that is pooled over the seeds and logs of many runs.
+
+    ``units``: the independent units, "logs", or "seeds" of a single log. ``count``: number of units. ``logs``: number of logs.
+    ``low``, ``high``: 95 % interval over the units, None if there are too few. ``least``, ``most``: range over the units.
+    """
 
     value: float
     low: float | None
@@ -60,11 +62,14 @@ class Pooled:
 
 @dataclass(frozen=True)
 class Contrast:
-    """``a`` minus ``b``: negative if the scores of ``a`` are lower.
+    """The difference between the scores of two methods a and b.
 
-    ``difference`` of the pooled figures, with 95 % interval ``low`` to ``high``; ``p`` (two-sided) and ``effect`` (-1 to 1) of
-    the signed-rank test. Interval and test are over ``count`` ``units``, None if these are too few. ``by_log``: both figures of
-    each log, (value_a, value_b). ``pairs``: number of runs compared; ``left_out``: number without a partner.
+    ``difference``: pooled score of a minus that of b, negative if the scores of a are lower. ``low``, ``high``: 95 % interval.
+    ``p``: two-sided p value of the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1.
+    ``units``: "logs", or "seeds" of a single log. ``count``: number of units. Interval and test are over the units; they are None
+    if there are too few.
+    ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs that
+    have no partner.
     """
 
     difference: float
@@ -80,9 +85,10 @@ class Contrast:
 
 
 def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) -> Pooled | None:
-    """A figure pooled over seeds, then over logs with equal weight: root mean square, or else the mean. None without any.
+    """Pool a score over seeds, and then over logs with equal weights. Return None if there are no scores.
 
-    ``alike``: for logs that are variations of one, its name; together they count as one log.
+    ``scores``: by log and seed. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``: for logs that are
+    variants of the same log, a common name. Together they count as one log.
     """
     known = {log: np.array([[v] for v in seeds.values() if v is not None]) for log, seeds in scores.items()}
     clusters = _clusters(known, alike)
@@ -99,10 +105,11 @@ def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) 
 def contrast(
     a: ByLog, b: ByLog, *, rms: bool, interval: bool = True, alike: Mapping[str, str] | None = None
 ) -> Contrast | None:
-    """Compare two sets of runs by their common logs and seeds; None if they have none in common.
+    """Compare the scores ``a`` and ``b`` of two methods on common logs and seeds. Return None if they have no pair in common.
 
-    One that ran with one seed is paired with each seed of the other. ``interval``: whether to compute the interval, which takes
-    time. ``alike``: see :func:`pooled`; ``by_log`` lists these logs separately.
+    If a method ran with a single seed, its run is paired with each seed of the other method. ``rms``, ``alike``: see
+    :func:`pooled`; ``by_log`` of the result lists variants of a log separately. ``interval``: whether to compute the interval,
+    which takes time.
     """
     matched = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in matched.values()) + sum(len(b[log]) for log in b if log not in a)
@@ -137,11 +144,12 @@ def contrast(
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Differences ``a`` minus ``b`` of the RMSEs of all pairs of estimators: negative if ``a`` is better.
+    """Return the table of differences between the RMSEs of all pairs of estimators ``a`` and ``b``, with :data:`DIFFERENCES`.
 
-    ``rows`` are runs with log, estimator, seed and scores. For each log: RMSE pooled over the pairs of seeds. With enough logs
-    for an interval also ``log`` = "(all)". ``pairs``: number of compared (log, seed); ``left_out``: number without a score in one
-    of the two. Without any pair the values are None.
+    ``rows``: runs with log, estimator, seed and scores. A row of the table has the RMSEs on one log, pooled over pairs of seeds,
+    and their difference, which is negative if ``a`` is better. With enough logs for an interval there is a row with log "(all)".
+    ``pairs``: number of compared pairs of runs. ``left_out``: number of runs without a partner that has a score. Values are None
+    if there are no pairs.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -167,9 +175,14 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def signed_rank(differences: Array) -> float:
-    """Two-sided p of Wilcoxon's signed-rank test that differences (N,) are symmetric about 0; exact up to 60."""
+    """Return the two-sided p value of Wilcoxon's signed-rank test that ``differences`` (N,) are symmetric about 0.
+
+    It is exact for at most 60 differences that are not 0. Above, the normal approximation is used.
+    """
     ranks = _ranks(differences)
-    doubled = np.rint(2.0 * ranks[differences != 0.0]).astype(int)  # ranks of ties are multiples of a half
+    doubled = np.rint(2.0 * ranks[differences != 0.0]).astype(
+        int
+    )  # whole numbers: ranks of ties are multiples of a half
     if not len(doubled):
         return 1.0
     total = int(doubled.sum())
@@ -187,14 +200,14 @@ def signed_rank(differences: Array) -> float:
 
 
 def rank_biserial(differences: Array) -> float:
-    """Matched-pairs rank-biserial correlation of differences (N,): 1 if all are positive, -1 if all are negative."""
+    """Return the matched-pairs rank-biserial correlation of differences (N,): 1 if all are positive, -1 if all are negative."""
     ranks = _ranks(differences)
     total = float(ranks[differences != 0.0].sum())
     return float(ranks[differences > 0.0].sum() - ranks[differences < 0.0].sum()) / total if total else 0.0
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's corrected p values: those below 0.05 are significant together. None is not tested, and stays."""
+    """Correct p values for the number of tests by Holm's method. None stands for a comparison that is not tested."""
     tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0
@@ -205,14 +218,14 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def least_p(count: int) -> float:
-    """The smallest p that :func:`signed_rank` can return for ``count`` differences."""
+    """Return the smallest p value that :func:`signed_rank` can return for ``count`` differences."""
     return float(2.0 ** (1 - count))
 
 
 def independent_count(values: Array) -> float:
-    """The effective number of independent values in a series (N,): N over its integrated autocorrelation time, at least 1.
+    """Return the effective number of independent values in a time series (N,): N divided by its autocorrelation time, at least 1.
 
-    Autocorrelations are summed over pairs of lags until a pair is no longer positive (Geyer's initial positive sequence).
+    Autocorrelations are summed over pairs of lags until the sum of a pair is not positive (Geyer's initial positive sequence).
     """
     n = len(values)
     centred = values - np.mean(values)
@@ -228,10 +241,11 @@ def independent_count(values: Array) -> float:
 
 
 def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float, float]:
-    """The 95 % band of a consistent estimator's mean NEES, averaged over logs.
+    """Return the 95 % interval of the NEES of a consistent estimator, averaged over each log and then over logs.
 
-    ``counts``: effective number of independent values of each log; ``dofs``: its degrees of freedom. The band is that of a
-    chi-square distribution with the same mean and variance."""
+    ``counts``: by log, the effective number of independent values. ``dofs``: by log, the degrees of freedom of a pose. The
+    distribution is approximated by a scaled chi-square distribution with the same mean and variance.
+    """
     expected = float(np.mean(dofs))
     matched = (expected * len(dofs)) ** 2 / float(np.sum(np.asarray(dofs) / np.asarray(counts, dtype=float)))
     tail = (1.0 - CONFIDENCE) / 2.0
@@ -240,14 +254,16 @@ def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float,
 
 
 def _ranks(differences: Array) -> Array:
-    """Ranks of the absolute values, equal ones sharing theirs; zeros get the lowest and count for neither side. As
-    ``scipy.stats.rankdata``, which takes half a second to import."""
+    """Return the ranks (N,) of the absolute values, where equal values have their mean rank. Zeros have the lowest rank.
+
+    This is ``scipy.stats.rankdata``, without the half second that the import of ``scipy.stats`` takes.
+    """
     _, which, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1.0))[which])
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """The scores (K, C) of each log that has any, with those of ``alike`` logs merged."""
+    """Return the scores (K, C) of each log that has any, in one array for the variants of a log (``alike``)."""
     merged: dict[str, list[Array]] = {}
     for log, values in scores.items():
         if len(values):
@@ -256,7 +272,7 @@ def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> l
 
 
 def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:
-    """The statistical units, and whether there are enough."""
+    """Return the kind of the independent units, and True if there are enough for intervals and tests."""
     if len(clusters) == 1:
         return "seeds", len(clusters[0]) >= ENOUGH_LOGS
     return "logs", len(clusters) >= ENOUGH_LOGS

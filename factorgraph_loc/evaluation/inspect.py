@@ -1,4 +1,4 @@
-"""Inspection of a log: its content and its problems."""
+"""Inspection of a log: a summary of its content, and warnings about problems. ``fgloc info`` prints it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +17,10 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class StreamSummary:
-    """One stream: rows, median rate [Hz], first and last stamp [s], and long gaps (start, length) [s]."""
+    """Summary of a stream: the number of rows, the median ``rate`` [Hz], the ``first`` and ``last`` timestamp [s].
+
+    ``gaps``: start and length [s] of each long gap.
+    """
 
     rows: int
     rate: float
@@ -28,7 +31,11 @@ class StreamSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The content of a log: streams and reference, results of each sensor (``sensors``, by name), and problems."""
+    """The result of an inspection.
+
+    ``streams``: by name, a summary of each stream. ``reference``: summary of the reference, None if the log has none.
+    ``problems``: warnings. ``sensors``: by sensor, a summary of its measurements.
+    """
 
     streams: Mapping[str, StreamSummary]
     reference: StreamSummary | None
@@ -37,7 +44,8 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The results of all sensors, by key (``unseen``, ``rfid``, ...); those of one of several below its name."""
+        """The results of all sensors by key, such as ``unseen`` or ``rfid``. If there are several sensors of a kind, the results of
+        each are nested below its name."""
         entries: dict[str, Any] = {}
         for name, summary in self.sensors.items():
             entries |= summary.found if kind_of(name) == name else {name: dict(summary.found)}
@@ -45,12 +53,12 @@ class Inspection:
 
     @property
     def in_map(self) -> dict[str, int]:
-        """The number of objects in each layer of the map."""
+        """The number of objects in each layer of the map, such as landmarks and tags."""
         return {layer: count for summary in self.sensors.values() for layer, count in summary.in_map.items()}
 
 
 def inspect(log: Log) -> Inspection:
-    """Inspect a log: summaries of its streams, and problems."""
+    """Summarize the streams of a log, and collect warnings about problems."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
     reference = None if log.reference is None else _summary(log.reference.t)
     problems = list(log.warnings)
@@ -66,7 +74,7 @@ def inspect(log: Log) -> Inspection:
 
 
 def _about(name: str, summary: Summary) -> Summary:
-    """A summary whose lines begin with the name of the sensor if it is one of several."""
+    """Return a summary whose lines begin with the name of the sensor if there are several sensors of its kind."""
     if kind_of(name) == name:
         return summary
     text = [replace(paragraph, line=f"{name}: {paragraph.line}") for paragraph in summary.text]
@@ -74,14 +82,14 @@ def _about(name: str, summary: Summary) -> Summary:
 
 
 def _problems(name: str, sensors: Mapping[str, Summary]) -> list[Notice]:
-    """The problems of a sensor. An undetected thing is none if another sensor of the kind detects it."""
+    """Return the warnings of a sensor. A landmark or tag is reported as undetected only if no sensor of the kind detects it."""
     of_kind = [summary for each, summary in sensors.items() if kind_of(each) == kind_of(name)]
     undetected = [each for each in sensors[name].undetected if all(each in summary.undetected for summary in of_kind)]
     return [*sensors[name].problems, *undetected]
 
 
 def _summary(t: Array) -> StreamSummary:
-    """Summary of a stream with stamps (N,) in order of arrival."""
+    """Summarize a stream. ``t`` (N,): timestamps [s] in order of arrival."""
     if len(t) == 0:
         return StreamSummary(0, 0.0, 0.0, 0.0, ())
     stamps = np.unique(t)

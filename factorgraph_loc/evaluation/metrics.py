@@ -1,6 +1,6 @@
 """Accuracy of a trajectory against the reference, and consistency of its covariances.
 
-If the map's frame is known, trajectories are aligned only on request.
+Trajectories are compared without alignment, except on request or if the run estimated its map in a frame of its own.
 
 Pairing of poses: :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with
 Applications to Tracking and Navigation", 2001, section 5.4. Relative pose errors:
@@ -30,19 +30,20 @@ from factorgraph_loc.text import notice
 from factors import chi_squared, positive, se2
 from factors.se2 import Array
 
-FEWEST_SCORED = 10  # least number of poses for meaningful figures
-FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` with which it estimates the map
+FEWEST_SCORED = 10  # minimum number of compared poses; with fewer a trajectory has no scores
+FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` if it estimates the map without a given one
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors at N stamps ``t`` (N,) of the reference, from the first pose to the last; NaN in gaps of the trajectory.
+    """Errors of a trajectory at N times of the reference. All errors are NaN in gaps of the trajectory.
 
-    ``poses`` and ``reference`` (N, 3): the compared poses. ``difference`` (N, 3): estimate minus reference in x, y [m, world
-    frame] and heading [rad, wrapped]. ``position`` (N,): Euclidean [m]. ``heading`` (N,): absolute [rad], NaN if the reference
-    has no heading. ``nees`` (N,): normalised estimation error squared of x, y and heading, or of x and y if the reference has no
-    heading (``dof`` 3 or 2). ``nees_position`` (N,): of x and y. Both are NaN if the covariance is missing or not positive
-    definite; ``invalid`` (N,) marks the latter.
+    ``t`` (N,): times [s]. ``poses``, ``reference`` (N, 3): the compared poses (x, y, heading).
+    ``difference`` (N, 3): estimate minus reference in x, y [m, world frame] and heading [rad, wrapped].
+    ``position`` (N,): distance [m]. ``heading`` (N,): absolute difference [rad], NaN if the reference has no heading.
+    ``nees`` (N,): normalised estimation error squared of x, y and heading, or of x and y if the reference has no heading.
+    ``dof``: number of these components, 3 or 2. ``nees_position`` (N,): normalised estimation error squared of x and y.
+    ``invalid`` (N,): mask of the poses whose covariance is not positive definite. There, and without covariances, NEES are NaN.
     """
 
     t: Array
@@ -58,8 +59,11 @@ class Errors:
 
 
 def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Errors:
-    """The errors of ``trajectory`` at the scored stamps of ``reference``, without alignment; see
-    :func:`~factorgraph_loc.evaluation.pairing.pairs`."""
+    """Return the errors of a trajectory against the reference, without alignment, at about ten times per second.
+
+    ``max_gap`` [s]: errors are NaN between estimates that are further apart. See
+    :func:`~factorgraph_loc.evaluation.pairing.pairs`.
+    """
     if trajectory.covariances is not None:
         unsound = ~_positive_definite(trajectory.covariances)
         trajectory = replace(trajectory, covariances=np.where(unsound[:, None, None], np.nan, trajectory.covariances))
@@ -92,21 +96,21 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
 
 
 def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, Any]:
-    """All figures of a run, by dotted key; metres, radians, None where undefined.
+    """Return all scores of a run by key, in metres and radians. A score that is undefined is None.
 
-    - ``scoring.max_gap`` [s]: only runs with equal values are comparable.
-    - ``causal.*`` and ``final.*``: see :func:`accuracy`. Both are scored from the first localized causal estimate. All but
-      ``scored`` are None without a reference, or with fewer than :data:`FEWEST_SCORED` scored poses. If the run was never
-      localized, ``causal.*`` is None, and ``final.*`` is scored from the beginning of the run.
-    - ``time_to_localized`` [s]: from the first tick.
+    - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Only runs with equal values are comparable.
+    - ``causal.*`` and ``final.*``: see :func:`accuracy`. Both are scored from the first causal estimate with a localized robot.
+      All but ``scored`` are None without a reference, or with fewer than :data:`FEWEST_SCORED` scored poses. If the robot was
+      never localized, ``causal.*`` is None, and ``final.*`` is scored from the beginning of the run.
+    - ``time_to_localized`` [s]: time from the start of the run until the robot is localized.
     - ``landmarks.*``: see :func:`landmark_figures`; None unless the run estimated the map.
-    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: of each learnt constant.
+    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each learnt constant.
     - ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*``, ``timing.*``, and the list ``warnings`` always exist.
 
-    If ``align`` is not ``none``, or if the run estimated its map, which is then aligned by ``se2``, there are also
-    ``scoring.align`` and the errors :data:`ALIGNED` [m, rad] of ``causal`` and ``final`` after the alignment, at the same stamps
-    (:func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). These are None without a reference. They are None, with a
-    warning, if the poses do not determine the alignment.
+    ``align``: an alignment of the trajectories with the reference; ``none`` becomes ``se2`` if the run estimated its map. With an
+    alignment there are also ``scoring.align``, and the errors :data:`ALIGNED` [m, rad] of ``causal`` and ``final`` after it, at the
+    same times (:func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). These errors are None without a reference. If
+    the poses do not determine the alignment, they are None and there is a warning.
     """
     causal = result.causal()
     final = result.final
@@ -148,15 +152,18 @@ def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap:
 
 
 def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
-    """The figures of one trajectory against the reference, see :func:`errors`; all None without one.
+    """Return the scores of one trajectory against the reference by name. All are None if there is no reference.
 
-    ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95``, ``max``. ``rpe_*_per_m``: root mean square of the
-    relative errors over ``rpe_pieces`` of a metre of path; ``rpe_*_per_s``: over a second (see
-    :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`). ``anees``: mean NEES, ideally 3 (2 if the reference has no
-    heading). ``nees_bounds``: 95 % interval of the mean of as many *independent* NEES; errors along a trajectory are correlated, so
-    a consistent estimator is outside more often. ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 %
-    ellipse. ``invalid_covariances``: number of scored poses whose covariance is not positive definite, excluded from these three.
-    ``scored``: number of poses of the reference with an estimate.
+    - ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95`` and ``max`` of the errors, see :func:`errors`.
+    - ``rpe_position_per_m``, ``rpe_heading_per_m``: root mean square of the relative errors over pieces of one metre of path, see
+      :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`. ``rpe_pieces``: number of these pieces.
+    - ``rpe_position_per_s``, ``rpe_heading_per_s``: the same over pieces of one second.
+    - ``anees``: mean NEES, ideally 3, or 2 if the reference has no heading.
+    - ``nees_bounds``: 95 % interval of the mean of as many independent NEES. Errors along a trajectory are correlated, so the
+      ANEES of a consistent estimator is outside of the interval more often.
+    - ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 % ellipse.
+    - ``invalid_covariances``: number of scored poses whose covariance is not positive definite. The previous three exclude them.
+    - ``scored``: number of compared poses.
     """
     figures: dict[str, Any] = dict.fromkeys(ACCURACY)
     if reference is None:
@@ -188,12 +195,15 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
 def landmark_figures(
     trajectory: Trajectory, landmarks: Mapping[str, LearntPoint], log: Log, max_gap: float = MAX_GAP
 ) -> dict[str, Any]:
-    """``OF_FREE_MAP`` of a run that estimated its map.
+    """Return the scores of the landmarks of a run that estimated its map. A score that is undefined is None.
 
-    Of the learnt landmarks that are also in the log's map, after the alignment of the ``trajectory`` in the plane: their
-    ``count``, root mean square distance ``rmse`` [m] and mean NEES ``anees``, ideally 2. The covariances include the uncertainty
-    of the start, which the alignment removes, so less than 2 is usual. Without a reference the landmarks themselves are aligned.
-    None where a figure is undefined.
+    Estimated ``landmarks`` are compared with those of the log's map, after an alignment in the plane that moves ``trajectory`` onto
+    the reference. Without a reference, the alignment moves the landmarks onto those of the map.
+
+    - ``landmarks.count``: number of estimated landmarks that the log's map has too.
+    - ``landmarks.rmse`` [m]: root mean square distance of these landmarks from the map.
+    - ``landmarks.anees``: their mean NEES, ideally 2. It is usually below 2, because the covariances include the uncertainty of the
+      start, which the alignment removes.
     """
     figures: dict[str, Any] = dict.fromkeys(OF_FREE_MAP)
     names = [name for name in landmarks if name in log.world.landmarks]
@@ -206,7 +216,7 @@ def landmark_figures(
         pair = pairs(trajectory, log.reference, max_gap)
         pose = se2.align_points(pair.poses[:, :2], pair.truth[:, :2])
     if names and np.isfinite(pose).all():
-        # in the estimate's own frame, as the covariances
+        # in the frame of the estimate, like the covariances
         error = positions - se2.transform_to(pose, truth)
         figures["landmarks.rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
         covariances = np.array([landmarks[name].covariance for name in names])
@@ -216,12 +226,14 @@ def landmark_figures(
 
 
 def _positive_definite(covariances: Array) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the matrices (N, D, D) that are finite and positive definite."""
     finite: NDArray[np.bool_] = np.all(np.isfinite(covariances), axis=(1, 2))
     smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], covariances, np.eye(covariances.shape[-1])))[:, 0]
     return np.asarray(finite & (smallest > 0.0))
 
 
 def _squared(difference: Array, covariances: Array) -> Array:
+    """Return the squared Mahalanobis distances (N,) of differences (N, D) with ``covariances`` (N, D, D)."""
     whitened = positive.solve(covariances, difference[..., None])[..., 0]
     return np.asarray(np.sum(difference * whitened, axis=1))
 
@@ -234,10 +246,14 @@ def _constants(learnt: Learnt) -> dict[str, float]:
 
 
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
-    """Diagnostics as figures.
+    """Return the diagnostics of a run as scores by key.
 
-    NIS by sensor (median of NIS over its expected median, ideally 1; fraction above the 95 % bound), residuals at the prediction
-    (m, rad), numbers of unused measurements, and doubted elements of the map with their probability.
+    - ``nis.SENSOR.median_ratio``: median of the NIS divided by its expected median, ideally 1. ``nis.SENSOR.beyond_95``: fraction
+      above the 95 % bound. ``nis.SENSOR.count``: number of innovations.
+    - ``residual.NAME.rms`` and ``residual.NAME.median_abs`` [m or rad]: of the residuals at the prediction.
+    - ``ignored.*``, ``rejected.*``, ``late.*``: numbers of unused measurements, in total and by reason.
+    - ``KIND.total`` and ``KIND.NAME``: landmarks or tags that are probably dead or moved, by kind of doubt, with the probability.
+    - ``events``: number of events.
     """
     figures: dict[str, Any] = {}
     for sensor, rows in sorted(diagnostics.nis.items()):
@@ -245,7 +261,7 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
             _, nis, dof = np.array(rows, dtype=float).T
             valid = (dof > 0.0) & np.isfinite(nis)
             nis, dof = nis[valid], dof[valid]
-            # not the mean, which a few outliers dominate
+            # the median, because a few outliers dominate the mean
             figures[f"nis.{sensor}.median_ratio"] = (
                 float(np.median(nis / chi_squared.quantile(0.5, dof))) if len(nis) else None
             )

@@ -1,14 +1,15 @@
-"""Common steps of all scores of trajectories: pairing with the reference, alignment in the plane, pieces, statistics of errors.
+"""Common steps of all scores of trajectories: pairing of poses with the reference, pieces of paths, and statistics of errors.
 
-Estimates are paired with the reference at its own stamps, at most ten per second. Pieces are intervals of relative errors.
+A trajectory is compared with the reference at timestamps of the reference, at most ten per second. Relative errors are computed
+over pieces of the path.
 
-Estimates are interpolated. The reference is not: it is defined only at its stamps, and a gap contains no stamp. Estimates are on
-a grid of 10 Hz, so a scored pose is interpolated between two that are less than 0.1 s away. The later of these may use a
-measurement that had not arrived at the stamp.
+The estimates are interpolated at these timestamps. The reference is not interpolated: nothing is scored in its gaps. Estimates are
+usually 0.1 s apart, so a scored pose is interpolated between two estimates that are less than 0.1 s away. The later one may use a
+measurement that arrives after the timestamp.
 
-Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights. Let ``a`` and ``b`` be
-the errors of the neighbours. The covariance of ``(1 - f) a + f b`` is at most ``(1 - f) E[a a'] + f E[b b']``, for any
-correlation. Both are equal for identical errors.
+Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights, which is conservative. Let
+``a`` and ``b`` be the errors of the neighbours, and ``f`` the weight of the later one. The covariance of ``(1 - f) a + f b`` is at
+most ``(1 - f) E[a a'] + f E[b b']``, for any correlation. Both are equal for identical errors.
 """
 
 import bisect
@@ -22,21 +23,22 @@ from factorgraph_loc.model.scoring import MAX_GAP
 from factorgraph_loc.model.trajectory import Trajectory, neighbours
 from factors.se2 import Array, Integers
 
-RATE = 10.0  # Hz, of poses that are scored
-TOLERANCE = 1e-3  # s, of stamps
-_PAUSE = 1.0  # s between neighbours of a reference that is never a gap
-_USUAL = 3.0  # times the median interval that is never a gap
-PIECE_TOLERANCE = 0.1  # maximum relative difference of a length, for all pairs of poses
-DELTA = 1.0  # m, and s: interval of relative errors
-CONFIDENCE = 0.95  # of intervals
-HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")
+RATE = 10.0  # Hz; maximum rate of scored poses
+TOLERANCE = 1e-3  # s; tolerance of comparisons of timestamps
+_PAUSE = 1.0  # s; a shorter interval between timestamps is no gap
+_USUAL = 3.0  # an interval below this multiple of the median interval is no gap
+PIECE_TOLERANCE = 0.1  # maximum relative difference between the length of an overlapping piece and the requested length
+DELTA = 1.0  # length of the pieces of relative errors, in m of path and in s
+CONFIDENCE = 0.95  # probability of all intervals
+HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")  # names of statistics
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """M estimates and true poses at the times ``t`` (M,), stamps of the reference from the first estimate to the last.
+    """Estimated and true poses (x, y, heading) at M timestamps of the reference.
 
-    ``poses`` (M, 3) and ``covariances`` (M, 3, 3) or None: of the estimate, NaN in its gaps. ``truth`` (M, 3).
+    ``t`` (M,): times [s] between the first and the last estimate. ``truth`` (M, 3): poses of the reference.
+    ``poses`` (M, 3), ``covariances`` (M, 3, 3) or None: interpolated estimates, NaN in gaps of the estimates.
     """
 
     t: Array
@@ -46,7 +48,8 @@ class Pairs:
 
 
 def thinned(t: Array) -> Integers:
-    """Which of the stamps ``t`` (N,), ascending, are scored: the first, and each at least 0.1 s after the previous one."""
+    """Return the indices of the scored ones of ascending timestamps (N,) [s]: the first, and each at least 0.1 s after the
+    previous scored one."""
     kept: list[int] = []
     stamps, i = t.tolist(), 0
     while i < len(stamps):
@@ -56,7 +59,10 @@ def thinned(t: Array) -> Integers:
 
 
 def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Pairs:
-    """The estimates at the reference's stamps, where neighbouring estimates are at most ``max_gap`` [s] apart."""
+    """Interpolate a trajectory at timestamps of the reference, and pair it with the reference.
+
+    ``max_gap`` [s]: the interpolated pose is NaN between estimates that are further apart.
+    """
     rows = thinned(reference.t)
     at = _within(reference.t[rows], trajectory.t)
     rows, at = rows[np.isfinite(at)], at[np.isfinite(at)]
@@ -65,7 +71,10 @@ def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GA
 
 
 def pairs_in_space(estimate: PosePath, reference: PosePath, max_gap: float = MAX_GAP) -> tuple[PosePath, PosePath]:
-    """The same in space: estimates and true poses, only where both exist."""
+    """Interpolate a path in space at timestamps of the reference. Return the interpolated and the true poses, in equal numbers.
+
+    ``max_gap`` [s]: timestamps between estimates that are further apart are omitted.
+    """
     t0_ns = int(estimate.stamps()[0])
     own, t = (checks.seconds(path.stamps(), t0_ns) for path in (estimate, reference))
     rows = thinned(t)
@@ -75,7 +84,10 @@ def pairs_in_space(estimate: PosePath, reference: PosePath, max_gap: float = MAX
 
 
 def pauses(t: Array) -> Integers:
-    """The stamps ``t`` (N,) that follow a gap: more than 1 s, and more than three times the median interval."""
+    """Return the indices of the timestamps ``t`` (N,) [s] that follow a gap.
+
+    A gap is longer than 1 s and longer than three times the median interval.
+    """
     if len(t) < 2:
         return np.empty(0, dtype=np.int64)
     steps = np.diff(t)
@@ -83,7 +95,8 @@ def pauses(t: Array) -> Integers:
 
 
 def _within(t: Array, stamps: Array) -> Array:
-    """Times ``t`` clipped to the range of ``stamps`` if outside by at most the tolerance, else NaN."""
+    """Return times ``t`` (M,) clipped to the range of ``stamps`` (N,). A time that is outside by more than :data:`TOLERANCE`
+    becomes NaN."""
     if not len(stamps):
         return np.full(len(t), np.nan)
     clipped = np.clip(t, stamps[0], stamps[-1])
@@ -91,13 +104,13 @@ def _within(t: Array, stamps: Array) -> Array:
 
 
 def rms(values: Array) -> float | None:
-    """Root mean square of the finite values, None without any."""
+    """Return the root mean square of the finite values, or None if there are none."""
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
 def summarize(values: Array) -> dict[str, float | None]:
-    """Statistics of the finite values by the names of :data:`HOW`, None without any."""
+    """Return the statistics :data:`HOW` of the finite values by name. They are None if there are no finite values."""
     values = values[np.isfinite(values)]
     if not len(values):
         return dict.fromkeys(HOW)
@@ -113,10 +126,10 @@ def summarize(values: Array) -> dict[str, float | None]:
 
 
 def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """Successive pieces as indices of their first and last pose.
+    """Divide a path of N poses into successive pieces. Return the indices of the first and the last pose of each piece.
 
-    ``steps`` (N - 1,): between N poses, numbered from ``first``. A piece ends at the first pose where its steps sum up to
-    ``length`` or more.
+    ``steps`` (N - 1,): distances or times between successive poses. ``first``: index of the first pose. A piece ends at the first
+    pose where the sum of its steps is ``length`` or more.
     """
     pieces: list[tuple[int, int]] = []
     begin, covered = first, 0.0
@@ -129,9 +142,10 @@ def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, i
 
 
 def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """The same for pieces that may overlap: from each pose to the first later one with a distance nearest to ``length``.
+    """Return overlapping pieces of a path of N poses, one from each pose, as indices of their first and last pose.
 
-    Pieces that differ from ``length`` by more than :data:`PIECE_TOLERANCE` of it are omitted.
+    ``steps``, ``first``: see :func:`successive`. A piece ends at the pose for which its length is nearest to ``length``. Pieces
+    whose length differs from ``length`` by a fraction of more than :data:`PIECE_TOLERANCE` are omitted.
     """
     covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
     pieces: list[tuple[int, int]] = []
@@ -139,7 +153,7 @@ def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, in
         next_index = bisect.bisect_left(covered, start + length, i + 1)
         near = [j for j in (next_index - 1, next_index) if i < j < len(covered)]
         best = min(near, key=lambda j: abs(covered[j] - start - length))
-        best = bisect.bisect_left(covered, covered[best], i + 1)  # the first pose of a stop
+        best = bisect.bisect_left(covered, covered[best], i + 1)  # of poses at the same distance, the first
         if abs(covered[best] - start - length) <= PIECE_TOLERANCE * length:
             pieces.append((first + i, first + best))
     return pieces

@@ -32,11 +32,16 @@ _FILES = (
 
 
 def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path) -> list[Path]:
-    """Write the plots of a log NAME, for estimators by name, into ``folder`` and return their paths.
+    """Write the plots of the runs on a log into ``folder``. Return the paths of the PNG files, whose names start with that of the
+    log.
 
-    ``NAME-trajectories.png``, and for several estimators with a reference ``NAME-error-distribution.png``. For each with a
-    trajectory: ``NAME-consistency-ESTIMATOR.png``, with a reference or innovations; with a reference
-    ``NAME-errors-ESTIMATOR.png``; with tags ``NAME-reliability-ESTIMATOR.png``.
+    ``tracks``: the plotted data of the run of each estimator by name. The plots are:
+
+    - ``trajectories``: the trajectories of all estimators.
+    - ``error-distribution``: the distribution of errors, for several estimators and a log with a reference.
+    - ``errors-ESTIMATOR``: errors over time, if there is a reference.
+    - ``consistency-ESTIMATOR``: NEES and NIS, if there is a reference or if there are innovations.
+    - ``reliability-ESTIMATOR``: observed and predicted numbers of detections, if there are RFID tags.
     """
     figures = {"trajectories": trajectories(log, tracks)}
     if log.reference is not None and len(tracks) > 1:
@@ -51,19 +56,20 @@ def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path) -> list[Path]:
 
 
 def write_plots(result: RunResult, log: Log, out: Path) -> None:
-    """Write the plots of a run into ``out/plots``, replacing those of a previous one."""
+    """Write the plots of a run into ``out/plots``, and remove the plots of a previous run from it."""
     remove_plots(out / "plots")
     plot_log(log, {str(result.config["estimator"]): Track.of(result)}, out / "plots")
 
 
 def remove_plots(folder: Path) -> None:
-    """Remove the plots of a previous run or comparison, and nothing else."""
+    """Remove the plots of a previous run or comparison from a folder. Other files are kept."""
     for pattern in _FILES:
         for plot in folder.glob(pattern):
             plot.unlink()
 
 
 def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
+    """Return the plots of a single estimator, by the end of the file name."""
     if not len(track.final):
         return {}
     figures = {}
@@ -78,7 +84,7 @@ def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
 
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
-    """Causal and final trajectories with walls, map objects and reference; the axes fit map and reference."""
+    """Plot causal and final trajectories with walls, map objects and reference. The range of the axes fits map and reference."""
     view, height = _room(log)
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
@@ -94,7 +100,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
 
 
 def overview(log: Log, odometry: Trajectory | None) -> Figure:
-    """A log from above: its map and reference, and where the ``odometry`` alone leads from the start, if there is any."""
+    """Plot a log from above: its map, its reference, and the trajectory by ``odometry`` alone from the start, if known."""
     view, height = _room(log)
     figure, axes = grid(1, 1, height, log.name)
     _map(axes[0, 0], log, view)
@@ -106,13 +112,16 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
 
 
 def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reliability]) -> Figure:
-    """Observed over predicted numbers of detections, by group, with two-sigma bars about the prediction."""
+    """Plot the ratio of observed to predicted numbers of detections, by group, with bars of two standard deviations.
+
+    ``reliability``: by sensor, the numbers of detections in groups, such as ranges of distance.
+    """
     figure, axes = grid(
         len(reliability), 1, 3.2 * len(reliability), f"{log.name}, {estimator}: observed over predicted detections"
     )
     for axis, sensor in zip(axes[:, 0], reliability.values(), strict=True):
         place = np.arange(len(sensor.groups))
-        label = "what a right model leaves to chance (2 sigma)"
+        label = "expected for a correct model (2 sigma)"
         axis.errorbar(
             place,
             np.ones(len(place)),
@@ -136,7 +145,7 @@ def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reli
 
 
 def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -> Figure:
-    """Signed errors in x, y and heading over time, causal and final, with two-sigma bands."""
+    """Plot signed errors in x, y and heading over time, of causal and final poses, with bands of two standard deviations."""
     rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
     figure, axes = grid(
         len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands", shared=True
@@ -165,7 +174,10 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
 
 
 def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Track]) -> Figure:
-    """Cumulative distribution of position and heading errors, causal and final, on a logarithmic axis."""
+    """Plot the cumulative distribution of position and heading errors of causal and final poses, on a logarithmic axis.
+
+    ``tracks``: the plotted data of the run of each estimator by name.
+    """
     rows = (("position", "m"), ("heading", "rad"))[: 2 if reference.has_heading else 1]
     figure, axes = grid(len(rows), 2, 4.5 * len(rows), f"{log.name}: distribution of errors")
     for (estimator, track), style in zip(tracks.items(), styles(), strict=False):
@@ -178,14 +190,14 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
                 distribution(axes[row, column], getattr(e, what), label=estimator, **style)
     for row, (what, unit) in enumerate(rows):
         for axis in axes[row]:
-            axis.set(xlabel=f"{what} error [{unit}]", ylabel="share of times below")
+            axis.set(xlabel=f"{what} error [{unit}]", ylabel="fraction of smaller errors")
         same_range(axes[row])
     legend(figure, axes[0])
     return figure
 
 
 def _map(axis: Axes, log: Log, view: Array | None) -> None:
-    """Draw walls, map objects and reference; ``view`` (2, 2): lower and upper corner of the axes, None for all that is drawn."""
+    """Draw walls, map objects and reference. ``view`` (2, 2) [m]: lower and upper corner of the axes, None to fit the content."""
     if log.reference is not None:
         axis.plot(*gapped_path(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
     walls = np.array(log.world.walls).reshape(-1, 2, 2)
@@ -202,24 +214,30 @@ def _map(axis: Axes, log: Log, view: Array | None) -> None:
 
 
 def _layers(log: Log) -> list[Marks]:
-    """The map objects that are drawn one by one."""
+    """Return the layers of the map whose objects are drawn individually, unlike the many points of a point map."""
     return [m for m in marks(log) if not m.dense]
 
 
 def _room(log: Log) -> tuple[Array | None, float]:
-    """The part of the plane that is drawn, and the height of the figure."""
+    """Return the corners (2, 2) [m] of the drawn part of the plane, and the height of the figure in units of 100 px.
+
+    The corners are None for a log without a reference.
+    """
     places = (*(m.positions[:, :2] for m in _layers(log)), np.array(log.world.walls).reshape(-1, 2))
     view = _view(np.concatenate(places), log.reference)
     return view, 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
 
 
 def _joined(segments: Array) -> Array:
-    """Segments (W, 2, 2) as one line (3 W, 2) with a row of NaN after each."""
+    """Convert W segments (W, 2, 2) to one polyline (3 W, 2) with a row of NaN after each segment, to plot them at once."""
     return np.insert(segments, 2, np.nan, axis=1).reshape(-1, 2)
 
 
 def _view(places: Array, reference: Trajectory | None) -> Array | None:
-    """Lower and upper corner (2, 2) of map and reference, as dead reckoning may drift far away. None without a reference."""
+    """Return the lower and the upper corner (2, 2) of a box around map and reference, with a margin. None without a reference.
+
+    Trajectories are not in the box by design, because dead reckoning may drift far away.
+    """
     if reference is None or not len(reference):
         return None
     points = np.concatenate((places, reference.poses[:, :2]))
@@ -229,6 +247,7 @@ def _view(places: Array, reference: Trajectory | None) -> Array | None:
 
 
 def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
+    """Plot an error with its band of two standard deviations. ``row``: 0 for x, 1 for y, 2 for the heading."""
     t = trajectory.t
     axis.axhline(0.0, color="0.5", linewidth=0.8)
     if trajectory.covariances is not None:
@@ -241,7 +260,7 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Half the height of a panel, which shows all but the largest half percent of errors and bands."""
+    """Return half the range of the y axis of a panel, so that it shows all but the largest half percent of errors and bands."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))
@@ -254,12 +273,12 @@ def distribution(axis: Axes, values: Array, **style: Any) -> None:
     values = np.sort(values[np.isfinite(values)])
     axis.set(xscale="log", ylim=(0.0, 1.0))
     if len(values):
-        # an error of exactly 0 is not on a logarithmic axis
+        # a logarithmic axis has no 0
         axis.plot(np.maximum(values, 1e-6), np.arange(1, len(values) + 1) / len(values), linewidth=2.0, **style)
 
 
 def same_range(axes: Any) -> None:
-    """Give all axes the same x range, without the smallest hundredth of the values."""
+    """Give all axes the same x range. The smallest hundredth of the plotted values may be outside of it."""
     drawn = [line.get_xdata() for axis in axes for line in axis.lines]
     if drawn:
         low = min(float(np.percentile(x, 1.0)) for x in drawn)

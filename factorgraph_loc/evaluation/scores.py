@@ -14,10 +14,12 @@ _DEGREES = 180.0 / math.pi
 
 @dataclass(frozen=True)
 class Metric:
-    """A score by its ``key``.
+    """How a score is displayed and pooled.
 
-    ``title``: in a report, where it is shown times ``factor`` in ``unit``. ``column``: in tables of text, where it has its own
-    unit and so many ``digits``. ``rms``: pooled as root mean square, else as the mean.
+    ``key``: key of the score, such as "final.position_rmse". ``title``: name in an HTML report. There the value is multiplied by
+    ``factor`` and has the unit ``unit``. ``column``: header in a table of text, with the unit of the value itself. ``digits``:
+    decimals in such a table. ``rms``: whether values are pooled by the root mean square instead of the mean. ``better``: which
+    values are better, None for neither.
     """
 
     title: str
@@ -35,15 +37,15 @@ class Metric:
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     def text(self, value: float, *, sign: bool = False) -> str:
-        """A formatted value without the unit."""
+        """Return a value as text for a report, without the unit. ``sign``: whether a positive value has a plus sign."""
         return significant(self.factor * value, sign=sign)
 
     def range(self, least: float, most: float, *, sign: bool = False) -> str:
-        """A formatted range."""
+        """Return a range of values as text for a report."""
         return f"{self.text(least, sign=sign)} … {self.text(most, sign=sign)}"
 
 
-# of a trajectory, below ``causal.`` and ``final.``
+# scores of a trajectory; their keys start with ``causal.`` or ``final.``
 ACCURACY = {
     "position_rmse": Metric("position RMSE", "m", column="pos [m]", rms=True),
     "position_median": Metric("position median error", "m"),
@@ -64,12 +66,12 @@ ACCURACY = {
     "invalid_covariances": Metric("invalid covariances", better=None),
     "scored": Metric("scored", digits=0, better=None),
 }
-# the same after an alignment
+# scores of a trajectory after an alignment with the reference
 ALIGNED = {
     "aligned_position_rmse": Metric("aligned position RMSE", "m", column="pos [m]", rms=True),
     "aligned_rotation_rmse": Metric("aligned rotation RMSE", "°", _DEGREES, "rot [rad]", 4, rms=True),
 }
-# of a run that estimated its map
+# scores of a run that estimated its map
 OF_FREE_MAP = ("landmarks.count", "landmarks.rmse", "landmarks.anees")
 TIMINGS = {
     "timing.update_ms_median": Metric("update, median", "ms", column="update [ms]", digits=2),
@@ -82,16 +84,16 @@ TIMINGS = {
 LOCALIZED = {"time_to_localized": Metric("localized after", "s", column="localized after [s]", digits=1)}
 
 COMPARED = tuple(f"{kind}.{what}_rmse" for kind in KINDS for what in ("position", "heading"))
-TABLE = (  # in the table of a comparison
+TABLE = (  # scores in the table of a comparison
     *(f"{kind}.{name}" for kind in KINDS for name in ("position_rmse", "heading_rmse", "anees")),
     *("timing.update_ms_median", "timing.real_time_factor"),
 )
-SUMMARY = TABLE[:5]  # of an experiment, unless its file names others
+SUMMARY = TABLE[:5]  # scores that an experiment prints, unless its file names others
 REPORT = (*(f"{kind}.{what}_rmse" for what in ("position", "heading") for kind in KINDS), "timing.update_ms_median")
 
 
 def metric_of(key: str) -> Metric:
-    """The metric of a key of the scores; for an unknown one neither direction is better."""
+    """Return the metric of a score by its key. For an unknown key, the title is the key and neither direction is better."""
     kind, _, name = key.partition(".")
     of_trajectory = ACCURACY | ALIGNED
     if kind in KINDS and name in of_trajectory:

@@ -1,12 +1,12 @@
-"""Pooled figures, their bootstrap, and paired comparison of two methods on the same cases.
+"""Pooled scores, their bootstrap, and the comparison of two methods on the same cases.
 
-Runs are paired by log and seed; logs are clusters. The interval is a percentile bootstrap over logs and, within each, over seeds
-(Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
+Runs are paired by log and seed, and logs are clusters. Intervals are percentile bootstraps over logs and, within each log, over
+seeds (Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
 
-McNemar's exact test of proportions: McNemar, "Note on the sampling error of the difference between correlated proportions or
-percentages", Psychometrika 12(2), 1947, with the exact binomial distribution. Medians: percentile bootstrap over the cases (Efron
-and Tibshirani, "An Introduction to the Bootstrap", 1993, section 13.3). A case that never succeeds has an infinite value: the
-median exists if more than half of the cases are finite.
+Proportions are compared by McNemar's test with the exact binomial distribution: McNemar, "Note on the sampling error of the
+difference between correlated proportions or percentages", Psychometrika 12(2), 1947. Intervals of medians are percentile bootstraps
+over the cases (Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, section 13.3). A case without success, such as a
+robot that is never localized, has an infinite value. The median is finite if more than half of the cases are.
 """
 
 import math
@@ -21,28 +21,32 @@ from numpy.typing import ArrayLike, NDArray
 from factorgraph_loc.evaluation.pairing import CONFIDENCE
 from factors.se2 import Array
 
-ENOUGH_LOGS = 6  # needed for a bootstrap over logs
-DRAWS = 4000
-_SEED = 0  # of the bootstrap, for reproducible intervals
+ENOUGH_LOGS = 6  # minimum number of logs for a bootstrap over logs
+DRAWS = 4000  # number of draws of a bootstrap
+_SEED = 0  # seed of the bootstrap; a constant seed makes intervals reproducible
 
 
 def average(scores: ArrayLike, *, rms: bool) -> Array:
-    """The root mean square, or else the mean, over the rows of ``scores`` (K, ...)."""
+    """Return the mean over the rows of ``scores`` (K, ...), or the root mean square if ``rms`` is set."""
     values = np.asarray(scores, dtype=float)
     return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)) if rms else np.mean(values, axis=0))
 
 
 def pooled_rms(values: Sequence[float]) -> float:
-    """Root mean square of RMSEs of several logs or seeds, with equal weights."""
+    """Return the root mean square of the RMSEs of several logs or seeds, with equal weights."""
     return float(average(values, rms=True))
 
 
 def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> tuple[Array, int]:
-    """Scores (K, 2) of ``a`` and ``b`` by common seed, and the number of missing pairs; None: a run without a score."""
+    """Pair the scores of two methods by seed. ``a``, ``b``: by seed, the score of a run, None if it has none.
+
+    If a method has a single run, it is paired with each run of the other method. Returns the pairs (K, 2), and the number of seeds
+    that have no pair.
+    """
     by_seed = (a, b)
     seeds = sorted(set(a) | set(b))
     both = [[s.get(seed, next(iter(s.values())) if len(s) == 1 else None) for s in by_seed] for seed in seeds]
-    if any(len(s) == 1 for s in by_seed):  # paired with each seed of the other, not only with its own seed
+    if any(len(s) == 1 for s in by_seed):  # only seeds of the longer one count
         longer = max(by_seed, key=len)
         both = [pair for seed, pair in zip(seeds, both, strict=True) if seed in longer]
     complete = [pair for pair in both if None not in pair]
@@ -50,17 +54,17 @@ def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> 
 
 
 def bounds(figures: Array) -> tuple[float, float]:
-    """The 95 % interval of a figure from its bootstrap draws (D,)."""
+    """Return the 95 % interval of a score from its bootstrap draws (D,)."""
     tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
     low, high = np.percentile(figures, (tail, 100.0 - tail))
     return float(low), float(high)
 
 
 def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
-    """Bootstrap of C pooled figures, (DRAWS, C): logs are drawn, and seeds within each.
+    """Return bootstrap draws (DRAWS, C) of C pooled scores. Logs are drawn, and seeds within each log.
 
-    ``clusters``: for each log, the scores (K, C) of its K seeds. A pooled figure is the root mean square over seeds, then over
-    logs with equal weights, or without ``rms`` the mean of the means.
+    ``clusters``: for each log, the scores (K, C) of its K seeds. Scores are pooled over seeds, and then over logs with equal
+    weights, by the root mean square if ``rms`` is set, and otherwise by the mean.
     """
     scores = np.concatenate([np.square(cluster) if rms else cluster for cluster in clusters])
     drawn = _weights(tuple(map(len, clusters))) @ scores
@@ -69,7 +73,7 @@ def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
 
 @lru_cache(maxsize=2)
 def _weights(seeds: tuple[int, ...]) -> Array:
-    """The weight of each of all N scores in each draw, (DRAWS, N), for logs with these numbers of seeds."""
+    """Return the weight of each score in each bootstrap draw, (DRAWS, N). ``seeds``: number of seeds of each log, N in total."""
     rng = np.random.default_rng(_SEED)
     sizes = np.array(seeds)
     logs = rng.integers(len(sizes), size=(DRAWS, len(sizes)))
@@ -85,7 +89,11 @@ def _weights(seeds: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True)
 class McNemar:
-    """The number of cases with the event ``only_a`` and ``only_b``, and the two-sided ``p`` value for equal rates."""
+    """The result of McNemar's test.
+
+    ``only_a``, ``only_b``: number of cases in which the event occurred only with method a, or only with b. ``p``: two-sided p value
+    of the hypothesis that the event is equally frequent with both.
+    """
 
     only_a: int
     only_b: int
@@ -94,7 +102,7 @@ class McNemar:
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure and its 95 % interval. The figure is NaN if undefined; bounds may be infinite."""
+    """A ``value`` and its 95 % interval. The value is NaN if it is undefined, and the bounds may be infinite."""
 
     value: float
     low: float
@@ -102,7 +110,10 @@ class Interval:
 
 
 def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
-    """McNemar's exact test for an event that occurred (N,) with ``a`` and with ``b`` in the same N cases."""
+    """Compare the frequencies of an event with two methods in the same N cases by McNemar's exact test.
+
+    ``a``, ``b`` (N,): masks of the cases in which the event occurred with each method.
+    """
     first, second = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     only_a, only_b = int(np.sum(first & ~second)), int(np.sum(second & ~first))
     uneven = only_a + only_b
@@ -110,18 +121,24 @@ def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """The least of the values (N,) that is at least as large as this ``share`` of them, which may be infinite; NaN if N is 0."""
+    """Return a quantile of N values, which may be infinite. ``share``: 0.5 for the median. Return NaN if there are no values.
+
+    The result is the smallest of the values that at least this share of them does not exceed.
+    """
     known = np.asarray(values, dtype=float)
     return float(np.quantile(known, share, method="inverted_cdf")) if len(known) else math.nan
 
 
 def median_difference(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Median of ``a`` (N,) minus that of ``b`` (N,) in the same N cases; values may be infinite."""
+    """Return the median of ``a`` (N,) minus that of ``b`` (N,), in the same N cases, with its interval. Values may be infinite."""
     return _of_medians(np.subtract, a, b, lowest=-math.inf)
 
 
 def median_ratio(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Median of ``a`` (N,) over that of ``b`` (N,) in the same N cases; values must not be negative and may be infinite."""
+    """Return the ratio of the median of ``a`` (N,) to that of ``b`` (N,), in the same N cases, with its interval.
+
+    Values must not be negative, and may be infinite.
+    """
     return _of_medians(np.divide, a, b, lowest=0.0)
 
 
@@ -132,12 +149,12 @@ def _of_medians(
     if not len(first):
         return Interval(math.nan, lowest, math.inf)
     drawn = np.random.default_rng(_SEED).integers(len(first), size=(DRAWS, len(first)))
-    # the original cases come first: their figure is the value
+    # the first row are the original cases, whose result is the value
     cases = np.vstack((np.arange(len(first)), drawn))
     with np.errstate(invalid="ignore", divide="ignore"):
         figures = compare(np.median(first[cases], axis=1), np.median(second[cases], axis=1))
     tail = (1.0 - CONFIDENCE) / 2.0
-    # a draw with two infinite medians extends the interval to both sides
+    # a draw with two infinite medians is undefined and counts at both ends of the interval
     unknown = np.isnan(figures[1:])
     low = quantile(np.where(unknown, lowest, figures[1:]), tail)
     high = quantile(np.where(unknown, math.inf, figures[1:]), 1.0 - tail)

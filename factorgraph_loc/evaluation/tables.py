@@ -1,4 +1,5 @@
-"""The table of a comparison: a row for each log and estimator, then each estimator over all logs."""
+"""The table of a comparison of estimators, and sentences about it. The table has a row for each log and estimator, and then a row
+for each estimator over all logs. ``rows`` are the runs: dictionaries with log, estimator, seed, status and scores."""
 
 from collections.abc import Sequence
 
@@ -17,8 +18,9 @@ EQUIVALENCE = 0.01  # relative difference of errors within which estimators are 
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
-    """The optional scores of each table, by its title: errors after an alignment, if the runs have one, and requested relative
-    errors.
+    """Return the keys of the scores of additional tables, by title of the table.
+
+    There is a table of errors after an alignment if the runs have any, and a table of relative errors if ``rpe`` is set.
     """
     tables: dict[str, tuple[str, ...]] = {}
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
@@ -34,12 +36,12 @@ def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ..
 
 
 def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the table, from the rows of a comparison. ``shown``: other scores than :data:`TABLE`.
+    """Return the header and the rows of the table of a comparison. ``shown``: keys of the scores in it, empty for :data:`TABLE`.
 
-    RMSEs are pooled over seeds (root mean square), the rest is averaged; with several seeds the standard deviation follows after
-    ±. The last rows pool each estimator over the logs with equal weights; ``runs`` is the number of successful runs of all, and a
-    pooled row with failures is not comparable with the others. ``scored``: number of scored poses, as a range over runs, and
-    summed over logs. The time to localization is a column if it is not 0 throughout.
+    RMSEs are pooled over seeds by the root mean square, and other scores by the mean. With several seeds a cell has the standard
+    deviation after ±. The last rows pool each estimator over the logs with equal weights. The column "runs" has the number of
+    successful runs; a pooled row with failures is not comparable with others. The column "poses scored" has the number of scored
+    poses as a range over runs, and summed over logs. There is a column for the time to localization if it is not always 0.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -63,22 +65,23 @@ def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[li
 
 
 def unscored(rows: Sequence[Row]) -> list[str]:
-    """In words: why successful runs have no errors, a line for each log with such runs."""
+    """Return a sentence for each log on which successful runs have no errors, with the reason."""
     lines = []
     for log in dict.fromkeys(row["log"] for row in rows):
         runs = [row for row in rows if row["log"] == log and row["status"] == "ok"]
         without = [row for row in runs if not _is_known(row, "position_rmse")]
         if without and (count := max(scored_of(row) or 0 for row in without)):
-            lines.append(f"{log}: too little of the reference to score against: {count:.0f} poses")
+            lines.append(f"{log}: no errors, because the reference covers only {count:.0f} poses")
         elif without and all(scored_of(row) is None for row in runs):
-            lines.append(f"{log}: there is no reference to score against, so there are no errors")
+            lines.append(f"{log}: no errors, because the log has no reference")
     return lines
 
 
 def verdict(rows: Sequence[Row]) -> list[str]:
-    """In words: the estimator with the least position error, causal and final, compared with dead reckoning if that ran.
+    """Return a sentence about the estimator with the smallest position error, for causal and for final trajectories.
 
-    Pooled over logs and seeds; those nearly as good are named too. Estimators with a failed run or a missing score are excluded.
+    Errors are pooled over logs and seeds. The sentence also names estimators that are nearly as good, and the error of dead
+    reckoning. Estimators with a failed run or a missing score are excluded.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -106,7 +109,7 @@ def verdict(rows: Sequence[Row]) -> list[str]:
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table that is aligned as plain text."""
+    """Return a table in Markdown whose columns are aligned in the plain text."""
     texts = [list(header), *map(list, lines)]
     widths = [max(len(text[i]) for text in texts) for i in range(len(header))]
     padded = [
@@ -118,22 +121,28 @@ def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def scored_of(row: Row) -> float | None:
-    """Number of scored poses of a run's causal trajectory, else of the final one; None without a reference."""
+    """Return the number of scored poses of a run's causal trajectory, or of the final one if there is no causal trajectory.
+
+    Return None if there is no reference.
+    """
     counts = (row.get(f"{kind}.scored") for kind in KINDS)
     return next((count for count in counts if count is not None), None)
 
 
 def _is_known(row: Row, figure: str) -> bool:
+    """True if the causal or the final trajectory of a run has the score ``figure``."""
     return any(row.get(f"{kind}.{figure}") is not None for kind in KINDS)
 
 
 def _figure(row: Row, key: str) -> float | None:
-    # an offline estimator (never localized before the end) only collects: its update times mean nothing
+    """Return the score ``key`` of a run, or None if it has none."""
+    # the update times of a batch estimator are meaningless, because its updates only collect measurements
     offline = row.get("time_to_localized") is None
     return None if offline and key.startswith("timing.") else row.get(key)
 
 
 def _cell(metric: Metric, values: Sequence[float | None]) -> str:
+    """Return a cell with a score pooled over seeds, and its standard deviation if there are several. None: a run without it."""
     known = [v for v in values if v is not None]
     if not known:
         return "-"
@@ -142,13 +151,14 @@ def _cell(metric: Metric, values: Sequence[float | None]) -> str:
 
 
 def _pooled(metric: Metric, by_log: Sequence[Sequence[Row]]) -> str:
+    """Return a cell with a score pooled over seeds and logs. ``by_log``: the runs on each log."""
     known = [[v for v in (_figure(r, metric.key) for r in runs) if v is not None] for runs in by_log]
     averages = [average(values, rms=metric.rms) for values in known if values]
     return number(float(average(averages, rms=metric.rms)) if averages else None, metric.digits)
 
 
 def counted(*by_log: Sequence[Row]) -> str:
-    """Number of scored poses, as a range over the runs of a log, summed over logs; empty without a reference."""
+    """Return the number of scored poses as text: a range over the runs of a log, summed over logs. "" without a reference."""
     counts = [[c for row in runs if (c := scored_of(row)) is not None] for runs in by_log]
     known = [of_log for of_log in counts if of_log]
     least, most = sum(map(min, known)), sum(map(max, known))
@@ -156,4 +166,5 @@ def counted(*by_log: Sequence[Row]) -> str:
 
 
 def _went_well(runs: Sequence[Row]) -> str:
+    """Return the number of successful runs and of all runs: "4/5"."""
     return f"{sum(r['status'] == 'ok' for r in runs)}/{len(runs)}"

@@ -1,23 +1,25 @@
-"""Warnings about results: stored with the scores of a run and in its row, and printed once for all runs concerned."""
+"""Warnings about the results of runs. A warning is stored with each run, and printed once for all runs that have it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-WARNINGS = "warnings"  # key of the scores (a list), and of a row (one text, one line each; None without any)
-SWEEP = "sweep."  # columns of rows: the swept settings of a run
-SIMULATION = "simulation"  # first word of swept settings of simulated logs
+WARNINGS = (
+    "warnings"  # key of the warnings: a list in the scores of a run, in a row a text with one warning a line, or None
+)
+SWEEP = "sweep."  # start of the names of the columns that have the swept settings of a run
+SIMULATION = "simulation"  # start of the names of swept settings of simulated logs
 
-Row = Mapping[str, Any]
+Row = Mapping[str, Any]  # a run: its log, estimator, seed, status and scores
 
 
 def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """The scores of a run as cells of a row: lists are omitted, except for the warnings, which become one text."""
+    """Convert the scores of a run to the cells of a row. Lists are omitted, except for the warnings, which become one text."""
     cells = {name: value for name, value in scores.items() if not isinstance(value, list)}
     return cells | {WARNINGS: "\n".join(map(str, scores.get(WARNINGS, ()))) or None}
 
 
 def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The runs concerned by each warning, in order of appearance."""
+    """Return the runs that have each warning, by the text of the warning in order of appearance."""
     concerned: dict[str, list[Row]] = {}
     for row in rows:
         for text in (row.get(WARNINGS) or "").split("\n"):
@@ -27,7 +29,7 @@ def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Each warning once, with the estimators concerned unless these are all that ran on the logs."""
+    """Return each warning once. If only some of the estimators on the same logs have a warning, their names follow it."""
     texts = []
     for text, concerned in by_text(rows).items():
         logs = {row["log"] for row in concerned}
@@ -38,5 +40,5 @@ def lines(rows: Sequence[Row]) -> list[str]:
 
 
 def label_of(row: Row) -> str:
-    """The label of the estimator in the results."""
+    """Return the label of the estimator of a run in the results, which is its name if it has no label."""
     return str(row.get("label") or row["estimator"])

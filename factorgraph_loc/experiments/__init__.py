@@ -1,4 +1,4 @@
-"""Runs: single ones, comparisons, and experiments of many runs that are stored, resumed and reported."""
+"""Execution of runs: single runs, comparisons, and experiments of many runs whose results are stored, resumed and reported."""
 
 __all__ = [
     "active",

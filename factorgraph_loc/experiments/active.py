@@ -1,6 +1,6 @@
-"""Experiments with active localization: worlds, policies and estimators on the same seeds, in parallel processes.
+"""Experiments with active localization: policies and estimators are compared on the same simulated worlds and seeds.
 
-The runs are executed and stored like those of other experiments, so that an interrupted experiment can be resumed.
+The runs are executed in parallel processes and stored like those of other experiments. An interrupted experiment can be resumed.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -44,7 +44,7 @@ PLOTS, PICTURE = "plots", "run.png"
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """A planned run; plotted if ``pictured``."""
+    """A planned run of active localization in the simulated world ``simulation``. ``pictured``: whether the run is plotted."""
 
     simulation: SimulationSettings
     policy: str
@@ -60,12 +60,13 @@ class ActiveJob:
 
     @property
     def key(self) -> str:
-        """The key of the results, specific to settings and version."""
+        """The key of the stored results: a hash of the settings and the version of the package."""
         given: list[Any] = [__version__, self.policy, self.estimator, self.seed, self.pictured]
         return digest_of(given + [model.model_dump(mode="json") for model in (self.simulation, self.settings)])
 
     def make(self) -> Files:
-        """The figures of the run, and its plot."""
+        """Execute the run. Return the content of its files by name: the figures, and the plot. If the input is invalid, return the
+        files of a failed run."""
         try:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)
         except InputError as error:
@@ -75,12 +76,12 @@ class ActiveJob:
 
     @property
     def shown(self) -> str:
-        """A description that distinguishes it from the other runs."""
+        """A description that distinguishes this run from the other runs, for messages."""
         return f"{self.source}, {self.policy}, {self.estimator}, seed {self.seed}"
 
     @property
     def columns(self) -> dict[str, Any]:
-        """The first columns of its row in the table."""
+        """The first columns of the run's row in the table of results."""
         named = {"world": self.source, "policy": self.policy, "estimator": self.estimator, "seed": self.seed}
         return named | {"key": self.key}
 
@@ -97,18 +98,21 @@ def active(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Done:
-    """Drive simulated robots from an unknown start until they are localized: each policy with each estimator on each seed.
+    """Simulate robots that drive from an unknown start until they are localized, for each policy, estimator and seed.
 
-    ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``changes``: nested tables of
-    settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres": 50}``.
-    Written into ``out``: ``results.parquet`` and ``results.csv`` (a row per run), ``differences.csv`` (see
-    :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml``, ``plots/comparison.png``
-    and for each policy and estimator a plot of the run of the first seed. A failed run is a row with its reason; the others
-    continue. The same call resumes an interrupted experiment. ``jobs``: number of parallel processes (None: one per core).
-    ``progress`` is called with the number of runs done and of all.
+    ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings.
+    ``out``: folder for the results. ``overwrite``: whether existing results in it may be replaced.
+    ``changes``: nested tables of settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres": 50}``.
+    ``jobs``: number of parallel processes, None for one per core.
+    ``progress``: called with the number of finished runs and of all runs.
 
-    Raises InputError before anything runs if a policy or an estimator is unknown or repeated, or if ``out`` contains results
-    without ``overwrite``. It also raises InputError if the input of all runs is rejected.
+    The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
+    :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and ``plots/comparison.png``.
+    For each policy and estimator there is a plot of the run with the first seed. A failed run has a row with the reason, and does
+    not stop other runs. The same call resumes an interrupted experiment.
+
+    Raises InputError before any run if a policy or an estimator is unknown or repeated, or if ``out`` contains results and
+    ``overwrite`` is not set. Also raises InputError if every run rejects its input.
     """
     simulation, settings = _settings(world, changes or {})
     seeds, out = list(seeds), Path(out)
@@ -162,7 +166,7 @@ def _write(table: pl.DataFrame, jobs: Sequence[ActiveJob], out: Path) -> None:
 def _settings(
     world: str | Path | SimulationSettings, changes: Mapping[str, Any]
 ) -> tuple[SimulationSettings, ActiveSettings]:
-    """Split the changes into settings of the world and of the run; no key belongs to both."""
+    """Return the settings of the simulated world and of the run, with ``changes``. A key of ``changes`` belongs to one of them."""
     of_run, of_world = ActiveSettings.model_fields, SimulationSettings.model_fields
     for key in changes:
         if key not in of_run and key not in of_world:
@@ -170,7 +174,7 @@ def _settings(
     changed = {key: value for key, value in changes.items() if key in of_world}
     if isinstance(world, SimulationSettings) and changed:
         raise InputError(
-            "the world is given as settings, so no key of it can be changed: name a preset or a file, or edit the settings"
+            "the world is given as settings, so its keys cannot be changed: name a preset or a file, or edit the settings"
         )
     simulation = world if isinstance(world, SimulationSettings) else named_settings(str(world), changed)
     run = {key: value for key, value in changes.items() if key in of_run}
@@ -178,7 +182,7 @@ def _settings(
 
 
 def figures_of(run: ActiveRun) -> dict[str, float | None]:
-    """The figures of a run in tables."""
+    """Return the figures of a run that are stored and shown in tables."""
     times = run.planning_ms
     return {
         "localized": run.localized,
@@ -194,6 +198,7 @@ def figures_of(run: ActiveRun) -> dict[str, float | None]:
 
 
 def _check_names(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise InputError if there are no names, or a name is unknown or repeated. ``what``: the kind of names, for the message."""
     if not names:
         raise InputError(f"no {what} is given; known: {', '.join(known)}")
     for name in names:

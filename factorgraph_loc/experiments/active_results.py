@@ -1,7 +1,8 @@
-"""Active localization runs, policy by policy on the same seeds: summaries, paired comparisons, and plots of them and of the
-decisions of one run.
+"""Results of active localization: summaries of policies, paired comparisons on the same seeds, and plots.
 
-A run that failed or did not end localized counts with an infinite distance."""
+A run that failed, or whose robot is not localized at the end, has an infinite distance. ``rows`` are the runs: dictionaries with
+world, estimator, policy, seed and figures.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 Case = tuple[str, str]  # world, estimator
 
-# columns of a difference, with their types, as there may be no rows
+# columns of the table of differences, with their types, which a table without rows needs
 DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("world", "estimator", "a", "b"), str),
     "pairs": int,
@@ -33,39 +34,43 @@ DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("failed_only_a", "failed_only_b"), int),
     "p": float,
 }
-NEVER = "never"
-SHOWN = 6  # decisions of a run that are plotted
-COLUMNS = 3
-ARROW = 0.7  # m
+NEVER = "never"  # text of an infinite distance
+SHOWN = 6  # number of decisions of a run that are plotted
+COLUMNS = 3  # number of plotted decisions in a row
+ARROW = 0.7  # m; length of the line that shows the robot's heading
 
 
 def cases(rows: Sequence[Row]) -> list[Case]:
-    """World and estimator of the runs, in order of appearance."""
+    """Return the pairs of world and estimator of the runs, in order of appearance."""
     return list(dict.fromkeys((row["world"], row["estimator"]) for row in rows))
 
 
 def policies(rows: Sequence[Row]) -> list[str]:
-    """The policies of the runs, in order of appearance."""
+    """Return the policies of the runs, in order of appearance."""
     return list(dict.fromkeys(row["policy"] for row in rows))
 
 
 def runs_of(rows: Sequence[Row], case: Case, policy: str) -> list[Row]:
-    """The runs of one world, estimator and policy."""
+    """Return the runs of one world and estimator (``case``) with one policy."""
     return [row for row in rows if (row["world"], row["estimator"]) == case and row["policy"] == policy]
 
 
 def metres(rows: Sequence[Row]) -> Array:
-    """Metres driven until localized (N,), infinite for runs that never were."""
+    """Return the distances (N,) [m] that robots drove until they were localized. Infinite if a robot was not localized."""
     return np.array([row["metres"] if row.get("localized") else math.inf for row in rows], dtype=float)
 
 
 def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Statistics for each world, estimator and policy.
+    """Return statistics for each world, estimator and policy, as dictionaries with these keys.
 
-    ``runs``; ``median`` and 90th percentile ``p90`` of the metres until localized; ``failures`` and their 95 % interval;
-    ``claimed_wrong``: runs that at some time claimed wrongly to be localized; median errors ``error_position`` [m] and
-    ``error_heading`` [rad] and median ``seconds`` (simulated) of those that ended localized; ``planning_ms``: median over runs of
-    the median time of a planning step."""
+    - ``runs``: number of runs.
+    - ``median``, ``p90``: median and 90th percentile of the distance [m] until the robot is localized.
+    - ``failures``, ``failures_low``, ``failures_high``: number of runs that did not end localized, and the 95 % interval of their
+      fraction.
+    - ``claimed_wrong``: number of runs that at any time reported a wrong pose as localized.
+    - ``error_position`` [m], ``error_heading`` [rad], ``seconds``: median errors, and median simulated time, of the other runs.
+    - ``planning_ms``: median over runs of the median computing time of a planning step.
+    """
     results = []
     for case in cases(rows):
         for policy in policies(rows):
@@ -96,10 +101,12 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Comparison of the first policy ``a`` with each other one ``b``, on common seeds, for each world and estimator.
+    """Compare the first policy ``a`` with each further policy ``b``, on common seeds, for each world and estimator.
 
-    ``difference`` [m] of the medians, a minus b, with 95 % interval ``low`` to ``high``. ``ratio`` of the medians, a over b, with
-    its interval. ``failed_only_a``, ``failed_only_b``: numbers of seeds. ``p``: of McNemar's exact test for equal failure rates.
+    - ``difference``, ``low``, ``high`` [m]: median distance of a minus that of b, and its 95 % interval.
+    - ``ratio``, ``ratio_low``, ``ratio_high``: median distance of a divided by that of b, and its 95 % interval.
+    - ``failed_only_a``, ``failed_only_b``: number of seeds on which only one policy failed.
+    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of common seeds.
     """
     results = []
     first, *further = policies(rows)
@@ -123,7 +130,7 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the table of :func:`summaries`."""
+    """Return the header and the rows of the printed table of :func:`summaries`."""
     header = ["world", "policy", "estimator", "runs", "median [m]", "90 % [m]", "failed (95 %)", "claimed wrongly"]
     header += ["error [m]", "[deg]", "time [s]", "planning [ms]"]
     lines = []
@@ -143,7 +150,7 @@ def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the table of :func:`differences`."""
+    """Return the header and the rows of the printed table of :func:`differences`."""
     header = ["world", "policies", "estimator", "pairs", "difference [m] (95 %)", "ratio (95 %)"]
     header += ["failed only first / second", "p (McNemar)"]
     lines = []
@@ -166,10 +173,12 @@ def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def metres_text(value: float) -> str:
+    """Return a distance [m] as text, or "never" if it is infinite."""
     return NEVER if math.isinf(value) else number(value, 1)
 
 
 def _interval_text(interval: Sequence[float], digits: int) -> str:
+    """Return a value and its interval as text. ``interval``: the value, the lower and the upper bound, which may be infinite."""
     value, low, high = (
         f"{bound:.{digits}f}".replace("inf", "∞") if math.isinf(bound) else number(bound, digits) for bound in interval
     )
@@ -177,12 +186,13 @@ def _interval_text(interval: Sequence[float], digits: int) -> str:
 
 
 def _median(rows: Sequence[Row], key: str) -> float:
+    """Return the median of a figure of the runs that have it, or NaN if none has it."""
     known = [row[key] for row in rows if row.get(key) is not None]
     return float(np.median(known)) if known else math.nan
 
 
 def comparison(rows: Sequence[Row]) -> Figure:
-    """For each world and estimator: a box plot per policy, and the fraction of runs localized over distance."""
+    """Plot for each world and estimator the distances as a box per policy, and the fraction of localized runs over distance."""
     panels = cases(rows)
     seeds = len({row["seed"] for row in rows})
     figure, axes = grid(len(panels), 2, 4.2 * len(panels) + 1.0, f"metres driven until localized, {seeds} runs of each")
@@ -196,7 +206,8 @@ def comparison(rows: Sequence[Row]) -> Figure:
 
 
 def run_picture(run: ActiveRun) -> Figure:
-    """Belief, candidates and choice at some decisions of a run; and the spread of the belief over distance."""
+    """Plot some decisions of a run: the belief, the candidate paths and the chosen path. Also plot the belief's standard deviation
+    over distance."""
     chosen = np.unique(np.linspace(0, len(run.steps) - 1, SHOWN).round().astype(int)) if run.steps else ()
     rows = max(math.ceil(len(chosen) / COLUMNS), 1)
     width, depth = np.ptp(_outline(run).reshape(-1, 2), axis=0)
@@ -216,13 +227,13 @@ def run_picture(run: ActiveRun) -> Figure:
     driven, sigmas = [step.metres for step in run.steps], [_belief_sigma(step) for step in run.steps]
     axes["belief"].semilogy(driven, np.maximum(sigmas, 1e-3), "o-", color=COLOURS[0], markersize=4)
     axes["belief"].axvline(run.metres, color="0.5", linestyle="--", label="end of the run")
-    axes["belief"].set(xlabel="metres driven", ylabel="spread of the belief [m]")
+    axes["belief"].set(xlabel="metres driven", ylabel="standard deviation of the belief [m]")
     legend(figure, axes.values())
     return figure
 
 
 def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    """Box plots with a dot for each run; runs that were never localized are at the upper end, and counted."""
+    """Plot a box for each policy, and a dot for each run. Robots that were never localized are at the upper end and counted."""
     names = policies(rows)
     top = _farthest(rows, case)
     rng = np.random.default_rng(0)  # horizontal jitter, so that dots do not cover each other
@@ -245,6 +256,7 @@ def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 
 def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
+    """Plot the fraction of localized runs over the driven distance, a line for each policy."""
     longest = _farthest(rows, case)
     for policy, style in zip(policies(rows), styles(), strict=False):
         driven = np.sort(metres(runs_of(rows, case, policy)))
@@ -252,17 +264,18 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
         share = np.arange(len(known) + 1) / max(len(driven), 1)
         x = np.concatenate((np.zeros(1), known, (longest,)))
         axis.step(x, np.append(share, share[-1]), where="post", label=policy, linewidth=2.0, **style)
-    axis.set(ylim=(0.0, 1.0), xlim=(0.0, longest), xlabel="metres driven", ylabel="share of runs localized")
+    axis.set(ylim=(0.0, 1.0), xlim=(0.0, longest), xlabel="metres driven", ylabel="fraction of localized runs")
 
 
 def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
-    """The largest distance of a run in this world, 1 if there is none."""
+    """Return the largest distance [m] of a run of one world and estimator, or 1 if there is none."""
     return (
         max((row.get("metres") or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
     )
 
 
 def _step(axis: Axes, run: ActiveRun, index: int) -> None:
+    """Plot one decision of a run. ``index``: number of the decision."""
     step = run.steps[index]
     for i, (x1, y1, x2, y2) in enumerate(run.world.walls):
         axis.plot((x1, x2), (y1, y2), color="0.35", linewidth=1.0, label=None if i else "walls", zorder=1)
@@ -281,19 +294,19 @@ def _step(axis: Axes, run: ActiveRun, index: int) -> None:
     driven = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))))
     last = index == len(run.steps) - 1
     so_far = truth if last else truth[driven <= step.metres + 1e-6]
-    axis.plot(*so_far[:, :2].T, color=COLOURS[0], linewidth=1.2, label="way (true)", zorder=4)
+    axis.plot(*so_far[:, :2].T, color=COLOURS[0], linewidth=1.2, label="path (true)", zorder=4)
     low, high = _outline(run).min(axis=0), _outline(run).max(axis=0)
     axis.set(xlim=(low[0] - 0.5, high[0] + 0.5), ylim=(low[1] - 0.5, high[1] + 0.5))
     axis.set_aspect("equal", adjustable="box")
-    axis.set_title(f"after {step.metres:.1f} m" + (f", way to the end at {run.metres:.1f} m" if last else ""))
+    axis.set_title(f"after {step.metres:.1f} m" + (f", path to the end at {run.metres:.1f} m" if last else ""))
 
 
 def _belief_sigma(step: PlanningStep) -> float:
-    """Root of the sum of the belief's variances in x and y [m]."""
+    """Return the standard deviation [m] of the belief: the root of the sum of the variances in x and y."""
     return float(np.sqrt(np.sum(np.var(step.particles[:, :2], axis=0))))
 
 
 def _outline(run: ActiveRun) -> Array:
-    """The ends (K, 2) of all walls, or the trajectory if there are none."""
+    """Return the end points (K, 2) of all walls, or the positions of the robot if there are no walls, to find the plotted area."""
     walls = np.array(run.world.walls).reshape(-1, 2)
     return walls if len(walls) else run.truth.poses[:, :2]

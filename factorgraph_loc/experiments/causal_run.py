@@ -1,4 +1,7 @@
-"""The causal part of a run: measurements and ticks in the order of arrival, the estimates at the ticks, and their times."""
+"""The main loop of a run: it passes measurements to the estimator in the order of arrival, and records estimates at regular ticks.
+
+These estimates are called causal, because they use only measurements that have arrived before the tick.
+"""
 
 import bisect
 import gc
@@ -33,7 +36,7 @@ GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_thresho
 
 @dataclass
 class CausalEstimates:
-    """The estimates at the ticks, as columns."""
+    """The estimates at the ticks of a run, as columns. ``t`` [s]: times of the ticks."""
 
     t: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
@@ -42,7 +45,7 @@ class CausalEstimates:
     doubts_model: list[bool] = field(default_factory=list)
 
     def add(self, t: float, e: PoseEstimate) -> None:
-        """Take an estimate with the tick's time, as an unlocalized one has none; copied, as an estimator may reuse its arrays."""
+        """Append the estimate ``e`` at the tick ``t`` [s]. Arrays are copied, because an estimator may reuse them."""
         self.t.append(t)
         self.poses.append(np.array(e.pose, dtype=float))
         self.covariances.append(np.array(e.covariance, dtype=float))
@@ -52,7 +55,13 @@ class CausalEstimates:
 
 @dataclass
 class CausalRun:
-    """The causal part of a run, up to ``end``, in a map with this ``frame``."""
+    """The main loop of one run of an estimator on a log.
+
+    ``guard``: converts errors of the estimator. ``sensors``: names of the used sensors. ``prior``: prior of the start, None if it
+    is unknown. ``ticks``: times of recorded estimates. ``frame``: frame of the map. ``progress``: called with the fraction done.
+    ``watch``: called with the time and the estimator after each tick. ``end`` [s]: later measurements are not processed.
+    ``estimates``: the recorded estimates.
+    """
 
     guard: Guard
     estimator: Estimator
@@ -75,7 +84,7 @@ class CausalRun:
         self._update_s: list[float] = []
 
     def run(self) -> None:
-        """Process all measurements and ticks."""
+        """Process all measurements and ticks, and measure the times of updates."""
         started = perf_counter()
         for (t, is_motion), group in groupby(self._measurements(), attrgetter("t", "is_motion")):
             if is_motion:
@@ -97,7 +106,10 @@ class CausalRun:
         self.progress(1.0)
 
     def timings(self, final_seconds: float, prepared: PreparedLog) -> Timings:
-        """The times of the loop, of the preparation, and of the final trajectory."""
+        """Return the computing times of a run, after :meth:`run`.
+
+        ``final_seconds``: time for the final trajectory. ``prepared``: has the time for the extraction of image features.
+        """
         return Timings(
             update_t=np.array(self._update_t),
             update_ms=np.array(self._update_s) * 1e3,
@@ -110,19 +122,20 @@ class CausalRun:
         )
 
     def _measurements(self) -> Iterator[Measurement]:
+        """Return the measurements until ``end``. For estimators that accept it, successive rows of odometry are one object."""
         joined = getattr(self.estimator, "takes_rows", False)
         steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
         return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
-        """Process the start and the ticks that precede a measurement at ``t``."""
+        """Initialize the estimator if it is time, and process the ticks before a measurement at ``t`` [s]."""
         if not self._initialized and t > self._start:
             self._initialize()
         for tick in self.ticks.advance(t):
             self._tick(tick)
 
     def _move(self, m: Measurement) -> None:
-        """Take a row of motion; or some, cut where a tick is due."""
+        """Process a row of odometry, or several successive rows (``Rows``), which are divided at ticks."""
         if not isinstance(m, Rows):
             self._reach(m.t)
             self.guard.process(self.estimator, m)
@@ -131,17 +144,19 @@ class CausalRun:
         while first < len(times):
             self._reach(times[first])
             last = max(first + 1, bisect.bisect_right(times, self.ticks.due))
-            self.ticks.advance(times[last - 1])  # no ticks, but the time of the last measurement
+            self.ticks.advance(times[last - 1])  # there are no ticks before this time
             self.guard.process(self.estimator, m.part(first, last))
             first = last
 
     def _initialize(self) -> None:
+        """Initialize the estimator at the prior."""
         assert self.prior is not None
         self._initialized = True
         with self.guard.computing("the start", self.prior.t):
             self.estimator.initialize(self.frame.prior(self.prior))
 
     def _update(self, t: float, measurements: Iterator[Measurement]) -> None:
+        """Process the measurements that arrive at ``t`` [s], and measure the time until the estimate is available."""
         started = perf_counter()
         for m in measurements:
             self.guard.process(self.estimator, m)
@@ -151,6 +166,7 @@ class CausalRun:
         self._update_t.append(t)
 
     def _tick(self, t: float) -> None:
+        """Record the estimate at the tick ``t`` [s]."""
         with self.guard.computing("the estimate", t):
             e = self.frame.estimate(sound(self.estimator.estimate(t)))
         self.guard.process(self.estimator, Tick(t))
@@ -164,7 +180,7 @@ class CausalRun:
 
 
 def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
-    """First and last stamp [s] of the measurements of ``sensors``. Raises InputError if there are none."""
+    """Return the first and the last timestamp [s] of the measurements of ``sensors``. Raises InputError if there are none."""
     streams = {s: log.streams[s].t for s in sensors if s in log.streams}
     stamps: list[Array] = [t + log.rig.time_offset(s) for s, t in streams.items() if len(t)]
     if not stamps:
@@ -174,10 +190,10 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 
 @contextmanager
 def rare_garbage_collection() -> Iterator[None]:
-    """Collect garbage less often within this context, and skip objects that exist already.
+    """Collect garbage less often in this block, and exclude objects that exist already.
 
-    A collection over the objects of all loaded modules takes as long as many updates. The context has no effect if the program
-    has called ``gc.freeze``.
+    A collection over the objects of all loaded modules takes as long as many updates. No effect if the program has called
+    ``gc.freeze``.
     """
     if gc.get_freeze_count():
         yield
@@ -193,7 +209,8 @@ def rare_garbage_collection() -> Iterator[None]:
 
 
 def _peak_memory_mb() -> float:
-    # getrusage includes the parent's memory at the fork; the kernel's own figure does not
+    """Return the peak resident memory of this process in 10^6 bytes."""
+    # getrusage includes memory of the parent process at the time of the fork, but /proc does not
     try:
         status = Path("/proc/self/status").read_text(encoding="ascii")
         return float(status.split("VmHWM:")[1].split()[0]) * 1024 / 1e6

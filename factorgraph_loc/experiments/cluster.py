@@ -1,7 +1,7 @@
-"""Planned runs on an existing cluster of ``dask.distributed``.
+"""Execution of the runs of an experiment on an existing cluster of ``dask.distributed``.
 
-Workers send the files of their runs back, so that they need no common file system except for recorded logs. A run that is lost
-with its worker is repeated by another.
+Workers return the files of their runs, so a common file system is needed only for recorded logs. If a worker ends during a run,
+another worker repeats the run.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ if TYPE_CHECKING:
 
     from factorgraph_loc.experiments.experiment_file import Limits
 
-CONNECT = 10.0  # s to wait for the scheduler
-POLL_INTERVAL = 0.5  # s to wait for finished runs
-QUEUED = 2  # runs per busy worker, so that the next one does not wait for this process
-RESTART = 60.0  # s for a worker to restart
-_ONE = Lock()  # one run at a time in a process, for meaningful times
+CONNECT = 10.0  # s; maximum time to wait for the scheduler
+POLL_INTERVAL = 0.5  # s; maximum time to wait for finished runs
+QUEUED = 2  # number of runs that are sent to each worker, so that it always has a next run
+RESTART = 60.0  # s; maximum time for the restart of a worker
+_ONE = Lock()  # a worker process executes one run at a time, so that computing times are meaningful
 
 
 @dataclass(frozen=True)
 class _Made:
-    """The files of a run; ``late``: the address of the worker that is still busy with it after the time limit."""
+    """The files of a run. ``late``: the address of the worker that still executes the run after the time limit, None if none."""
 
     files: Files
     late: str | None = None
 
 
 class Cluster(Executor):
-    """Computes runs on the cluster of the ``scheduler`` (its address).
+    """Executes runs on the cluster of a scheduler. ``scheduler``: its address.
 
-    The executor limits the time of a run, the cluster its memory. The context raises InputError if ``distributed`` is not
-    installed, the scheduler does not answer, it has no workers, or a worker has other code or other libraries. It raises
-    RunFailedError if the scheduler disappears.
+    The time of a run is limited by this class, and its memory by the cluster. Used as a context manager, the executor raises
+    InputError if ``distributed`` is not installed, the scheduler does not answer or has no workers, or a worker has other code or
+    libraries. It raises RunFailedError if the connection to the scheduler is lost.
     """
 
     def __init__(self, scheduler: str, limits: Limits) -> None:
         self._scheduler, self._seconds = scheduler, limits.time
-        self._session = uuid4().hex  # for unique keys: a scheduler returns the stored result of a key, even a failure
+        self._session = uuid4().hex  # makes keys unique, because a scheduler returns the stored result of a known key
         self._sent: dict[Any, Planned] = {}
 
     def __enter__(self) -> Cluster:
@@ -74,9 +74,9 @@ class Cluster(Executor):
         with suppress(Exception):  # the scheduler may be gone
             self._client.cancel(list(self._sent), force=True)
         self._client.close()
-        if isinstance(error, OSError | self._distributed.CancelledError):  # those of the store are StoreErrors
+        if isinstance(error, OSError | self._distributed.CancelledError):  # errors of the store are StoreErrors
             raise RunFailedError(
-                "the scheduler has disappeared; results are stored, the same command continues"
+                "the connection to the scheduler is lost; finished runs are stored, and the same command resumes"
             ) from error
 
     def submit(self, take: Take, left: int) -> None:
@@ -91,10 +91,11 @@ class Cluster(Executor):
             run, made = self._sent.pop(future), self._result(future)
             yield run.key, made.files
             if made.late is not None:
-                with suppress(Exception):  # a worker without a nanny continues with that run
+                with suppress(Exception):  # a worker without a nanny process cannot restart and continues the run
                     self._client.restart_workers([made.late], timeout=RESTART, raise_for_error=False)
 
     def _done(self) -> list[Any]:
+        """Wait for at most :data:`POLL_INTERVAL`, and return the futures of finished runs."""
         if not self._sent:
             time.sleep(POLL_INTERVAL)
             return []
@@ -108,20 +109,26 @@ class Cluster(Executor):
             return []
 
     def _result(self, future: Any) -> _Made:
+        """Return the result of a finished run. Raises FglocError if a worker could not execute it."""
         if future.status != "error":
             made = future.result()
             assert isinstance(made, _Made)
             return made
         error = future.exception()
         if isinstance(error, self._distributed.KilledWorker):
-            return _Made(failure("killed", "the workers that were given it died, one after the other"))
+            return _Made(failure("killed", "every worker that executed the run died"))
         if isinstance(error, FglocError):
             raise error
-        raise RunFailedError(f"a worker could not make a run: {type(error).__name__}: {error_text(error)}") from error
+        raise RunFailedError(
+            f"a worker could not execute a run: {type(error).__name__}: {error_text(error)}"
+        ) from error
 
 
 def make(run: Planned, version: str, seconds: float) -> _Made:
-    """Compute a run on a worker, if its code and libraries have the digest ``version``, in at most ``seconds``."""
+    """Execute a run on a worker, in at most ``seconds``.
+
+    ``version``: digest of the code and libraries of the experiment. Raises InputError if those of the worker differ.
+    """
     from distributed import get_worker  # noqa: PLC0415
 
     address = str(get_worker().address)
@@ -149,7 +156,7 @@ def make(run: Planned, version: str, seconds: float) -> _Made:
 
 
 def _findable(run: Planned) -> Planned:
-    """The run with the data folder of this machine, whose path does not depend on folder and environment of the worker."""
+    """Return the run with the absolute path of the data folder, so that it does not depend on the worker's environment."""
     if not isinstance(run, PlannedRun) or not isinstance(run.source, RecordedSource):
         return run
     root = run.source.data_root or os.environ.get(DATA_ROOT)
@@ -157,6 +164,7 @@ def _findable(run: Planned) -> Planned:
 
 
 def _import() -> ModuleType:
+    """Import the package ``distributed``. Raises InputError if it is not installed."""
     try:
         import distributed  # noqa: PLC0415
     except ImportError as error:

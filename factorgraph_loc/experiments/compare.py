@@ -1,4 +1,4 @@
-"""Comparison of several estimators on several logs: an experiment without a file, a table, differences, and plots."""
+"""Comparison of several estimators on several logs. It is an experiment that is not described in a file."""
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -33,12 +33,12 @@ from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain
 
 WRITTEN = (*TABLES, PAGE)
-FINISHED = (*WRITTEN, *FILES)  # results that are not replaced; an unfinished comparison has none of them
+FINISHED = (*WRITTEN, *FILES)  # files of finished comparisons and runs, which must not be replaced without a request
 
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Done):
-    """The results of a comparison, which print as its table. ``out``: their folder."""
+    """The results of a comparison. ``repr`` gives its table. ``out``: the folder of the results."""
 
     out: Path
 
@@ -47,7 +47,7 @@ class Comparison(Done):
 
 
 def summary_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The table of runs, and what follows from it, as text."""
+    """Return the table of a comparison as text, with sentences about missing scores, the best estimator and failed runs."""
     best = verdict(rows) if len({row["estimator"] for row in rows}) > 1 else []
     failures = [f"failed: {row['log']}, {row['estimator']}: {row['reason']}" for row in rows if row["status"] != "ok"]
     return "\n".join((markdown(*comparison_cells(rows)), *unscored(rows), *best, *failures))
@@ -72,19 +72,24 @@ def compare(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Comparison:
-    """Run several estimators on several logs with each seed, as an experiment in ``jobs`` processes (None: one per core).
+    """Run several estimators on several logs with each seed, and compare them.
 
-    ``settings``: of each estimator. ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
-    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. A run that fails, or whose process dies, becomes a row with
-    its reason; the others continue. Runs whose results are stored are not repeated.
+    ``out``: folder for the results, None for a new folder below the folder ``out``. ``overwrite``: whether existing results in it
+    may be replaced.
+    ``settings``: by estimator, its settings by key. ``rig``, ``world``: replace those of the logs.
+    ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
+    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`.
+    ``rpe``: whether ``table.md`` and the report contain relative errors.
+    ``jobs``: number of parallel processes, None for one per core.
+    ``progress``: called with the number of finished runs and of all runs.
 
-    Written into ``out``, by default a new folder below ``out``: ``results.parquet`` and ``results.csv`` (the rows),
-    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
-    :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the folder ``store``, by
-    its key (see :class:`~factorgraph_loc.experiments.store.Store`). ``rpe``: also show relative errors, in ``table.md`` and in
-    the report. ``progress`` is called with the number of runs done and of all.
+    A run that fails, or whose process dies, has a row with the reason, and does not stop other runs. Runs with stored results are
+    not repeated. The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
+    :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
+    :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the folder ``store``
+    (see :class:`~factorgraph_loc.experiments.store.Store`).
 
-    Raises InputError, before anything runs, for invalid or missing input, and for results in ``out`` without ``overwrite``.
+    Raises InputError before any run if the input is invalid, or ``out`` contains results and ``overwrite`` is not set.
     """
     out = new_below(Path("out"), "compare") if out is None else Path(out)
     require_free(out, FINISHED, overwrite=overwrite)
@@ -108,7 +113,7 @@ def compare(
 
 
 def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
-    """The settings of each estimator, by name; InputError for settings of another one."""
+    """Return the settings of each estimator by name. Raises InputError for settings of an estimator that is not compared."""
     if unknown := [name for name in settings if name not in estimators]:
         raise InputError(f"settings are given for {unknown[0]}, which is not run here; run: {listed(estimators)}")
     return {name: settings.get(name, {}) for name in estimators}
@@ -117,7 +122,7 @@ def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]])
 def _experiment(
     logs: Sequence[Log], estimators: Mapping[str, Mapping[str, Any]], keys: Mapping[str, Any], *, rpe: bool
 ) -> Experiment:
-    """The experiment of a comparison."""
+    """Return the comparison as an experiment. ``keys``: further keys of the experiment and their values."""
     tables = further_tables([{"scoring.align": keys["align"]}] if keys["align"] != "none" else [], rpe=rpe)
     further = [key for keys in tables.values() for key in keys]
     content: dict[str, Any] = {
@@ -132,7 +137,7 @@ def _experiment(
 
 
 def _prepared(experiment: Experiment, logs: Sequence[Log], out: Path) -> Prepared[PlannedRun]:
-    """The runs of the experiment, with the states of stored results."""
+    """Plan the runs of the experiment, and read the states of stored results in ``out``."""
     with temporary_folder(of_system("plan")) as folder:  # nothing is written into ``out`` if the input is wrong
         runs = plan(experiment, folder, folder, given=[GivenSource(log, digest_of_log(log)) for log in logs])
     Store(out).create()
@@ -140,7 +145,7 @@ def _prepared(experiment: Experiment, logs: Sequence[Log], out: Path) -> Prepare
 
 
 def digest_of_log(log: Log) -> str:
-    """The sha256 of the content of a log in memory, with size and time of the files that it names."""
+    """Return the sha256 of the content of a log in memory, including size and modification time of the files that it names."""
     total = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -165,7 +170,7 @@ def digest_of_log(log: Log) -> str:
 
 
 def _plot(logs: Sequence[Log], prepared: Prepared[PlannedRun], folder: Path) -> None:
-    """The plots of each log; the first seed of each estimator represents all."""
+    """Write the plots of each log into ``folder``. They show the first successful seed of each estimator."""
     store = prepared.store
     for log in logs:
         tracks: dict[str, Track] = {}
@@ -177,6 +182,7 @@ def _plot(logs: Sequence[Log], prepared: Prepared[PlannedRun], folder: Path) -> 
 
 
 def _table(rows: Sequence[Mapping[str, Any]], *, rpe: bool) -> str:
+    """Return the content of ``table.md``: the table of the comparison, and requested further tables."""
     text = markdown(*comparison_cells(rows))
     for title, columns in further_tables(rows, rpe=rpe).items():
         text += f"\n{title}\n\n{markdown(*comparison_cells(rows, columns))}"

@@ -1,4 +1,4 @@
-"""Warnings about a run whose map or reference does not fit its measurements."""
+"""Warnings about a run: too short a reference, an inaccurate map, gaps without measurements, a robot that is never localized."""
 
 from collections.abc import Sequence
 
@@ -13,52 +13,56 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import detecting
 from factorgraph_loc.text import Notice, notice
 
-LEAST_SHARE = 0.9  # fraction of the time with estimates
+LEAST_SHARE = 0.9  # minimum fraction of the estimates' time span that the reference covers; below it there is a warning
 
 
 def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, ...]:
-    """Warnings for a reference with too few poses to be scored, or that covers a part of the time only."""
+    """Return a warning if the reference has too few poses for scores, or covers only a part of the time span of the estimates.
+
+    ``max_gap`` [s]: maximum gap across which estimates are interpolated for scores.
+    """
     reference = log.reference
     if reference is None or not len(reference) or not len(final):
         return ()
     count = int(np.sum(np.isfinite(pairs(final, reference, max_gap).poses[:, 0])))
     if count < FEWEST_SCORED:
-        few = (
-            "{log}: only {poses} poses of the reference have an estimate, expected at least {least}: nothing is scored"
-        )
+        few = "{log}: only {poses} poses of the reference have an estimate, expected at least {least}: there are no scores"
         return (notice("few_scored", few, log.name, count, FEWEST_SCORED),)
     begin, end = max(reference.t[0], final.t[0]), min(reference.t[-1], final.t[-1])
     whole = final.t[-1] - final.t[0]
     if end - begin >= LEAST_SHARE * whole:
         return ()
-    sentence = (
-        "{log}: scored over {scored:.1f} s of {whole:.1f} s: the reference is there from {begin:.1f} s to {end:.1f} s"
-    )
+    sentence = "{log}: scored over {scored:.1f} s of {whole:.1f} s: the reference covers {begin:.1f} s to {end:.1f} s"
     return (notice("partly_scored", sentence, log.name, end - begin, whole, begin, end),)
 
 
 def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
-    """A warning about the common error, along the trajectory, of a map that was made without a reference."""
+    """Return a warning about the error of a map that was made without a reference.
+
+    Such a map is distorted like the trajectory with which it was made. ``frame``: has the covariance of this error by position.
+    """
     if frame.error is None or not len(final):
         return ()
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
     median, most = np.sqrt((np.median(worst), worst.max()))
     sentence = (
-        "{log}: the map was made without a reference: it may be wrong by {median:.2g} m here, {most:.2g} m at most (standard "
-        "deviations), which the covariances contain"
+        "{log}: the map was made without a reference. Along the trajectory the standard deviation of its error is {median:.2g} m "
+        "(median), {most:.2g} m at most, which the covariances include"
     )
     return (notice("bent_map", sentence, log.name, median, most),)
 
 
 def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[Notice, ...]:
-    """Warnings for gaps (begin, end) [s] between measurements without estimates inside."""
+    """Return a warning about gaps between measurements in which there are no estimates.
+
+    ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap.
+    """
     if not skipped:
         return ()
     begin, end = max(skipped, key=lambda gap: gap[1] - gap[0])
     count = "a gap" if len(skipped) == 1 else f"{len(skipped)} gaps"
     sentence = (
-        "{log}: {gaps} above {limit:g} s without any measurement, the longest {length:.0f} s at {t:.1f} s: "
-        "there are no estimates inside"
+        "{log}: {gaps} above {limit:g} s without measurements and estimates, the longest {length:.0f} s at {t:.1f} s"
     )
     return (notice("gaps", sentence, log.name, count, tick_gap, end - begin, begin),)
 
@@ -66,18 +70,20 @@ def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: floa
 def never_localized(
     log: Log, sensors: Sequence[str], status: Sequence[Status], final: Trajectory
 ) -> tuple[Notice, ...]:
-    """Warnings for an unknown start that was never resolved, in terms of what ``sensors`` observe in the map; ``status``: of
-    each causal estimate."""
+    """Return a warning with a likely reason if the start is unknown and the robot was never localized.
+
+    ``sensors``: the used sensors. ``status``: the status of each causal estimate.
+    """
     kinds_of_status = set(status)
-    if "localized" in kinds_of_status or (len(final) and status[-1] == "unlocalized"):  # or it has no causal estimates
+    if "localized" in kinds_of_status or (len(final) and status[-1] == "unlocalized"):  # the latter: a batch estimator
         return ()
     kinds = detecting(log.world, sensors)
     names = " and ".join(kind.detects for kind in kinds)
     if not kinds:
-        why = "the map has nothing that its sensors could find"
+        why = "the map has nothing that its sensors can detect"
     elif "ambiguous" in kinds_of_status:
-        why = f"its {names} leave several places possible"
-    elif len(kinds) > 1:  # an estimator may use only some of them
+        why = f"its {names} match several poses"
+    elif len(kinds) > 1:  # an estimator may use only some of these kinds
         why = f"its {names} did not determine the pose"
     else:
         why = f"no {names} of the map were detected"

@@ -1,8 +1,9 @@
-"""Execution of planned runs: each is claimed in the store, computed by an executor, and stored here under its claim.
+"""Execution of planned runs. A run is claimed in the store, computed by an executor, and stored.
 
-An executor computes in local processes or on a cluster (:mod:`~factorgraph_loc.experiments.cluster`). Only this process stores, so
-that nothing is stored twice, even if other processes use the same store. A local process makes many runs, so that short runs do
-not wait for imports. A run that exceeds its limit of time or memory is ended with its process, and fails; the others continue."""
+An executor computes runs in local processes or on a cluster (:mod:`~factorgraph_loc.experiments.cluster`). A claim excludes other
+processes that use the same store, so that no run is computed twice. A local worker process computes many runs, so that short runs
+do not wait for imports. A run that exceeds its limit of time or memory fails, and its process is killed. Other runs continue.
+"""
 
 from __future__ import annotations
 
@@ -30,20 +31,21 @@ from factorgraph_loc.text import error_text, json_text
 
 Files = dict[str, bytes]
 Kind = Literal["error", "timeout", "memory", "killed", "vanished", "refused"]
-RETRY_INTERVAL = 0.5  # s after which a run that another process has claimed is tried again
+RETRY_INTERVAL = 0.5  # s between attempts to claim a run that another process has claimed
 CHECK_INTERVAL = 0.1  # s between checks of memory and time
-ATTEMPTS = (
-    2  # a process may be killed because of others' memory; after two deaths the run itself is considered the cause
-)
-SHARE = 0.9  # of the machine's memory, for all workers together
+ATTEMPTS = 2  # a run fails if its process dies so many times; a single death may be due to other processes
+SHARE = 0.9  # fraction of the machine's memory that all workers together may use
 PRELOADED = ("cv2", "factorgraph_loc.experiments.output")  # modules that a worker imports before its first run
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 class Planned(Protocol):
-    """A run as plain data that can be sent to other processes. ``key``: of its results; ``source``: of the data that it loads,
-    which the next run in the same process may share. ``shown``: a description that distinguishes it from the other runs;
-    ``columns``: the first columns of its row in the table of results."""
+    """A planned run, which can be pickled and sent to other processes.
+
+    ``key``: key of its results in the store. ``source``: identifies the data that it loads. Runs with the same source are computed
+    in the same process if possible. ``shown``: a description that distinguishes the run from others. ``columns``: the first columns
+    of its row in the table of results.
+    """
 
     @property
     def key(self) -> str: ...
@@ -55,28 +57,28 @@ class Planned(Protocol):
     def columns(self) -> dict[str, Any]: ...
 
     def make(self) -> Files:
-        """The files of the run. Raises FglocError if it fails for a known reason."""
+        """Compute the run, and return the content of its files by name. Raises FglocError if it fails for a known reason."""
 
 
 class Take(Protocol):
-    """A function that returns the next claimed run, or None if there is none now."""
+    """A function that claims and returns the next run, or None if there is none now."""
 
     def __call__(self, loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
-        """The run has the source ``loaded`` if possible, else one that is not among ``avoided``."""
+        """Prefer a run with the source ``loaded``, which a worker has in memory. Otherwise avoid the sources ``avoided``."""
 
 
 class Executor(AbstractContextManager[Any], Protocol):
-    """Computes runs with :func:`compute`, in other processes. The end of the context ends all computations."""
+    """Computes runs by :func:`compute` in other processes. It is a context manager, whose end stops all computations."""
 
     def submit(self, take: Take, left: int) -> None:
-        """Begin as many runs as there is room for; ``left``: the number of runs that are not stored yet."""
+        """Start as many runs as possible. ``take``: returns the next run. ``left``: number of runs that are not stored yet."""
 
     def finished(self) -> Iterable[tuple[str, Files]]:
-        """The keys of runs that have ended, with their files; returns within about half a second."""
+        """Return the keys and files of runs that have ended since the last call. Waits at most about half a second."""
 
 
 class _Queue:
-    """The runs that are to be made, by source, and the ``later`` ones, which another process has claimed."""
+    """The runs to compute. ``later``: runs that another process has claimed, with the time of the next attempt to claim them."""
 
     def __init__(self, runs: Sequence[Planned]) -> None:
         self._runs: dict[Hashable, list[Planned]] = {}
@@ -88,7 +90,7 @@ class _Queue:
         return sum(map(len, self._runs.values())) + len(self.later)
 
     def next(self, loaded: Hashable, avoided: Sequence[Hashable]) -> Planned | None:
-        """The next run; see :class:`Take`."""
+        """Remove and return the next run; see :class:`Take`. Return None if there is none now."""
         while self.later and self.later[0][0] <= time.monotonic():
             self._add(self.later.pop(0)[1])
         if not self._runs:
@@ -108,15 +110,16 @@ class _Queue:
 def execute(
     runs: Sequence[Planned], folder: Path, executor: Executor, *, again: bool = False
 ) -> Iterator[tuple[str, State]]:
-    """Make ``runs``, store their results or failures in the store below ``folder`` unless they exist, and yield the key and the
-    state of each.
+    """Compute ``runs``, store their results or failures in the store below ``folder``, and yield the key and the state of each.
 
-    ``again``: repeat stored failures. A run that another process has claimed is waited for. When the generator is closed, the
-    executor ends without delay, and unfinished runs are not stored. Raises StoreError if the store cannot be written.
+    Runs with stored results are not repeated. ``again``: repeat stored failures. If another process has claimed a run, this waits
+    for its result. When the generator is closed, the executor stops immediately, and unfinished runs are not stored.
+
+    Raises StoreError if the store cannot be written.
     """
     store, queue = Store(folder), _Queue(runs)
     claims: dict[str, ExitStack] = {}
-    stored: list[tuple[str, State]] = []  # by other processes
+    stored: list[tuple[str, State]] = []  # runs that other processes have stored
 
     def take(loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
         while (run := queue.next(loaded, avoided)) is not None:
@@ -124,7 +127,7 @@ def execute(
                 if not claim.enter_context(store.claim(run.key)):
                     queue.later.append((time.monotonic() + RETRY_INTERVAL, run))
                     continue
-                state = store.state(run.key)  # the caller considers it missing or damaged
+                state = store.state(run.key)  # another process may have stored it since the runs were planned
                 if state not in ("ok", "failed") or (state == "failed" and again):
                     claims[run.key] = claim.pop_all()
                     return run
@@ -148,9 +151,9 @@ def execute(
 
 
 def compute(run: Planned) -> Files:
-    """The files of a run, or of its failure, for :meth:`~factorgraph_loc.experiments.store.Store.put`.
+    """Compute a run in this process. Return the content of its files by name, or of the file that describes its failure.
 
-    Raises StoreError only, if there is no space for them.
+    Raises only StoreError, if the disk for temporary files is full or not writable.
     """
     import cv2  # noqa: PLC0415
 
@@ -159,7 +162,7 @@ def compute(run: Planned) -> Files:
     try:
         return run.make()
     except MemoryError:
-        return failure("memory", "there was no memory left")
+        return failure("memory", "the run needed more memory than was available")
     except FglocError as error:
         return failure("vanished" if isinstance(error, VanishedError) else "error", str(error))
     except Exception as error:
@@ -170,13 +173,13 @@ def compute(run: Planned) -> Files:
 
 
 def failure(kind: Kind, reason: str, details: str = "") -> Files:
-    """The files of a failed run; ``details``: a traceback."""
+    """Return the content of the file of a failed run, by its name. ``details``: a traceback, or ""."""
     content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
     return {FAILURE: json_text(content).encode()}
 
 
 def _forget_peak_memory() -> None:
-    """Reset the kernel's peak memory of this process (proc(5), clear_refs 5), where possible."""
+    """Reset the peak memory of this process that the kernel records (proc(5), clear_refs 5), if possible."""
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:
@@ -185,12 +188,14 @@ def _forget_peak_memory() -> None:
 
 @dataclass(eq=False)
 class _Worker(Worker):
-    source: Hashable = None  # of its last run, whose data are loaded
+    """A worker process. ``source``: source of its last run, whose data are in memory. ``since``: start of its current run [s]."""
+
+    source: Hashable = None
     since: float = 0.0
 
 
 class Processes(Executor):
-    """Computes runs in at most ``jobs`` processes. Raises ProcessDiedError if none can be started."""
+    """Computes runs in at most ``jobs`` local processes. Raises ProcessDiedError if no process can be started."""
 
     def __init__(self, jobs: int, limits: Limits) -> None:
         self._jobs, self._time = jobs, limits.time
@@ -242,28 +247,30 @@ class Processes(Executor):
                 yield run.key, failure(*failed)
 
     def _died(self, worker: _Worker) -> tuple[Kind, str] | None:
-        """The failure that the death of a worker means for its run; None if it is repeated."""
+        """Return the kind and the reason of the failure of a run whose worker died. Return None if the run is repeated."""
         if not worker.ready:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
-                raise ProcessDiedError("a worker process ended before it began")
+                raise ProcessDiedError("a worker process ended before it was ready")
         if worker.job is None:
             return None
         self._deaths[worker.job.key] += 1
         if self._deaths[worker.job.key] < ATTEMPTS:
             self._repeated.append(worker.job)
             return None
-        return "killed", f"its process died without a word, {ATTEMPTS} times (killed, or a crash in native code)"
+        return "killed", f"its process died {ATTEMPTS} times without a message (killed, or a crash in native code)"
 
     def _too_much(self, worker: _Worker) -> tuple[Kind, str] | None:
+        """Return the kind and the reason of the failure of a run that exceeds a limit, or None if it does not."""
         if worker.job is None:
             return None
         if time.monotonic() - worker.since > self._time:
             return "timeout", f"it took more than {self._time:g} s"
         if resident_memory(worker.process.pid) > self._memory:
-            return "memory", f"its process held more than {self._memory / 1e6:.0f} MB"
+            return "memory", f"its process used more than {self._memory / 1e6:.0f} MB of memory"
         return None
 
 
 def _machine_memory() -> float:
+    """Return the physical memory of this machine in bytes."""
     return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")

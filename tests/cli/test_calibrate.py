@@ -47,7 +47,7 @@ def test_a_log_without_reference_is_calibrated_by_itself(fgloc, refused, short_l
     result = fgloc("calibrate", blind, "-o", out, "--overwrite")
     assert result.exit_code == 0
     assert "learnt without a reference, in" in result.stdout
-    assert "took turns" in (tmp_path / "a.report.html").read_text()
+    assert "in turns" in (tmp_path / "a.report.html").read_text()
     assert "range_sigma" in out.read_text()
     mixed = refused("calibrate", short_log, blind, "-o", tmp_path / "b.rig.toml")
     assert "has no reference, expected one to calibrate against" in mixed

@@ -153,7 +153,7 @@ def test_a_log_with_hardly_any_reference_is_not_scored(made, tmp_path):
         **{"causal.position_rmse": pl.when(poor).then(0.0).otherwise("causal.position_rmse")},
     )
     words = words_of(page_of(some, tmp_path))
-    assert "Fewer than 10 poses of log1 have a reference: nothing is scored there." in words
+    assert "Fewer than 10 poses of log1 have a reference, so these logs have no scores." in words
     assert Results(some.rows).scores("causal.position_rmse", "a")["log1"] == {0: None}
 
 

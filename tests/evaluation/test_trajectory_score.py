@@ -188,8 +188,8 @@ def test_a_plane_is_seen_from_above():
     assert figures["ape.rotation_max"] == pytest.approx(0.0, abs=1e-7)
     found = score(planar, in_space(t, positions + np.array((0.0, 0.0, 5.0)), rotations))
     assert tuple(map(str, found.warnings)) == (
-        "estimate is planar, and reference is up to 5.5 m above or below it: heights count, but not with align se2 or associate "
-        "interpolate",
+        "estimate is planar, and reference is up to 5.5 m above or below it. Errors include the difference in height: "
+        "set align se2 or associate interpolate to exclude it",
     )
 
 
@@ -205,7 +205,7 @@ def test_positions_without_headings_have_absolute_errors_only():
 @pytest.mark.parametrize(
     ("estimate", "options", "message"),
     [
-        (along_x(), {"align": "se3"}, "its positions lie on a line, which --align se3 cannot turn"),
+        (along_x(), {"align": "se3"}, "its positions lie on a line, so --align se3 has no unique rotation"),
         (along_x(1.0, 0.1), {"align": "se2"}, "2 poses are paired with reference, expected at least 3"),
         (along_x(math.nan), {}, "pose 1 is not finite"),
         (

@@ -81,7 +81,7 @@ def test_why_a_start_stayed_unknown_is_told_by_the_sensors_that_were_used(blank,
 
     assert why(with_points(blank, 2), "camera") == "no points of the map were detected"
     assert why(with_points(blank, 2), "bearing_range", "camera") == "no points of the map were detected"
-    assert why(blank, "bearing_range") == "the map has nothing that its sensors could find"
+    assert why(blank, "bearing_range") == "the map has nothing that its sensors can detect"
     both = with_points(replace(blank, world=log.world), 2)
     assert why(both, "camera") == "no points of the map were detected"
     unseen = replace(log.streams["bearing_range"], landmark=["x", "y"] * 4)
@@ -120,5 +120,5 @@ def test_a_reference_shorter_than_the_log_is_scored_where_it_is(log):
     short = with_reference(log, log.reference.t[(log.reference.t > 0.48) & (log.reference.t < 1.52)])
     result = run(short, RunConfig("dead_reckoning", prior="0,0,0"))
     (warning,) = result.warnings
-    assert str(warning) == "straight: scored over 1.0 s of 2.0 s: the reference is there from 0.5 s to 1.5 s"
+    assert str(warning) == "straight: scored over 1.0 s of 2.0 s: the reference covers 0.5 s to 1.5 s"
     assert score(result, short)["causal.scored"] == 11

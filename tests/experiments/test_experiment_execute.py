@@ -91,7 +91,7 @@ def test_a_claimed_run_is_left_to_its_owner(planned, out):
         (ZeroDivisionError("by nought"), "error", ": odometry at 0.000 s: by nought"),
         (TypeError("of\nours"), "error", "TypeError: of ours"),
         (FglocError("cannot go on"), "error", "cannot go on"),
-        (MemoryError(), "memory", "there was no memory left"),
+        (MemoryError(), "memory", "the run needed more memory than was available"),
     ],
 )
 def test_a_failure_is_stored_with_its_reason_and_tried_again_if_told(

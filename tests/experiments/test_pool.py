@@ -37,7 +37,7 @@ def test_a_run_that_takes_too_long_or_too_much_memory_fails_and_the_others_go_on
     outcomes = execute(runs, tmp_path / "out", Processes(1, Limits(memory=450.0)))
     assert [state for _, state in outcomes] == ["failed", "ok"]
     row = store.row(runs[0].key)
-    assert (row["kind"], row["reason"]) == ("memory", "its process held more than 450 MB")
+    assert (row["kind"], row["reason"]) == ("memory", "its process used more than 450 MB of memory")
     runs = planned([LONG], [{**HUGE, "label": "endless", "settings": {"particles": 900_000}}])
     list(execute(runs, tmp_path / "out", Processes(1, Limits(time=0.5))))
     row = store.row(runs[0].key)

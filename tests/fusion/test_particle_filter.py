@@ -38,7 +38,7 @@ def test_one_landmark_is_ambiguous(log, tmp_path):
     result = run(only(cut(log, 0.0, 3.0), "b"), UNKNOWN)
     assert set(result.status) == {"unlocalized", "ambiguous"}
     (warning,) = result.warnings
-    assert str(warning) == "simulated: never localized: its landmarks leave several places possible"
+    assert str(warning) == "simulated: never localized: its landmarks match several poses"
     scores = write_run(result, log, tmp_path / "out")
     assert scores["causal.position_rmse"] is None
     assert scores["time_to_localized"] is None

@@ -1,3 +1,3 @@
-"""Evaluation of point features: repeatability and matching."""
+"""Evaluation of point features of images: repeatability and matching."""
 
 __all__ = ["feature_evaluation", "repeatability", "scores", "sequences"]

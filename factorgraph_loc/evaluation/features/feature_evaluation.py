@@ -29,18 +29,18 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Feature:
-    """A feature under evaluation: ``find`` returns the points of an image, and their descriptors if it has any."""
+    """A kind of point feature. ``find`` detects the points of an image, and returns them with their descriptors or None."""
 
     name: str
     find: Callable[[Image], tuple[Keypoints, Descriptors | None]]
 
 
 class MatchScores(NamedTuple):
-    """Matching scores of a pair of images; NaN for detectors without descriptors.
+    """Matching scores of a pair of images. They are NaN for a detector without descriptors, and 0 if there are no matches.
 
-    ``matching_score``: correct mutual matches over the smaller number of features in the common part; ``matches``: mutual ones
-    with a ratio below :data:`~factorgraph_loc.vision.matching.RATIO`, ``precision``: fraction of correct ones. Without matches
-    the scores are 0.
+    ``matching_score``: number of correct mutual matches divided by the smaller number of features in the common part of the images.
+    ``matches``: number of mutual matches with a distance ratio below :data:`~factorgraph_loc.vision.matching.RATIO`.
+    ``precision``: fraction of the latter that is correct.
     """
 
     matches: int = 0
@@ -51,14 +51,16 @@ class MatchScores(NamedTuple):
 def evaluate(
     sequence: Sequence, what: Feature, progress: Callable[[], None] = lambda: None
 ) -> Iterator[dict[str, Any]]:
-    """The scores of a feature on each pair of a sequence: the first image and its image number ``image``.
+    """Yield the scores of a feature on each pair of images of a sequence: the first image and a later one.
 
-    ``change`` and ``amount`` are those of the sequence; ``features`` were detected and described in ``milliseconds``. The others
-    are those of :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability` and :class:`MatchScores`. Each image is
-    processed on one thread; ``progress`` is called after it.
+    The keys are ``feature``, ``sequence``, ``image`` (number of the later image), ``change`` and ``amount`` (see
+    :class:`~factorgraph_loc.evaluation.features.sequences.Sequence`), ``features`` (number in the later image), ``milliseconds``
+    (time to detect and describe these), and the fields of :class:`MatchScores` and
+    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`. Each image is processed on one thread. ``progress``
+    is called after each image.
     """
     with _one_thread():
-        what.find(sequence.first)  # exclude compilation and allocation at first use from the time
+        what.find(sequence.first)  # compilation and allocation at first use are not part of the measured time
         keypoints, descriptors = what.find(sequence.first)
         progress()
         for k, (image, homography) in enumerate(zip(sequence.others, sequence.homographies, strict=True)):
@@ -87,8 +89,12 @@ def evaluate(
 def match_scores(
     first: Keypoints, second: Keypoints, mutual: Matches, clear: Matches, homography: Array, shapes: Shapes
 ) -> MatchScores:
-    """The scores of ``mutual`` matches, and of the ``clear`` ones, whose ratio is small; one is correct if both points lie in the
-    common part of the images, and their regions overlap."""
+    """Return the scores of the matches between two images. A match is correct if both points lie in the common part of the images
+    and their regions overlap.
+
+    ``mutual``: mutual nearest neighbours. ``clear``: those with a small distance ratio. ``homography``: from the first image to the
+    second. ``shapes``: shapes of both images.
+    """
     in_first, in_second = common(first, second, homography, shapes)
     features = min(int(np.count_nonzero(in_first)), int(np.count_nonzero(in_second)))
 
@@ -102,7 +108,7 @@ def match_scores(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Run OpenCV on one thread, for comparable times."""
+    """Run OpenCV on one thread in this block, so that times are comparable."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

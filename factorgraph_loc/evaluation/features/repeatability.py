@@ -1,11 +1,11 @@
 """Repeatability of points between two images of a scene.
 
-A point stands for a disc, which the homography maps to an ellipse in the other image; two regions correspond if they overlap.
-Repeatability is the number of one-to-one correspondences over the smaller number of regions in the common part of the scene
-(Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, section 4). Both regions of a pair are scaled to a
-radius of 30 px in the first image; otherwise large regions would overlap even if they are inaccurate.
+The region of a point is a disc, which the homography maps to an ellipse in the other image. Two regions correspond if they overlap.
+Repeatability is the number of one-to-one correspondences divided by the smaller number of regions in the common part of the scene
+(Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005, section 4). Both regions of a pair are scaled so that
+the first has a radius of 30 px. Otherwise large regions would overlap even if their positions are inaccurate.
 
-The ``strict`` score compares regions in their own size: their position in units of the size, and a ratio of sizes near 1.
+The ``strict`` score does not scale regions. It compares positions in units of the region's size, and requires similar sizes.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from factorgraph_loc.evaluation.features.sequences import inside, invert, jacobi
 from factorgraph_loc.vision.features import Integers, Keypoints
 from factors.se2 import Array
 
-OVERLAP_ERROR = 0.4
-RADIUS = 30.0  # px, of a scaled region in the first image
+OVERLAP_ERROR = 0.4  # regions correspond below this error: 1 - intersection / union
+RADIUS = 30.0  # px; radius of a scaled region in the first image
 MEASUREMENT = 3.0  # radius of the region that describes a point, in units of half its size
 SCALE_RATIO = 1.2  # maximum ratio of sizes in the strict score
 
-_NODES = 64  # of the integration over a disc
-_CHUNK = 20_000
+_NODES = 64  # number of nodes of the integration over a disc
+_CHUNK = 20_000  # number of pairs that are compared at once, to limit memory
 
 Truths = NDArray[np.bool_]
 Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both images
 
 
 class Repeatability(NamedTuple):
-    """Scores of a pair of images, 0 to 1.
+    """Repeatability scores of a pair of images, from 0 to 1.
 
-    ``regions``: the smaller number of them in the common part; if it is 0, all scores are 0.
+    ``regions``: the smaller of the numbers of regions in the common part of both images. If it is 0, the scores are 0.
     """
 
     regions: int
@@ -46,8 +46,11 @@ class Repeatability(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Pairs of regions that may correspond: ``first`` (M,), ``second`` (M,) their indices, ``error`` (M,) overlap error, ``ratio``
-    (M,) of their sizes in the first image, second over first."""
+    """M pairs of regions that may correspond. ``first``, ``second`` (M,): indices of the regions in each image.
+
+    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region, mapped to the first image, divided by that of the
+    first.
+    """
 
     first: Integers
     second: Integers
@@ -55,7 +58,7 @@ class Candidates:
     ratio: Array
 
     def best(self, chosen: Truths) -> Candidates:
-        """The one-to-one pairs among ``chosen`` (M,), selected greedily by error."""
+        """Select one-to-one pairs from those in the mask ``chosen`` (M,), in the order of increasing error."""
         taken_first: set[int] = set()
         taken_second: set[int] = set()
         rows = []
@@ -70,9 +73,10 @@ class Candidates:
 
 
 def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> Repeatability:
-    """The scores of points found in two images of ``shapes`` (height, width, ...); ``homography`` maps the first to the second.
+    """Return the repeatability of points that are detected in two images.
 
-    Points with several orientations count as one region.
+    ``homography`` (3, 3): maps the first image to the second. ``shapes``: (height, width, ...) of both images. Points at the same
+    position with several orientations count as one region.
     """
     in_first, in_second = common(first, second, homography, shapes)
     first, second = distinct(first[in_first]), distinct(second[in_second])
@@ -86,14 +90,14 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 
 def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
-    """One-to-one pairs of points whose regions, in their own size, overlap, with a ratio of sizes below :data:`SCALE_RATIO`."""
+    """Return one-to-one pairs of points whose regions overlap without scaling, with a ratio of sizes below :data:`SCALE_RATIO`."""
     pairs = overlaps(first, second, homography, magnified=False)
     alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
     return pairs.best((pairs.error < OVERLAP_ERROR) & alike)
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
-    """Which points of each image lie in the common part of the scene."""
+    """Return for each image a mask of the points that lie inside the other image too."""
     back = invert(homography)
     return (
         inside(project(homography, first.points), shapes[1]),
@@ -102,16 +106,16 @@ def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shape
 
 
 def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Candidates:
-    """All pairs of points in the common part whose regions may have an overlap error below :data:`OVERLAP_ERROR`.
+    """Return the pairs of points whose regions may have an overlap error below :data:`OVERLAP_ERROR`.
 
-    ``magnified``: scale regions to :data:`RADIUS`, but not the distance of the centres; else the radius of a region is
-    :data:`MEASUREMENT` times half the size of its point.
+    ``magnified``: if set, regions are scaled so that the first has the radius :data:`RADIUS`, but the distance of the centres is
+    not scaled. Otherwise the radius of a region is :data:`MEASUREMENT` times half the size of its point.
     """
     if len(first) == 0 or len(second) == 0:
         none = np.empty(0, dtype=np.int64)
         return Candidates(none, none, np.empty(0), np.empty(0))
     mapped = project(invert(homography), second.points)
-    # symmetric convex regions that share more than half of one of them contain each other's centres
+    # if the intersection of two symmetric convex regions is more than half of one region, that region's centre is in the other
     reach = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
     near = cKDTree(mapped).query_ball_point(first.points, reach)
     i = np.repeat(np.arange(len(first)), [len(row) for row in near]).astype(np.int64)
@@ -123,11 +127,14 @@ def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnifie
 
 
 def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Array:
-    """Overlap error (N,) of point n of ``first`` with point n of ``second``: 1 - intersection / union, as in :func:`overlaps`; 1
-    for points that the homography maps to infinity."""
+    """Return the overlap errors (N,) between the regions of the N points ``first`` and of the N points ``second``.
+
+    The error is 1 - intersection / union, and 1 for points that the homography maps to infinity. ``magnified``: see
+    :func:`overlaps`.
+    """
     back = invert(homography)
     radius = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
-    # in units of that radius the first region is the unit disc
+    # in units of this radius the first region is the unit disc
     centre = (project(back, second.points) - first.points) / radius[:, None]
     local = jacobians(back, second.points) * (second.sizes / first.sizes)[:, None, None]
     ellipse = local @ local.transpose(0, 2, 1)
@@ -141,10 +148,10 @@ def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magni
 
 
 def shared_area(centres: Array, ellipses: Array) -> Array:
-    """Areas (N,) of the intersection of the unit disc with ellipses {c + x : x^T S^-1 x <= 1}: ``centres`` c (N, 2), ``ellipses``
-    S (N, 2, 2).
+    """Return the areas (N,) of the intersections of the unit disc with N ellipses {c + x : x^T S^-1 x <= 1}.
 
-    Integrates over the intersection of vertical chords, with denser nodes where the disc is short; accurate to 0.006.
+    ``centres``: c (N, 2). ``ellipses``: S (N, 2, 2). The lengths of common vertical chords are integrated numerically, with denser
+    nodes at the sides of the disc. The error is below 0.006.
     """
     angles = (np.arange(_NODES) + 0.5) * np.pi / _NODES - np.pi / 2.0
     x, half = np.sin(angles), np.cos(angles)
@@ -158,13 +165,13 @@ def shared_area(centres: Array, ellipses: Array) -> Array:
 
 
 def distinct(keypoints: Keypoints) -> Keypoints:
-    """Each position and size once, in the order of the points."""
+    """Return the points without those that have the position and the size of an earlier point."""
     rows = np.column_stack((keypoints.points, keypoints.sizes))
     _, index = np.unique(rows, axis=0, return_index=True)
     return keypoints[np.sort(index)]
 
 
 def _sizes_in_first(second: Keypoints, homography: Array) -> Array:
-    """The sizes of the second image's points in the first, for discs of equal area."""
+    """Return the sizes of points of the second image in the first image: the diameters of discs that have the mapped area."""
     areas = np.abs(np.linalg.det(jacobians(invert(homography), second.points)))
     return np.asarray(second.sizes * np.sqrt(areas))

@@ -1,6 +1,6 @@
-"""Scores of features on several sequences of images as tables, files and plots (among them figure 3 of the paper).
+"""Scores of point features on several sequences of images, as tables, files and plots, such as figure 3 of the paper.
 
-The scores are a table with a row for each feature and pair of images, and the columns of
+The table of scores has a row for each feature and pair of images, and the columns of
 :func:`~factorgraph_loc.evaluation.features.feature_evaluation.evaluate`.
 """
 
@@ -26,7 +26,7 @@ from factorgraph_loc.vision.matching import RATIO
 
 FILES = ("table.md", "pairs.parquet", "figure3.png")
 
-# of the table: the header of each score, and its digits
+# columns of the printed table: header and digits of each score
 COLUMNS = {
     "features": ("features", 0),
     "repeatability": ("repeatability", 3),
@@ -41,8 +41,10 @@ _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
 def evaluate_all(
     sequences: Several[Sequence], features: Several[Feature], progress: Callable[[float, float], None]
 ) -> pl.DataFrame:
-    """The scores of each feature on each sequence, null where a feature has none. ``progress`` is called with the number of images
-    done, and of all."""
+    """Return the scores of each feature on each sequence. A score that a feature does not have is null.
+
+    ``progress`` is called with the number of processed images and the number of all images.
+    """
     total = len(features) * sum(1 + len(sequence.others) for sequence in sequences)
     done = itertools.count(1)
     rows = [
@@ -55,7 +57,7 @@ def evaluate_all(
 
 
 def write_scores(scores: pl.DataFrame, out: Path) -> None:
-    """Write :data:`FILES` into ``out``: tables, the scores of all pairs, and the plot of repeatability."""
+    """Write :data:`FILES` into the folder ``out``: tables, the scores of all pairs of images, and the plot of repeatability."""
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / "table.md", tables(scores))
@@ -64,8 +66,10 @@ def write_scores(scores: pl.DataFrame, out: Path) -> None:
 
 
 def summary(scores: pl.DataFrame) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a table of features: means over the pairs of images, but medians of times, as first calls and other load
-    cause outliers. A dash stands for a score that the feature does not have."""
+    """Return the header and the rows of a table of features, with the mean of each score over the pairs of images.
+
+    For times it has the median, because other processes cause outliers. A dash is a score that the feature does not have.
+    """
     lines = []
     for name in scores["feature"].unique(maintain_order=True):
         rows = scores.filter(pl.col("feature") == name)
@@ -78,7 +82,7 @@ def summary(scores: pl.DataFrame) -> tuple[list[str], list[list[str]]]:
 
 
 def tables(scores: pl.DataFrame) -> str:
-    """The summary over all, and for each sequence the repeatability of each pair, in Markdown."""
+    """Return tables in Markdown: the summary over all pairs of images, and for each sequence the repeatability of each pair."""
     pairs = scores.select("sequence", "image").n_unique()
     parts = [f"Mean over {pairs} pairs of images\n", markdown(*summary(scores))]
     for sequence in scores["sequence"].unique(maintain_order=True):
@@ -109,7 +113,7 @@ def figure3(scores: pl.DataFrame) -> Any:
 
 
 def _panels(scores: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """The scores of the sequences that are plotted together, by title: photographs with the same warps; others alone."""
+    """Return the scores for each panel of the plot by its title. Photographs with the same warps have one panel together."""
     members: dict[tuple[Any, ...], list[str]] = {}
     for sequence in scores["sequence"].unique(maintain_order=True):
         rows = scores.filter(pl.col("sequence") == sequence)

@@ -1,9 +1,9 @@
-"""Images of one planar scene with known homographies: folders in the Oxford format, or one photograph with known warps.
+"""Sequences of images of one planar scene with known homographies: folders in the Oxford format, or warps of one photograph.
 
-A homography maps points and regions, and contains a zoom, a rotation and a tilt.
+A homography maps points of the first image to another image. It contains a zoom, a rotation and a tilt.
 
-Folders: Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005: ``img1`` to ``imgN`` and the homographies
-``H1to2p`` to ``H1toNp`` from the first image to each other one.
+A folder in the Oxford format (Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005) has the images ``img1``
+to ``imgN``, and the homographies ``H1to2p`` to ``H1toNp`` from the first image to each other image.
 """
 
 import re
@@ -22,19 +22,22 @@ from factorgraph_loc.text import error_text
 from factorgraph_loc.vision.images import Image, read_image
 from factors.se2 import Array
 
-_MAX_CONDITION = 1e12  # of the matrix in pixels: typical values for images of 1000 px are 1e4 to 1e7
+_MAX_CONDITION = 1e12  # maximum condition number of a homography; for images of 1000 px it is usually 1e4 to 1e7
 ZOOMS = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)  # reduction factors of photographs
-ROTATIONS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # degrees
-MIN_WARPED = 128  # px per side: a quarter of it must still have features
+ROTATIONS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # rotations of photographs, in degrees
+MIN_WARPED = 128  # px; minimum side of a photograph, because it must have features when reduced to a quarter
 
 SCALE, ROTATION, VIEWPOINT, OTHER = "scale change", "rotation [degrees]", "viewpoint (tilt)", "image"
-_SCALED, _TURNED, _TILTED = 1.3, np.radians(10.0), 1.3  # thresholds of the dominant change
+_SCALED, _TURNED, _TILTED = 1.3, np.radians(10.0), 1.3  # minimum zoom, rotation and tilt of the dominant change
 _SUFFIXES = ("", ".txt", ".xml")
 
 
 class ViewChange(NamedTuple):
-    """Change of view to a second image: ``zoom`` (above 1: larger there), ``rotation`` [rad], ``tilt`` (ratio of the axes of the
-    ellipse that a small circle becomes, at least 1)."""
+    """Change of view from a first image to a second one.
+
+    ``zoom``: above 1 if the scene is larger in the second image. ``rotation`` [rad]. ``tilt``: a small circle becomes an ellipse,
+    and this is the ratio of its axes, at least 1.
+    """
 
     zoom: float
     rotation: float
@@ -42,9 +45,9 @@ class ViewChange(NamedTuple):
 
 
 def project(homography: Array, points: Array) -> Array:
-    """Map points (N, 2) [px] of the first image to the second (N, 2); NaN if they lie at or behind infinity.
+    """Map points (N, 2) [px] of the first image to the second image (N, 2). Points that lie at or behind infinity become NaN.
 
-    ``homography`` (3, 3) has the sign set by :func:`checked`; its inverse then has the sign for the way back.
+    ``homography`` (3, 3): a matrix from :func:`checked`, which determines its sign, or the inverse of such a matrix.
     """
     mapped = points @ homography[:, :2].T + homography[:, 2]
     w = np.where(mapped[:, 2] > 0.0, mapped[:, 2], np.nan)
@@ -52,7 +55,7 @@ def project(homography: Array, points: Array) -> Array:
 
 
 def jacobians(homography: Array, points: Array) -> Array:
-    """Derivatives (N, 2, 2) of :func:`project`: the affine map of a small region around each of ``points`` (N, 2)."""
+    """Return the derivatives (N, 2, 2) of :func:`project` at ``points`` (N, 2). They map small regions around the points."""
     w = points @ homography[2, :2] + homography[2, 2]
     return np.asarray(
         (homography[:2, :2] - project(homography, points)[:, :, None] * homography[2, :2]) / w[:, None, None]
@@ -60,24 +63,24 @@ def jacobians(homography: Array, points: Array) -> Array:
 
 
 def invert(homography: Array) -> Array:
-    """The inverse homography (3, 3)."""
+    """Return the inverse homography (3, 3)."""
     return np.asarray(np.linalg.inv(homography), dtype=float)
 
 
 def inside(points: Array, shape: tuple[int, ...]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of ``points`` (N, 2) lie in an image of ``shape`` (height, width, ...); NaN do not."""
+    """Return a mask (N,) of the ``points`` (N, 2) that lie in an image of ``shape`` (height, width, ...). NaN lies outside."""
     last = np.array((shape[1] - 1.0, shape[0] - 1.0))
     return np.asarray(np.all((points >= 0.0) & (points <= last), axis=1))
 
 
 def corners(shape: tuple[int, ...]) -> Array:
-    """The centres (4, 2) of an image's corner pixels."""
+    """Return the centres (4, 2) of the corner pixels of an image of ``shape`` (height, width, ...)."""
     right, bottom = shape[1] - 1.0, shape[0] - 1.0
     return np.array(((0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)))
 
 
 def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
-    """Zoom, rotation and tilt at the centre of the first image, of ``shape``."""
+    """Return zoom, rotation and tilt at the centre of the first image, which has ``shape``."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
     left, axes, right = np.linalg.svd(local)
     turn = left @ right
@@ -87,8 +90,9 @@ def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
 
 
 def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
-    """``matrix`` (3, 3) scaled so that the first image, of ``shape``, has w > 0. Raises InputError, naming ``source``, if it is
-    not a homography.
+    """Check a homography, and scale it so that its third homogeneous coordinate is positive on the whole first image.
+
+    ``matrix`` (3, 3). ``shape``: of the first image. Raises InputError with the file ``source`` if it is not a valid homography.
     """
     if matrix.shape != (3, 3):
         raise InputError(f"{source}: has {matrix.size} numbers, expected the 3 x 3 of a homography")
@@ -98,17 +102,19 @@ def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
         raise InputError(f"{source}: is singular, expected a homography that can be inverted")
     w = corners(shape) @ matrix[2, :2] + matrix[2, 2]
     if not (np.all(w > 0.0) or np.all(w < 0.0)):
-        raise InputError(f"{source}: sends part of the first image to infinity, expected a view of all of it")
+        raise InputError(
+            f"{source}: maps a part of the first image to infinity, expected a homography that maps all of it"
+        )
     scaled = matrix / w.mean()
     if np.linalg.det(scaled) < 0.0:
-        raise InputError(f"{source}: mirrors the image, expected a view of the same side")
+        raise InputError(f"{source}: mirrors the image, expected a homography without reflection")
     return np.asarray(scaled)
 
 
 def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
-    """Read a homography (3, 3) for a first image of ``shape``: nine numbers as text, or a matrix in OpenCV's XML format.
+    """Read a homography (3, 3) from a file with nine numbers, or with a matrix in OpenCV's XML format.
 
-    Raises InputError if it cannot be read or :func:`checked` rejects it.
+    ``shape``: of the first image. Raises InputError if the file cannot be read or :func:`checked` rejects the matrix.
     """
     text = read_text(path)
     if text.lstrip().startswith("<"):
@@ -128,9 +134,9 @@ def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """A first image, and others with the homographies (3, 3) [px] from the first to them.
+    """A first image, other images, and the homographies (3, 3) [px] from the first image to each other image.
 
-    ``change``: what differs between the images; ``amounts``: its amount in each of the others.
+    ``change``: the dominant change, such as "scale change". ``amounts``: the amount of the change in each other image.
     """
 
     name: str
@@ -142,9 +148,9 @@ class Sequence:
 
 
 def find_sequences(paths: Several[Path]) -> list[Sequence]:
-    """The sequences of ``paths``: folders of one sequence, folders of such folders, and photographs, which are warped.
+    """Read sequences of images. A path is a folder with a sequence, a folder of such folders, or a photograph, which is warped.
 
-    Raises InputError for anything else, or damaged files.
+    Raises InputError for other paths and for damaged files.
     """
     sequences: list[Sequence] = []
     for path in paths:
@@ -159,7 +165,7 @@ def find_sequences(paths: Several[Path]) -> list[Sequence]:
             raise InputError(f"{path}: there is no such image or folder")
     names = [sequence.name for sequence in sequences]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{twice[0]}: several sequences have that name, expected one each")
+        raise InputError(f"{twice[0]}: several sequences have this name, expected different names")
     return sequences
 
 
@@ -183,11 +189,12 @@ def read_sequence(folder: Path) -> Sequence:
 
 
 def warped(photograph: Image, source: Path) -> list[Sequence]:
-    """A photograph reduced by :data:`ZOOMS`, and rotated by :data:`ROTATIONS`.
+    """Make two sequences from a photograph: one with the photograph reduced by :data:`ZOOMS`, one with it rotated by
+    :data:`ROTATIONS`.
 
-    A reduced photograph (area averaging) is placed in the middle of the mirrored original: a more distant camera sees more of the
-    surroundings, so that fewer of its points are on the scene. Rotated images are cropped to the largest square without a border
-    in any of them; the first image is the same square. If the photograph is too small, raises InputError, which names ``source``.
+    A reduced photograph (area averaging) is placed in the middle of the mirrored original. This imitates a more distant camera,
+    which has many points outside of the scene. Rotated images, and their first image, are cropped to the largest square that has no
+    border in any of them. Raises InputError with the file ``source`` if the photograph is too small.
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:
@@ -198,6 +205,7 @@ def warped(photograph: Image, source: Path) -> list[Sequence]:
 
 
 def _zoomed(photograph: Image, name: str) -> Sequence:
+    """Return the sequence of reduced photographs."""
     height, width = photograph.shape[:2]
     images, homographies = [], []
     for zoom in ZOOMS:
@@ -215,12 +223,13 @@ def _zoomed(photograph: Image, name: str) -> Sequence:
 
 
 def _rotated(photograph: Image, name: str) -> Sequence:
+    """Return the sequence of rotated photographs."""
     height, width = photograph.shape[:2]
     side = int(min(height, width) / np.sqrt(2.0))
     centre, middle = np.array((width - 1.0, height - 1.0)) / 2.0, (side - 1.0) / 2.0
 
     def turned(degrees: float) -> tuple[Image, Array]:
-        """The rotated square, and the map from the photograph to it."""
+        """Return the rotated square image, and the matrix (3, 3) from the photograph to it."""
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
         matrix = np.eye(3)
         matrix[:2, :2] = ((c, -s), (s, c))
@@ -238,7 +247,7 @@ def _rotated(photograph: Image, name: str) -> Sequence:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    """The files ``imgK.*`` of a folder by K. Raises InputError for several files with one K."""
+    """Return the files ``imgK.*`` of a folder by the number K. Raises InputError if several files have the same number."""
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"img(\d+)\.\w+", path.name)
@@ -251,7 +260,8 @@ def _images(folder: Path) -> dict[int, Path]:
 
 
 def _change(views: Several[ViewChange]) -> tuple[str, tuple[float, ...]]:
-    """The dominant change of a sequence, from the geometry of its pairs; blur and light leave none, then images are numbered."""
+    """Return the dominant change of a sequence, and its amount in each view. If no view changes much, as with blur or light, the
+    amounts are the numbers of the images."""
     zooms = [max(v.zoom, 1.0 / v.zoom) for v in views]
     if max(v.tilt for v in views) > _TILTED:
         return VIEWPOINT, tuple(v.tilt for v in views)

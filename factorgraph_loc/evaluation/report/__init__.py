@@ -1,4 +1,4 @@
-"""A report of results as one self-contained HTML file."""
+"""A report of the results of an experiment as one HTML file that needs no other file."""
 
 from factorgraph_loc.evaluation.report.page import write_report
 from factorgraph_loc.evaluation.report.tracks import Scene

@@ -1,6 +1,6 @@
-"""One self-contained HTML file of an experiment's results, with all that is needed to repeat them.
+"""The report of an experiment as one HTML file, with the configuration that is needed to repeat the experiment.
 
-The text is in ``drawing/templates/report.html``; here are the values that it shows.
+The text of the page is in ``drawing/templates/report.html``. This module computes the values that the text contains.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,8 +18,8 @@ from factorgraph_loc.evaluation.scores import REPORT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.files.models import write_text
 
-SHOWN = 8  # variants whose trajectories are visible initially
-_SWEPT = 3  # metrics that are plotted over a swept setting
+SHOWN = 8  # maximum number of variants whose trajectories are visible initially
+_SWEPT = 3  # maximum number of metrics that are plotted over a swept setting
 
 
 def write_report(
@@ -34,12 +34,16 @@ def write_report(
     damaged: Sequence[str] = (),
     versions: Mapping[str, str] | None = None,
 ) -> None:
-    """Write the page ``out``.
+    """Write the report to the file ``out``.
 
-    ``rows``: one per run, with key, log, estimator, seed, status (ok, failed), reason, scores, and optionally label, sensors,
-    kind (of a failure), warnings and ``sweep.*``. ``metrics``: scores to show. ``baseline``: the label that the others are
-    compared with; the first without one, or if no run has it. ``experiment``: the experiment file as plain values. ``damaged``:
-    descriptions of runs with unusable results. ``versions``: of the software used. Raises InputError for no rows.
+    ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional columns are
+    label, sensors, kind (of a failure), warnings and ``sweep.*``.
+    ``runs``: returns the result files of a run by its key. ``metrics``: keys of the scores to show.
+    ``baseline``: label with which the others are compared. If it is None or no run has it, the first label is used.
+    ``experiment``: content of the experiment file. ``damaged``: descriptions of runs with unusable results.
+    ``versions``: version of each used software by name.
+
+    Raises InputError if there are no rows.
     """
     if not len(rows):
         raise InputError(f"there are no runs to report on{f' ({len(damaged)} are damaged)' if damaged else ''}")
@@ -80,7 +84,7 @@ def write_report(
 
 
 def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dict[str, Any]:
-    """Values from the rows of the runs alone."""
+    """Return the values of the page that depend only on the rows of the runs."""
     best = [results.compare(metric) for metric in metrics]
     against = [results.compare(metric, baseline) for metric in metrics]
     times = _known(results, tuple(TIMINGS), whole=False)
@@ -105,7 +109,7 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
 
 
 def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
-    """Values from the files of the runs."""
+    """Return the values of the page that are read from the files of the runs. ``metric``: selects the drawn run among seeds."""
     read = read_runs(results, metric, runs)
     return {
         "tracks": read.tracks,
@@ -120,7 +124,7 @@ def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
 
 
 def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
-    """The metrics that have any score; with ``whole`` all of them if there is none."""
+    """Return the metrics of which any run has a score. If there is none, return all if ``whole`` is set."""
     known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return known or ([metric_of(k) for k in keys] if whole else [])
 

@@ -1,4 +1,4 @@
-"""The charts of the page, drawn as SVG."""
+"""The charts of the report of an experiment, drawn as SVG. A variant is an estimator with its sensors and swept settings."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ _NAME = 40  # maximum length of a name at an axis
 
 @dataclass(frozen=True)
 class _Row:
-    """The ``values`` of the logs of a variant, their ``mark`` (median or mean), and the ``band`` expected of the mark."""
+    """A row of a chart of dots: a variant, its ``values`` on each log, and a ``mark`` at their median or mean.
+
+    ``band``: the interval in which the mark is expected, None for none.
+    """
 
     name: str
     colour: str
@@ -42,7 +45,10 @@ class _Row:
 
 
 def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture | None:
-    """Ratio of each variant to the reference on each log, an axis for each metric; None if there are no ratios."""
+    """Plot the ratio of the score of each variant to that of the reference variant on each log. A panel for each metric.
+
+    Return None if there are no ratios.
+    """
     panels = {}
     for c in comparisons:
         rows = []
@@ -60,7 +66,11 @@ def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture
 def consistency(
     results: Results, trust: Mapping[str, tuple[float, float, float]], nees: Mapping[tuple[str, str], float]
 ) -> Picture | None:
-    """Mean NEES on each log, the mean over logs, and its 95 % band; None without any."""
+    """Plot the mean NEES of each variant on each log, the mean over logs, and its 95 % interval for correct covariances.
+
+    ``trust``: by variant, the mean over logs and the bounds of the interval. ``nees``: by variant and log, the mean NEES. Return
+    None if there are no values.
+    """
     rows = []
     for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
         if variant in trust:
@@ -72,7 +82,7 @@ def consistency(
 
 
 def times(results: Results, metric: Metric) -> Picture | None:
-    """A time, median over seeds, on each log; None without any."""
+    """Plot a computing time of each variant on each log, as the median over seeds. Return None if there are no times."""
     rows = []
     for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
         by_log = [
@@ -85,7 +95,10 @@ def times(results: Results, metric: Metric) -> Picture | None:
 
 
 def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Array]]) -> Picture | None:
-    """Distribution of the position errors of each kind of estimate, over the logs that all variants with errors have."""
+    """Plot the distribution of position errors of causal and final poses, over the logs on which all variants have errors.
+
+    ``errors``: by kind of trajectory, variant and log, quantiles of the position error [m]. Return None if there are no errors.
+    """
     figure, axes = grid(1, len(KINDS), 5.5)
     for axis, kind in zip(axes[0], KINDS, strict=True):
         met = {variant for variant, _ in errors[kind]}
@@ -95,7 +108,7 @@ def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str]
                 distribution(
                     axis, np.concatenate([errors[kind][variant, log] for log in common]), label=variant, **style
                 )
-        axis.set(xlabel="position error [m]", ylabel="share of times below")
+        axis.set(xlabel="position error [m]", ylabel="fraction of smaller errors")
         axis.set_title(f"{kind}, {len(common)} log{'' if len(common) == 1 else 's'}")
     if not any(axis.lines for axis in axes[0]):
         return None
@@ -105,7 +118,7 @@ def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str]
 
 
 def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
-    """Each metric over the values of each swept setting that is a number; None if there are none."""
+    """Plot each metric over the values of each swept setting. Return None if no swept setting is a number."""
     every = {(column, m): sweep(results, column, m) for column in results.sweeps for m in metrics}
     panels = {key: lines for key, lines in every.items() if any(len(points) > 1 for points in lines.values())}
     if not panels:
@@ -122,8 +135,10 @@ def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
 
 
 def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple[float, float, float, float]]]:
-    """Value of the setting, pooled metric, and the bounds of its interval or range, by value. There is a line for each label
-    and combination of the other swept settings.
+    """Return the points of the lines of a metric over a swept setting. ``column``: the column of the setting.
+
+    There is a line for each label and each combination of the other swept settings. A point consists of the value of the setting,
+    the pooled metric, and the lower and upper bound of its interval, or of its range if it has no interval.
     """
     lines: dict[str, dict[float, dict[str, dict[int, float | None]]]] = {}
     for variant in results.variants:
@@ -140,6 +155,7 @@ def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple
 def _points(
     metric: Metric, by_value: Mapping[float, dict[str, dict[int, float | None]]]
 ) -> Iterator[tuple[float, float, float, float]]:
+    """Yield the points of a line of :func:`sweep`. ``by_value``: scores by value of the setting, log and seed."""
     for value, scores in sorted(by_value.items()):
         figure = pooled(scores, rms=metric.rms)
         if figure is not None:
@@ -149,13 +165,13 @@ def _points(
 
 
 def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: str) -> str:
-    """The label and the swept settings other than that of the axis."""
+    """Return the name of a line: the label of a run, and its swept settings except the one on the axis."""
     columns = [c for c in results.sweeps if c != column and row.get(c) is not None]
     return ", ".join([results.variants[variant], *(f"{short_name(c)} {row[c]}" for c in columns)])
 
 
 def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with so many axes, in two columns if there are several, each ``height`` high."""
+    """Return a figure and its ``count`` axes, in two columns if there are several. ``height``: of each, in units of 100 px."""
     columns = min(count, 2)
     figure, axes = grid(math.ceil(count / columns), columns, height * math.ceil(count / columns))
     for axis in axes.flat[count:]:
@@ -164,7 +180,10 @@ def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
 
 
 def _dots(panels: Mapping[str, Sequence[_Row]], title: str, mark: str, *, ideal: float | None = None) -> Picture | None:
-    """Rows of dots on a logarithmic axis, in panels by their title."""
+    """Plot rows of dots on a logarithmic axis. ``panels``: the rows of each panel by its title. Return None without panels.
+
+    ``title``: label of the axis. ``mark``: label of the marks of the rows. ``ideal``: ideal value, drawn as a line.
+    """
     if not panels:
         return None
     figure, axes = _panels(len(panels), 1.6 + 0.4 * max(map(len, panels.values())))
@@ -185,7 +204,7 @@ def _dots(panels: Mapping[str, Sequence[_Row]], title: str, mark: str, *, ideal:
 
 
 def _tick(axis: Axes) -> None:
-    """Label a logarithmic axis with plain numbers, also within a decade."""
+    """Label a logarithmic axis with numbers without exponent, also between powers of ten."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator  # noqa: PLC0415
 
     low, high = axis.get_xlim()

@@ -1,4 +1,7 @@
-"""Results of an experiment for its page: figures of runs, and the trajectories, errors and configurations in their files."""
+"""The results of an experiment for its report: scores of runs, and the trajectories, errors and configurations in their files.
+
+A variant is an estimator with its sensors and the swept settings of the estimator.
+"""
 
 from __future__ import annotations
 
@@ -28,23 +31,23 @@ from factorgraph_loc.io.results import CONFIG, Estimates, ResultFiles
 from factorgraph_loc.model.scoring import KINDS
 from factors.se2 import Array
 
-POSES = 120_000  # on the page, shared by all trajectories
-FEWEST, MOST = 60, 1000  # bounds for one trajectory
-TRACKS = 1000  # maximum number of runs with trajectories; further logs appear in tables only
+POSES = 120_000  # maximum number of poses on the page, which all trajectories share
+FEWEST, MOST = 60, 1000  # minimum and maximum number of poses of one trajectory
+TRACKS = 1000  # maximum number of runs with trajectories; logs of further runs are in tables only
 
 
 Runs = Callable[[str], tuple[ResultFiles, Scene | None]]
-"""The files of a successful run, and the map of its log if known, by the key of the run."""
+"""Returns the files of a successful run, and the map of its log or None, by the key of the run."""
 
 
 @dataclass
 class RunData:
-    """The data read from all runs.
+    """The data that are read from the files of all runs.
 
-    ``tracks``: by log, its scene and thinned trajectories, as plain values. ``errors``: by kind, then by variant and log,
-    quantiles of the position error [m]. ``nees``: by variant and log, mean NEES of the causal poses; ``trust``: by variant, the
-    mean over logs and its 95 % band for correct covariances. ``configs``: the configuration of each drawn run, by its
-    description.
+    ``tracks``: by log, its map and trajectories with a reduced number of poses.
+    ``errors``: by kind of trajectory (causal, final), variant and log, quantiles of the position error [m].
+    ``nees``: by variant and log, the mean NEES of the causal poses. ``trust``: by variant, the mean of ``nees`` over logs and the
+    bounds of its 95 % interval for correct covariances. ``configs``: the configuration of each drawn run by a description.
     """
 
     tracks: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -55,7 +58,7 @@ class RunData:
 
 
 def read_runs(results: Results, metric: str, runs: Runs) -> RunData:
-    """Read the files of all successful runs; of several seeds the trajectory with the median ``metric`` is drawn."""
+    """Read the files of all successful runs. Of several seeds, the run with the median of the score ``metric`` is drawn."""
     data = RunData()
     chosen = {
         (variant, log): row
@@ -105,7 +108,7 @@ def read_runs(results: Results, metric: str, runs: Runs) -> RunData:
 
 
 def _series(files: ResultFiles) -> dict[str, Estimates]:
-    """The estimates of a run by kind, without kinds that it lacks."""
+    """Return the estimates of a run by kind (causal, final), without kinds that have no poses."""
     return {kind: estimates for kind, estimates in files.estimates().items() if len(estimates.trajectory)}
 
 
@@ -113,8 +116,10 @@ def _series(files: ResultFiles) -> dict[str, Estimates]:
 class MetricComparison:
     """Comparison of the variants by one metric.
 
-    ``pooled``: by variant, None without scores; ``best``: the best of the variants that have all logs; ``contrasts``: of the
-    others with ``reference``, a variant; ``p``: p values corrected for their number."""
+    ``pooled``: by variant, the pooled score; variants without scores are missing. ``best``: the best of the variants that have a
+    score on every log, None if there is none. ``reference``: the variant with which the others are compared. ``contrasts``: by
+    variant, the difference from the reference. ``p``: by variant, the p value, corrected for the number of comparisons.
+    """
 
     metric: Metric
     pooled: dict[str, Pooled]
@@ -125,8 +130,8 @@ class MetricComparison:
 
     @property
     def tied(self) -> list[str]:
-        """The variants that a test has not found to differ from the reference, where it could have."""
-        return [v for v, p in self.p.items() if self.can_tell and p is not None and not self.is_significant(v)]
+        """The variants that do not differ significantly from the reference, although the test has enough data."""
+        return [v for v, p in self.p.items() if self.has_power and p is not None and not self.is_significant(v)]
 
     @property
     def different(self) -> list[str]:
@@ -135,28 +140,28 @@ class MetricComparison:
 
     @property
     def incomplete(self) -> list[str]:
-        """The variants that lack some of the logs of the best."""
+        """The variants that have no score on some of the logs of the best variant."""
         assert self.best is not None
         return [v for v, c in self.contrasts.items() if c.count < self.pooled[self.best].count]
 
     @property
-    def can_tell(self) -> bool:
-        """Whether any difference could be significant, which needs enough logs for the number of comparisons."""
+    def has_power(self) -> bool:
+        """True if a difference can be significant, which requires enough logs for the number of comparisons."""
         tested = [c.count for name, c in self.contrasts.items() if self.p[name] is not None]
         return bool(tested) and least_p(max(tested)) * len(tested) < SIGNIFICANT
 
     def is_significant(self, variant: str) -> bool:
-        """Whether a variant differs significantly from the reference."""
+        """True if a variant differs significantly from the reference."""
         p = self.p.get(variant)
         return p is not None and p < SIGNIFICANT
 
 
 class Results:
-    """The rows of an experiment, by variant and log.
+    """The runs of an experiment by variant and log.
 
-    ``variants``: the label of each by its name on the page, in the order of the rows; ``logs``: the name of each log by its
-    label on the page; ``rows``: all of them, as dictionaries. For each value of a swept setting of the simulation, a simulated
-    log is listed separately; intervals and tests count these as one.
+    ``variants``: the label of each variant, by its name on the page. ``logs``: the name of each log, by its name on the page.
+    ``rows``: all runs as dictionaries. ``sweeps``: columns of the swept settings that vary. A simulated log appears once for each
+    value of a swept setting of the simulation. Intervals and tests count these variants of a log as one log.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
@@ -174,26 +179,26 @@ class Results:
             self._runs.setdefault((variant, log), []).append(row)
 
     def runs(self, variant: str, log: str) -> list[Row]:
-        """The rows of a variant on a log."""
+        """Return the runs of a variant on a log."""
         return self._runs.get((variant, log), [])
 
     def of(self, variant: str) -> list[Row]:
-        """The rows of a variant."""
+        """Return the runs of a variant on all logs."""
         return [row for log in self.logs for row in self.runs(variant, log)]
 
     def scores(self, metric: str, variant: str) -> dict[str, dict[int, float | None]]:
-        """The scores of a variant by log and seed, None for failed runs and missing scores."""
+        """Return a score of a variant by log and seed, None for failed runs and missing scores."""
         by_log = {log: {row["seed"]: score(row, metric) for row in self.runs(variant, log)} for log in self.logs}
         return {log: seeds for log, seeds in by_log.items() if seeds}
 
     def representative(self, variant: str, log: str, metric: str) -> Row | None:
-        """The run that represents all seeds: that with the median score, or the first successful one."""
+        """Return the run with the median score over the seeds. If no run has a score, return the first successful run or None."""
         well = [row for row in self.runs(variant, log) if row["status"] == "ok"]
         ranked = sorted((s, i) for i, row in enumerate(well) if (s := score(row, metric)) is not None)
         return well[ranked[(len(ranked) - 1) // 2][1]] if ranked else next(iter(well), None)
 
     def compare(self, metric: Metric, reference: str | None = None) -> MetricComparison:
-        """Compare all variants with a reference, by default with the best and without intervals of the differences."""
+        """Compare all variants with a ``reference`` variant. If it is None, compare with the best variant, without intervals."""
         scores = {name: self.scores(metric.key, name) for name in self.variants}
         figures = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
         best = _best(metric, scores, figures)
@@ -210,7 +215,7 @@ class Results:
         return MetricComparison(metric, figures, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
     def unscored(self) -> list[str]:
-        """Logs with too short a reference to be scored."""
+        """Return the logs on which a run has scored poses, but too few for scores."""
         kinds = [f"{kind}.scored" for kind in KINDS]
         return [
             log
@@ -224,21 +229,24 @@ class Results:
         ]
 
     def _pool(self, metric: Metric, variant: str, scores: ByLog) -> Pooled | None:
+        """Return the pooled score of a variant, and keep it for later calls. None if there are no scores."""
         key = (metric.key, variant)
         if key not in self._pooled:
             self._pooled[key] = pooled(scores, rms=metric.rms, alike=self.logs)
         return self._pooled[key]
 
     def _variant(self, row: Row, several: set[str]) -> str:
+        """Return the name of the variant of a run. ``several``: labels that ran with several sets of sensors."""
         label = label_of(row)
         sensors = [(row["sensors"] or "the rig's sensors").replace(",", ", ")] if label in several else []
         return _named(label, [*sensors, *self._swept(row, of_log=False)])
 
     def _log(self, row: Row) -> str:
+        """Return the name of the log of a run on the page, with the swept settings of the simulation."""
         return _named(str(row["log"]), self._swept(row, of_log=True))
 
     def _swept(self, row: Row, *, of_log: bool) -> list[str]:
-        """The swept settings of a run, of its log or of its estimator, as ``name value``."""
+        """Return the swept settings of a run as "name value": those of its simulated log (``of_log``) or of its estimator."""
         known = [c for c in self.sweeps if row.get(c) is not None and of_log == c.startswith(f"{SWEEP}{SIMULATION}.")]
         return [f"{short_name(c)} {f'{row[c]:g}' if isinstance(row[c], float) else row[c]}" for c in known]
 
@@ -248,14 +256,14 @@ def _named(name: str, parts: Sequence[str]) -> str:
 
 
 def short_name(key: str) -> str:
-    """The last word of a dotted name."""
+    """Return the last part of a dotted name, with blanks in place of underscores."""
     return key.rpartition(".")[2].replace("_", " ")
 
 
 def score(row: Row, metric: str) -> float | None:
-    """The score of a run; None if it failed, has none, or was scored at too few poses.
+    """Return a score of a run. Return None if the run failed, has no such score, or has too few scored poses.
 
-    Update times of offline estimators are ignored.
+    Update times of batch estimators are None, because their updates only collect measurements.
     """
     kind = metric.partition(".")[0]
     if metric.startswith("timing.update") and row.get("time_to_localized") is None:
@@ -268,7 +276,7 @@ def score(row: Row, metric: str) -> float | None:
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
-    """The best variant among those with a score of each log that any variant has."""
+    """Return the best of the variants that have a score on every log on which any variant has one. None if there is none."""
     if metric.better is None or not figures:
         return None
     complete = {
@@ -282,6 +290,7 @@ def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Poo
 
 
 def _labels_with_several_sensors(rows: Sequence[Row]) -> set[str]:
+    """Return the labels that ran with several sets of sensors."""
     met: dict[str, set[str | None]] = {}
     for row in rows:
         met.setdefault(label_of(row), set()).add(row.get("sensors"))

@@ -1,4 +1,7 @@
-"""The tables of the page, whose figures have an interval, a range, or a count; and cautions about them."""
+"""The tables of the report of an experiment, and cautions about them. A cell has a score and its interval, range or count.
+
+A variant is an estimator with its sensors and swept settings.
+"""
 
 from collections.abc import Sequence
 from statistics import median
@@ -18,13 +21,16 @@ _NONE = "–"
 
 
 def name(results: Results, variant: str) -> Cell:
-    """The name of a variant, with its colour."""
+    """Return a cell with the name of a variant and a mark in its colour."""
     return Cell(variant, colour=list(results.variants).index(variant))
 
 
 def overview(results: Results, comparisons: Sequence[MetricComparison]) -> Table:
-    """All logs together: a row per variant, a column per metric, the best of each marked, and the number of successful runs."""
-    # the time to localization is of interest for unknown starts only
+    """Return the table of scores pooled over all logs, with a row for each variant and a column for each metric.
+
+    The best variant of each metric is marked. Further columns have the numbers of localized runs, scored poses and successful runs.
+    """
+    # the number of localized runs is shown only if a run had to be localized first
     is_sought = any(row.get("time_to_localized") for row in results.rows)
     rows = []
     for variant in results.variants:
@@ -39,7 +45,10 @@ def overview(results: Results, comparisons: Sequence[MetricComparison]) -> Table
 
 
 def differences(results: Results, comparisons: Sequence[MetricComparison]) -> Table:
-    """Differences of each variant from the baseline with interval, corrected p, and effect; grey if not significant."""
+    """Return the table of differences between each variant and the baseline, with interval, corrected p value and effect size.
+
+    A difference that is not significant is grey.
+    """
     baseline = comparisons[0].reference
     rows = []
     for variant in results.variants:
@@ -49,7 +58,7 @@ def differences(results: Results, comparisons: Sequence[MetricComparison]) -> Ta
 
 
 def by_log(results: Results, metric: Metric) -> Table:
-    """A row per log, a column per variant; the best of each row marked."""
+    """Return the table of a score with a row for each log and a column for each variant. The best of each row is marked."""
     rows = []
     for log in results.logs:
         scores = {v: _known(results.runs(v, log), metric) for v in results.variants}
@@ -62,7 +71,7 @@ def by_log(results: Results, metric: Metric) -> Table:
 
 
 def timing(results: Results, metrics: Sequence[Metric]) -> Table:
-    """Median over runs, and the range."""
+    """Return the table of computing times: for each variant and metric the median over runs, and the range."""
     rows = []
     for variant in results.variants:
         cells = []
@@ -75,7 +84,7 @@ def timing(results: Results, metrics: Sequence[Metric]) -> Table:
 
 
 def failures(results: Results) -> Table:
-    """Failed runs, grouped by reason."""
+    """Return the table of failed runs, grouped by estimator and reason."""
     failed = [row for row in results.rows if row["status"] != "ok"]
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in failed:
@@ -89,7 +98,7 @@ def failures(results: Results) -> Table:
 
 
 def warnings(results: Results) -> Table:
-    """Warnings, and the runs concerned."""
+    """Return the table of warnings, with the runs that have each of them."""
     rows: list[list[str | int]] = []
     for text, concerned in by_text(results.rows).items():
         where = dict.fromkeys(f"{row['log']}, {label_of(row)}" for row in concerned)
@@ -98,40 +107,43 @@ def warnings(results: Results) -> Table:
 
 
 def cautions(results: Results, comparisons: Sequence[MetricComparison]) -> list[str]:
-    """Sentences on logs that are not scored, and on differences that cannot become significant."""
+    """Return sentences about logs that are not scored, and about differences that cannot be significant."""
     said = []
     if poor := results.unscored():
-        said.append(f"Fewer than {FEWEST_SCORED} poses of {listed(poor)} have a reference: nothing is scored there.")
+        said.append(
+            f"Fewer than {FEWEST_SCORED} poses of {listed(poor)} have a reference, so these logs have no scores."
+        )
     contrasts = [c for comparison in comparisons for c in comparison.contrasts.values()]
     if contrasts and all(c.p is None for c in contrasts):
         units = f"{ENOUGH_LOGS} logs, or {ENOUGH_LOGS} seeds of one log"
-        said.append(f"With fewer than {units}, nothing is tested: read the figures log by log.")
-    untold = [c for c in comparisons if not c.can_tell and any(p is not None for p in c.p.values())]
-    if untold:
-        tested = [c for c in untold[0].contrasts.values() if c.p is not None]
+        said.append(f"With fewer than {units}, no difference is tested. Compare the scores on each log.")
+    weak = [c for c in comparisons if not c.has_power and any(p is not None for p in c.p.values())]
+    if weak:
+        tested = [c for c in weak[0].contrasts.values() if c.p is not None]
         most = max(tested, key=lambda c: c.count)
         few = f"{most.count} {most.units} are too few for {len(tested)} comparisons"
-        said.append(f"{few}: whatever the difference, it cannot become significant.")
+        said.append(f"{few}: no difference, however large, can be significant.")
     if all(score(row, c.metric.key) is None for row in results.rows for c in comparisons):
         said.append("No run has any of the requested scores.")
     return said
 
 
 def p_value(p: float | None) -> str:
-    """A formatted p value."""
+    """Return a p value as text, or a dash if it is None."""
     if p is None:
         return _NONE
     return "< 0.001" if p < 0.001 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
 def uncertainty(metric: Metric, figure: Pooled) -> str:
-    """The interval, or else the range: ``[0.1, 0.2]`` or ``0.1 … 0.2``; empty for a single value."""
+    """Return the interval of a pooled score, such as ``[0.1, 0.2]``, or else its range ``0.1 … 0.2``. "" for a single value."""
     if figure.low is not None and figure.high is not None:
         return f"[{metric.text(figure.low)}, {metric.text(figure.high)}]"
     return metric.range(figure.least, figure.most) if figure.count > 1 else ""
 
 
 def _pooled_cell(c: MetricComparison, variant: str) -> Cell:
+    """Return a cell with the pooled score of a variant. ● marks the best, ○ one that does not differ significantly from it."""
     figure = c.pooled.get(variant)
     if figure is None:
         return Cell(_NONE)
@@ -147,6 +159,7 @@ def _pooled_cell(c: MetricComparison, variant: str) -> Cell:
 
 
 def _difference_cell(c: MetricComparison, variant: str) -> Cell:
+    """Return a cell with the difference of a variant from the reference, its interval or range, and the test."""
     contrast = c.contrasts.get(variant)
     if contrast is None:
         return Cell(_NONE, kind="grey")
@@ -160,6 +173,8 @@ def _difference_cell(c: MetricComparison, variant: str) -> Cell:
 
 
 def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float | None) -> Cell:
+    """Return a cell with a score on one log. ``known``: scores of the runs. ``planned``: number of all runs. ``best``: best score
+    of the row."""
     if not known:
         return Cell(_NONE)
     value = float(average(known, rms=metric.rms))
@@ -175,11 +190,12 @@ def _first(names: Sequence[str]) -> str:
 
 
 def _poses(runs: Sequence[Row]) -> Cell:
-    """Number of scored poses, as a range over the runs."""
+    """Return a cell with the number of scored poses, as a range over the runs."""
     return Cell(counted(runs) or _NONE)
 
 
 def _share(outcomes: Sequence[bool]) -> Cell:
+    """Return a cell with the number of successes among ``outcomes``, and the 95 % interval of their rate."""
     low, high = wilson(sum(outcomes), len(outcomes))
     return Cell(f"{sum(outcomes)} of {len(outcomes)}", [f"[{100 * low:.0f}, {100 * high:.0f}] %"])
 

@@ -1,5 +1,7 @@
-"""Trajectories and errors of runs, and their background: map and reference of the log. They are decimated and rounded to limit
-the size of the page."""
+"""The trajectories and errors of runs in a report, and their background: map and reference of the log.
+
+Poses are thinned out and rounded to limit the size of the page.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +20,19 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array
 
-LEVELS = np.linspace(0.0, 1.0, 51)  # of the plotted distribution of errors
-_POSES = 1500  # of the reference, in total
-_POINTS = 1500  # of a map of points
+LEVELS = np.linspace(0.0, 1.0, 51)  # probabilities of the quantiles of errors
+_POSES = 1500  # maximum number of poses of the reference
+_POINTS = 1500  # maximum number of points of a map of points
 
 Place = tuple[float, float]
 
 
 class Scene(BaseModel, frozen=True, allow_inf_nan=False):
-    """Map and reference in the world frame [m].
+    """Map and reference of a log in the world frame [m].
 
-    ``walls`` as x1, y1, x2, y2; ``layers`` of the map, such as landmarks, tags and points; ``reference``: pieces between long
-    gaps. ``t0_ns``: the log's start, absolute."""
+    ``walls``: endpoints x1, y1, x2, y2. ``layers``: by layer of the map, such as landmarks or tags, the positions of its objects.
+    ``reference``: positions in pieces, which are divided at long gaps. ``t0_ns``: timestamp of the log's start.
+    """
 
     walls: list[tuple[float, float, float, float]]
     layers: dict[str, list[Place]]
@@ -38,7 +41,7 @@ class Scene(BaseModel, frozen=True, allow_inf_nan=False):
 
     @classmethod
     def of(cls, log: Log) -> Scene:
-        """The scene of a log to a millimetre, with objects where estimators assume them."""
+        """Return the scene of a log, rounded to a millimetre, with objects at the positions that estimators use."""
         return cls(
             walls=_plain(np.array(log.world.walls, dtype=float).reshape(-1, 4)),
             layers={layer.layer: _plain(_thinned(layer)) for layer in marks(log)},
@@ -68,7 +71,7 @@ def _plain(values: Array) -> list[Any]:
 
 
 def sigma(estimates: Estimates) -> Array:
-    """Twice the standard deviation (N,) [m] in the least certain direction."""
+    """Return twice the standard deviation (N,) [m] of the position in its least certain direction."""
     assert estimates.trajectory.covariances is not None
     xx, xy, yy = (estimates.trajectory.covariances[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     with np.errstate(invalid="ignore"):
@@ -76,10 +79,10 @@ def sigma(estimates: Estimates) -> Array:
 
 
 def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
-    """About ``count`` poses as plain values, to a millimetre and a millisecond; None where unknown.
+    """Select about ``count`` poses of a trajectory, and return them as lists of rounded numbers, None for unknown ones.
 
-    ``t``, ``x``, ``y``, ``e`` (position error) and ``s`` (sigma). Of each interval of time there are the poses with the smallest
-    and with the largest error.
+    The lists are ``t`` [s], ``x``, ``y`` [m], ``e`` (position error [m]) and ``s`` (see :func:`sigma`). The trajectory is divided
+    into intervals, and the poses with the smallest and the largest error of each interval are selected.
     """
     error, trajectory = estimates.errors["error_position"], estimates.trajectory
     x, y, _ = trajectory.poses.T
@@ -92,13 +95,16 @@ def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
 
 
 def quantiles(errors: Sequence[Array]) -> Array:
-    """Quantiles of the pooled errors of several runs at ``LEVELS``; empty without any error."""
+    """Return the quantiles at :data:`LEVELS` of the errors of several runs together. Empty if there are no errors."""
     known = _known(np.concatenate(errors)) if errors else np.empty(0)
     return np.quantile(known, LEVELS) if len(known) else known
 
 
 def consistency(estimates: Estimates) -> tuple[float, float, int] | None:
-    """Mean NEES, its effective number of independent values, and the degrees of freedom; None without any."""
+    """Return the mean NEES of a trajectory, the effective number of independent values in it, and the degrees of freedom.
+
+    Return None if fewer than two NEES are known.
+    """
     nees = _known(estimates.errors["nees"])
     dof = 3 if len(_known(estimates.errors["error_heading"])) else 2
     return (float(np.mean(nees)), independent_count(nees), dof) if len(nees) > 1 else None
@@ -109,7 +115,10 @@ def _known(values: Array) -> Array:
 
 
 def _thin(error: Array, count: int) -> NDArray[np.int64]:
-    """About ``count`` indices of N, including the first and the last; evenly spread where no error is known."""
+    """Return about ``count`` indices of poses: those with the smallest and largest error (N,) of each interval, and both ends.
+
+    They are evenly spaced where no error is known.
+    """
     if len(error) <= count:
         return np.arange(len(error))
     size = -(-2 * len(error) // count)

@@ -1,3 +1,3 @@
-"""Scores of any trajectory against any other: association, alignment, absolute and relative errors, and their report."""
+"""Scores of a trajectory against any other trajectory: association, alignment, absolute and relative errors, and their report."""
 
 __all__ = ["association", "page", "score"]

@@ -20,14 +20,17 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factors import se2
 from factors.se2 import Array, Integers
 
-FEWEST = 3  # pairs that define an alignment by least squares
-_DEGENERATE = 1e-12  # of a spread, relative to the largest one
+FEWEST = 3  # minimum number of pairs of poses for an alignment by least squares
+_DEGENERATE = 1e-12  # positions whose extent is smaller, relative to the largest one, are degenerate
 
 
 @dataclass(frozen=True)
 class Associated:
-    """N poses of an ``estimate`` and as many of the ``reference``. ``gaps``: indices of poses that follow a gap, which no relative
-    error spans; ``from_reference``: whether these are taken over the path of the reference, not of the estimate."""
+    """N poses of an ``estimate``, and the N poses of the ``reference`` with which they are compared.
+
+    ``gaps``: indices of poses that follow a gap. Relative errors are not computed across gaps. ``from_reference``: whether the
+    lengths of pieces for relative errors are measured along the reference instead of the estimate.
+    """
 
     estimate: PosePath
     reference: PosePath
@@ -38,13 +41,17 @@ class Associated:
 def associate(
     estimate: PosePath, reference: PosePath, how: Association, *, max_diff: float, max_gap: float
 ) -> Associated:
-    """Pairs of poses of both, at least one.
+    """Pair the poses of an estimate with poses of the reference.
 
-    By index if one trajectory has no stamps; both must then have equal lengths. ``nearest``: each pose of the shorter one (if
-    equal, of the estimate) with the pose of the other with the nearest stamp, at most ``max_diff`` [s] away. ``interpolate``: as
-    in scores of runs, see :mod:`factorgraph_loc.evaluation.pairing`; in the plane if one of both is planar.
+    If a trajectory has no timestamps, poses are paired by index, and both must have the same number of poses. Otherwise ``how`` is
+    one of these:
 
-    InputError without pairs.
+    - "nearest": each pose of the trajectory with fewer poses is paired with the pose of the other trajectory that is nearest in
+      time, if it is at most ``max_diff`` [s] away.
+    - "interpolate": the estimate is interpolated at timestamps of the reference, across gaps of at most ``max_gap`` [s], see
+      :mod:`factorgraph_loc.evaluation.pairing`. If one trajectory is planar, both are compared in the plane.
+
+    Raises InputError if there are no pairs.
     """
     if estimate.t_ns is None or reference.t_ns is None:
         if how != "nearest":
@@ -53,7 +60,7 @@ def associate(
         if len(estimate) != len(reference):
             raise InputError(
                 f"{estimate.name}: has {len(estimate)} poses, expected {len(reference)} as {reference.name} has: without stamps, "
-                "rows are matched by their number"
+                "poses are paired by their row number"
             )
         return Associated(estimate, reference, np.empty(0, dtype=np.int64), from_reference=False)
     if how == "nearest":
@@ -69,7 +76,7 @@ def associate(
 
 
 def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Integers, Integers]:
-    """Rows of the estimate and of the reference, for their stamps [s]."""
+    """Return the indices of paired poses of the estimate and of the reference. The arguments are their timestamps [s]."""
     swapped = len(estimate) > len(reference)
     short, long = (reference, estimate) if swapped else (estimate, reference)
     later = np.searchsorted(long, short).clip(max=len(long) - 1)
@@ -80,6 +87,7 @@ def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Intege
 
 
 def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> Associated:
+    """Pair interpolated poses of the estimate with poses of the reference, in the plane if one trajectory is planar."""
     t0_ns = int(estimate.stamps()[0])
     if estimate.is_planar or reference.is_planar:
         above, true = (Trajectory.of(path.seen_from_above(), t0_ns) for path in (estimate, reference))
@@ -91,9 +99,9 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
 def in_plane(
     pair: Pairs, estimate: Trajectory, reference: Trajectory, names: tuple[str, str] = ("", ""), t0_ns: int = 0
 ) -> Associated:
-    """The poses of a ``pair`` of two planar trajectories where both are known.
+    """Convert the paired poses of two planar trajectories. Pairs with an unknown pose are omitted and count as gaps.
 
-    Each other row is a gap, as is a pause of the reference. ``names``: of the estimate and the reference.
+    ``estimate``, ``reference``: the trajectories that were paired. ``names``: their names. ``t0_ns``: timestamp of the time 0.
     """
     known = np.isfinite(pair.poses[:, 0]) & np.isfinite(pair.truth[:, 0])
     kept = np.flatnonzero(known)
@@ -107,6 +115,7 @@ def in_plane(
 def _nothing_in_common(
     estimate: PosePath, reference: PosePath, how: Association, max_diff: float, max_gap: float
 ) -> InputError:
+    """Return the error for two trajectories without any pair, with the likely reason."""
     ours, theirs = estimate.seconds(), reference.seconds()
     if ours[0] > theirs[-1] or theirs[0] > ours[-1]:
         spans = (f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (ours, theirs))
@@ -124,14 +133,14 @@ def _nothing_in_common(
 
 @dataclass(frozen=True)
 class Similarity:
-    """The map of points ``scale * rotation @ p + translation``: ``rotation`` (3, 3), ``translation`` (3,) [m]."""
+    """The transformation ``scale * rotation @ p + translation`` of a point p. ``rotation`` (3, 3), ``translation`` (3,) [m]."""
 
     rotation: Array
     translation: Array
     scale: float = 1.0
 
     def of(self, path: PosePath) -> PosePath:
-        """The path in the frame that the similarity maps to."""
+        """Return a path with the transformed poses."""
         positions = self.scale * path.positions @ self.rotation.T + self.translation
         return replace(path, positions=positions, rotations=self.rotation @ path.rotations)
 
@@ -140,11 +149,16 @@ IDENTITY = Similarity(np.eye(3), np.zeros(3))
 
 
 def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Similarity:
-    """The similarity that moves the ``estimate`` onto the ``reference``, poses of equal number N.
+    """Return the transformation that moves the N poses of the ``estimate`` onto the N poses of the ``reference``.
 
-    ``none``: the identity. ``origin``: of the first pose onto the first. ``se2``, ``yaw``, ``se3`` and ``sim3``: least squares of
-    the positions, by a planar motion, one in space that turns about the vertical, any motion in space, and one with a scale.
-    InputError if the poses do not determine it.
+    - "none": the identity.
+    - "origin": moves the first pose onto the first pose.
+    - "se2": a motion in the plane. It minimises the squared distances of the positions, like the following ones.
+    - "yaw": a motion in space that turns only about the vertical.
+    - "se3": any motion in space.
+    - "sim3": any motion in space, with a scale.
+
+    Raises InputError if the poses do not determine the transformation.
     """
     if how == "none":
         return IDENTITY
@@ -165,12 +179,12 @@ def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Simila
 
 
 def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similarity:
-    """The motion in the plane; with ``yaw`` also along the vertical."""
+    """Return the least-squares motion in the plane, with a vertical shift if ``how`` is "yaw"."""
     points, targets = estimate.positions[:, :2], reference.positions[:, :2]
     for path, places in ((estimate, points), (reference, targets)):
         if np.abs(places - places[0]).max() <= _DEGENERATE * max(1.0, float(np.abs(places).max())):
             raise InputError(
-                f"{path.name}: all positions are one, which --align {how} cannot turn, expected a robot that moves"
+                f"{path.name}: all positions are equal, so --align {how} has no heading, expected a robot that moves"
             )
     x, y, angle = se2.align_points(points, targets)
     rise = float(np.mean(reference.positions[:, 2] - estimate.positions[:, 2])) if how == "yaw" else 0.0
@@ -178,6 +192,7 @@ def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similari
 
 
 def _umeyama(estimate: PosePath, reference: PosePath, *, with_scale: bool) -> Similarity:
+    """Return the least-squares transformation in space, by the method of Umeyama."""
     centre, target = estimate.positions.mean(axis=0), reference.positions.mean(axis=0)
     a, b = estimate.positions - centre, reference.positions - target
     left, singular, right = np.linalg.svd(b.T @ a / len(a))
@@ -185,7 +200,7 @@ def _umeyama(estimate: PosePath, reference: PosePath, *, with_scale: bool) -> Si
         of_path = np.linalg.svd(places, compute_uv=False)
         if not of_path[1] ** 2 > _DEGENERATE * of_path[0] ** 2:
             raise InputError(
-                f"{path.name}: its positions lie on a line, which --align {'sim3' if with_scale else 'se3'} cannot turn, "
+                f"{path.name}: its positions lie on a line, so --align {'sim3' if with_scale else 'se3'} has no unique rotation, "
                 "expected a path with a bend: use se2 or origin"
             )
     signs = np.array((1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))))

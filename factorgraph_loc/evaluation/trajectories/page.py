@@ -1,4 +1,4 @@
-"""The report of a score as one HTML page and as files, with plots of both trajectories and of the errors."""
+"""The report of a comparison of two trajectories as an HTML page and as files, with plots of the trajectories and errors."""
 
 from __future__ import annotations
 
@@ -35,15 +35,16 @@ ERRORS = {
     "rotation per second [rad]": "rpe_per_s.rotation",
 }
 EXPLANATION = (
-    "Absolute: between poses of the two, after the alignment. Per metre and per second: between the motions of the two over "
-    "pieces of that length, not divided by it, plotted at the end of each piece. Rotations are the angle between two "
-    "orientations. 95 %: this share of the errors is smaller; std: their standard deviation."
+    "Absolute errors are differences between the poses of both trajectories, after the alignment. Errors per metre and per second "
+    "are differences between the motions of both trajectories over pieces of that length. They are not divided by the length, and "
+    "are plotted at the end of each piece. A rotation error is the angle between two orientations. 95 % of the errors are smaller "
+    "than the value in the column 95 %. The column std has their standard deviation."
 )
 FILES = ("errors.csv", "report.html", "score.json")  # the last one is written last
 
 
 def _trajectories(score: TrajectoryScore) -> Figure:
-    """A plot from above and, unless both are planar, one of the heights."""
+    """Plot both trajectories from above. Unless both are planar, also plot their heights."""
     flat = score.estimate.is_planar and score.reference.is_planar
     places = np.concatenate((score.estimate.positions, score.reference.positions))[:, :2]
     width, depth = np.maximum(np.ptp(places, axis=0), 1e-6)
@@ -71,7 +72,7 @@ def _trajectories(score: TrajectoryScore) -> Figure:
 
 
 def _errors(score: TrajectoryScore) -> Figure:
-    """Each error over time, and the distribution of the absolute ones."""
+    """Plot the absolute and the relative errors over time, and the distribution of the absolute errors."""
     kinds = {"absolute": score.ape, "over 1 m of path": score.rpe_per_m, "over 1 s": score.rpe_per_s}
     kinds |= {f"over {delta}": errors for delta, errors in score.rpe.items()}
     known = {name: errors for name, errors in kinds.items() if errors is not None and len(errors.position)}
@@ -87,19 +88,19 @@ def _errors(score: TrajectoryScore) -> Figure:
             axis.set_ylim(bottom=0.0)
         absolute = np.sort(getattr(score.ape, what))
         row[-1].plot(absolute, np.arange(1, len(absolute) + 1) / len(absolute), color=COLOURS[0])
-        row[-1].set(ylim=(0.0, 1.0), xlabel=f"absolute {what} error [{unit}]", ylabel="share of poses below")
+        row[-1].set(ylim=(0.0, 1.0), xlabel=f"absolute {what} error [{unit}]", ylabel="fraction of smaller errors")
     legend(figure, axes[0])
     return figure
 
 
 def _abscissa(score: TrajectoryScore) -> tuple[Array, str]:
-    """The abscissa (N,) of the errors and its label: times, or numbers of the poses."""
+    """Return the abscissa (N,) of the plots and its label: times [s], or numbers of the poses if there are no timestamps."""
     t = score.seconds()
     return (np.arange(1.0, len(score.estimate) + 1), "number of the pose") if t is None else (t, "time [s]")
 
 
 def errors_table(score: TrajectoryScore) -> Rows:
-    """The statistics of the errors that are defined, a row for each kind."""
+    """Return a table of the statistics of the errors, with a row for each kind of error that is defined."""
     figures, titles = score.figures, dict(ERRORS)
     for delta in score.rpe:
         titles |= {f"{what} per {delta} [{unit}]": f"rpe_{delta}.{what}" for what, unit in UNITS.items()}
@@ -112,7 +113,7 @@ def errors_table(score: TrajectoryScore) -> Rows:
 
 
 def extents(score: TrajectoryScore) -> dict[str, str]:
-    """Descriptions of the estimate, the reference, their association and alignment."""
+    """Return descriptions of the estimate, the reference, their association, the pieces and the alignment, by title."""
     rows = {}
     for name, path, poses, length in zip(
         ("estimate", "reference"), (score.estimate, score.reference), score.poses, score.lengths, strict=True
@@ -123,14 +124,14 @@ def extents(score: TrajectoryScore) -> dict[str, str]:
     pieces = {"metre": score.rpe_per_m, "second": score.rpe_per_s}
     counts = [f"{len(errors.position)} of a {unit}" for unit, errors in pieces.items() if errors is not None]
     if counts:
-        overlap = "that may overlap" if score.settings["all_pairs"] else "one after the other"
+        overlap = "which may overlap" if score.settings["all_pairs"] else "which do not overlap"
         rows["pieces"] = f"{', '.join(counts)}, {overlap}"
     rows["alignment"] = _alignment(score)
     return rows
 
 
 def page(score: TrajectoryScore) -> str:
-    """The report as one HTML page."""
+    """Return the report as one HTML page."""
     lead = (
         f"The position error (RMSE) of {score.estimate.name} is {number(score.figures['ape.position_rmse'])} m, over "
         f"{len(score.estimate)} poses of {score.reference.name}."
@@ -144,15 +145,17 @@ def page(score: TrajectoryScore) -> str:
 
 
 def _association(score: TrajectoryScore) -> str:
+    """Describe how poses were paired."""
     settings = score.settings
     if "max_diff" in settings:
         return f"nearest stamps, at most {settings['max_diff']:g} s apart"
     if "max_gap" in settings:
         return f"estimates interpolated at the stamps of the reference, across at most {settings['max_gap']:g} s"
-    return "by the number of the row"
+    return "by row number"
 
 
 def _alignment(score: TrajectoryScore) -> str:
+    """Describe the alignment: its kind, translation, rotation vector and scale."""
     how, transform = score.settings["align"], score.transform
     if how == "none":
         return "none"
@@ -163,10 +166,10 @@ def _alignment(score: TrajectoryScore) -> str:
 
 
 def write_score(score: TrajectoryScore, out: Path) -> None:
-    """Write a score into the folder ``out``, replacing a previous one.
+    """Write the report of a comparison into the folder ``out``. Files of a previous report are replaced.
 
-    ``errors.csv``: a row for each pair of poses. ``report.html``: tables and plots. ``plots``: the same plots as PNG.
-    ``score.json``: the figures, see :meth:`TrajectoryScore.document`.
+    The files are ``errors.csv`` (a row for each pair of poses), ``report.html`` (tables and plots), the plots as PNG in ``plots``,
+    and ``score.json`` (see :meth:`TrajectoryScore.document`).
     """
     with writing(out):
         (out / "plots").mkdir(parents=True, exist_ok=True)
@@ -180,10 +183,10 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
 
 
 def errors_of(score: TrajectoryScore) -> pl.DataFrame:
-    """The table of ``errors.csv``: a row for each pair of poses.
+    """Return the table of ``errors.csv``, with a row for each pair of poses.
 
-    Columns: stamps [ns] of both (empty if missing), positions [m] of both (the estimate is aligned), errors in position [m] and
-    rotation [rad].
+    The columns are the timestamps [ns] of both trajectories (empty if missing), the positions [m] of both after the alignment, and
+    the errors of position [m] and rotation [rad].
     """
     rotation = score.ape.rotation
     columns = [

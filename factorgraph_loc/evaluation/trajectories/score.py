@@ -32,14 +32,15 @@ from factorgraph_loc.model.scoring import (
 from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.se2 import Array, Integers
 
-_MANY = 0.5  # share of poses that are paired, below which there is a warning
+_MANY = 0.5  # there is a warning if a smaller fraction of the poses is paired
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """K errors: ``position`` (K,) [m] and ``rotation`` (K,) [rad], an angle; None if a trajectory has no rotations.
+    """K absolute or relative pose errors.
 
-    ``ends`` (K,): index of the pose of an absolute error, of the last pose of a relative one.
+    ``position`` (K,) [m]. ``rotation`` (K,) [rad]: an angle, None if a trajectory has no rotations. ``ends`` (K,): index of the
+    pose of an absolute error, or of the last pose of the piece of a relative error.
     """
 
     position: Array
@@ -47,7 +48,7 @@ class PoseErrors:
     ends: Integers
 
     def figures(self, name: str) -> dict[str, float | None]:
-        """Statistics as ``NAME.position_rmse``, ...; None without errors."""
+        """Return the statistics of the errors by key, such as ``NAME.position_rmse``. They are None if there are no errors."""
         figures: dict[str, float | None] = {}
         for what, values in (("position", self.position), ("rotation", self.rotation)):
             statistics = summarize(np.empty(0) if values is None else values)
@@ -57,13 +58,14 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class TrajectoryScore:
-    """The errors of an estimate.
+    """The result of the comparison of an estimated trajectory with a reference.
 
-    ``estimate`` (aligned), ``reference``: N associated poses each. ``transform``: from the frame of the estimate to that of the
-    reference. ``ape``: absolute errors (N,). ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a
-    second; None without rotations or stamps. ``rpe``: by other distances and durations, such as ``5m``. ``lengths`` [m] and
-    ``poses`` of the whole estimate and of the whole reference. ``settings``: of association and alignment. ``warnings``: one for
-    each doubt.
+    ``estimate``, ``reference``: the N paired poses of both; those of the estimate are aligned.
+    ``transform``: the alignment, from the frame of the estimate to that of the reference. ``ape``: N absolute errors.
+    ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a second, None without rotations or timestamps.
+    ``rpe``: relative errors over other distances and durations, by a text such as "5m".
+    ``lengths`` [m], ``poses``: length and number of poses of the whole estimate and of the whole reference.
+    ``settings``: the settings of association and alignment. ``warnings``: likely mistakes in the comparison.
     """
 
     estimate: PosePath
@@ -80,11 +82,11 @@ class TrajectoryScore:
 
     @property
     def figures(self) -> dict[str, float | None]:
-        """All figures by dotted key, in metres and radians, None where undefined.
+        """All statistics by key, in metres and radians. A statistic that is undefined is None.
 
-        ``pairs``: number of compared poses. ``ape.position_*``, ``ape.rotation_*``, ``rpe_per_m.position_*``, ...: ``rmse``,
-        ``mean``, ``median``, ``p95``, ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``, ``rpe_per_s.pieces``: number of
-        relative errors.
+        ``pairs``: number of compared poses. ``ape.position_*``, ``ape.rotation_*``, ``rpe_per_m.position_*`` and so on have the
+        endings ``rmse``, ``mean``, ``median``, ``p95``, ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``, ``rpe_per_s.pieces``:
+        number of relative errors.
         """
         figures: dict[str, float | None] = {"pairs": len(self.estimate)}
         figures |= self.ape.figures("ape")
@@ -95,11 +97,11 @@ class TrajectoryScore:
         return figures
 
     def seconds(self) -> Array | None:
-        """Times (N,) of the pairs from the first one on [s], None without stamps."""
+        """Return the times (N,) [s] of the pairs since the first pair, or None if there are no timestamps."""
         return _seconds(self.estimate, self.reference)
 
     def document(self) -> dict[str, Any]:
-        """The score as plain values: settings, figures, the alignment and the warnings."""
+        """Return the result as a dictionary for JSON: settings, statistics, the alignment and the warnings."""
         names = ("estimate", "reference")
         extents = zip(names, self.poses, self.lengths, strict=True)
         return {
@@ -133,14 +135,15 @@ def score_paths(
     align_poses: int | None = None,
     delta: Sequence[str] = (),
 ) -> TrajectoryScore:
-    """Compare an estimate with a reference.
+    """Compare an estimated trajectory with a reference.
 
-    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`; ``se2`` compares both seen from above.
-    ``align_poses``: number of the first poses that determine the alignment, by default all. ``delta``: further distances and
-    durations of relative errors, such as ``5m`` or ``2s``.
+    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`. With "se2" heights are ignored.
     ``associate_by``, ``max_diff``, ``max_gap``: see :func:`~factorgraph_loc.evaluation.trajectories.association.associate`.
-    ``all_pairs``: relative errors over all pairs of poses about as far apart, not over pieces one after the other. InputError if
-    the two have nothing in common, or do not determine the alignment.
+    ``all_pairs``: whether relative errors are over overlapping pieces, one from each pose, instead of successive pieces.
+    ``align_poses``: number of the first poses that determine the alignment, None for all.
+    ``delta``: further distances and durations of relative errors, such as "5m" or "2s".
+
+    Raises InputError if no poses can be paired, the poses do not determine the alignment, or an argument is invalid.
     """
     _check(align, associate_by, max_diff, max_gap)
     if align_poses is not None and (align_poses < 1 or align in ("none", "origin")):
@@ -171,8 +174,8 @@ def score_paths(
     warnings = [*estimate.warnings, *reference.warnings, *_doubts(estimate, reference, associate_by, align)]
     if associate_by == "nearest" and len(aligned) < _MANY * min(poses):
         sentence = (
-            "{estimate}: {paired} of {poses} poses have a stamp within {max_diff:g} s in {reference}: "
-            "a larger max_diff finds more, and associate interpolate needs none"
+            "{estimate}: only {paired} of {poses} poses are within {max_diff:g} s of a pose of {reference}: "
+            "set a larger max_diff, or associate interpolate"
         )
         values = estimate.name, len(aligned), min(poses), max_diff, reference.name
         warnings.append(notice("few_pairs", sentence, *values))
@@ -182,7 +185,7 @@ def score_paths(
 def pose_errors(
     pair: Associated, *, all_pairs: bool = False
 ) -> tuple[PoseErrors, PoseErrors | None, PoseErrors | None]:
-    """Absolute errors, and relative ones over a metre and over a second; see :class:`TrajectoryScore`."""
+    """Return the absolute errors, and the relative errors over a metre of path and over a second; see :class:`TrajectoryScore`."""
     estimate, truth = pair.estimate, pair.reference
     distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
     ape = PoseErrors(distance, None, np.arange(len(estimate)))
@@ -193,7 +196,10 @@ def pose_errors(
 
 
 def relative_errors(pair: Associated, length: float, unit: str, *, all_pairs: bool = False) -> PoseErrors | None:
-    """Relative errors over pieces of a ``length`` in a ``unit``, m of path or s; None without rotations, or without stamps."""
+    """Return relative errors over pieces of a path. ``unit``: "m" for a ``length`` of path in metres, "s" for a time in seconds.
+
+    Return None without rotations, or for "s" without timestamps.
+    """
     estimate, truth = pair.estimate, pair.reference
     if not (estimate.has_rotations and truth.has_rotations):
         return None
@@ -207,7 +213,7 @@ def relative_errors(pair: Associated, length: float, unit: str, *, all_pairs: bo
 
 
 def _delta(text: str) -> tuple[float, str]:
-    """The length and unit of a distance or duration such as ``5m`` or ``0.5s``; InputError for other text."""
+    """Parse a distance or duration such as "5m" or "0.5s". Return its number and unit. Raises InputError for other text."""
     try:
         length = float(text[:-1])
     except ValueError:
@@ -218,6 +224,7 @@ def _delta(text: str) -> tuple[float, str]:
 
 
 def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> None:
+    """Raise InputError if an argument of :func:`score_paths` is invalid."""
     for name, value, known in (("align", align, ALIGNMENTS), ("associate", associate_by, ASSOCIATIONS)):
         if value not in known:
             raise InputError(f"{name} is {quoted(value)}, expected one of {listed(known)}")
@@ -229,7 +236,11 @@ def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> No
 def _relative(
     estimate: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
 ) -> PoseErrors:
-    """The translation and rotation of ``Q^-1 P`` for the motions Q of the reference and P of the estimate over each piece."""
+    """Return the translation and rotation of ``Q^-1 P`` for each piece. Q is the motion of the reference over the piece, and P the
+    motion of the estimate.
+
+    ``steps`` (N - 1,): distances or times between poses. ``length``: of a piece, in the same unit. No piece crosses ``gaps``.
+    """
     cut = pairing.all_pairs if all_pairs else pairing.successive
     inner = np.unique(gaps[(gaps > 0) & (gaps < len(estimate))]).tolist()
     pieces = [piece for a, b in pairwise([0, *inner, len(estimate)]) for piece in cut(steps[a : b - 1], length, a)]
@@ -241,33 +252,39 @@ def _relative(
 
 
 def _motions(path: PosePath, begins: Integers, ends: Integers) -> tuple[Array, Array]:
-    """Rotations (K, 3, 3) and translations (K, 3) from poses to later ones."""
+    """Return the rotations (K, 3, 3) and translations (K, 3) between poses ``begins`` and ``ends``, in the frame of the former."""
     back = path.rotations[begins].transpose(0, 2, 1)
     shifts = path.positions[ends] - path.positions[begins]
     return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, shifts)
 
 
 def _steps(path: PosePath) -> Array:
+    """Return the distances (N - 1,) [m] between successive poses."""
     return np.asarray(np.linalg.norm(np.diff(path.positions, axis=0), axis=1))
 
 
 def _angles(rotations: Array) -> Array:
-    """The angles (K,) [rad] of rotations (K, 3, 3), from their sine and cosine."""
+    """Return the angles (K,) [rad] of rotations (K, 3, 3). Sine and cosine are both used, which is accurate for all angles."""
     sine = np.linalg.norm(rotations - rotations.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8.0)
     cosine = (np.trace(rotations, axis1=1, axis2=2) - 1.0) / 2.0
     return np.asarray(np.arctan2(sine, cosine))
 
 
 def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
+    """Return the times (N,) [s] of pairs since the first pair, by the clock of the estimate if it has one. None without any."""
     t_ns = truth.t_ns if estimate.t_ns is None else estimate.t_ns
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
 
 def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[Notice]:
-    """Warnings about likely mistakes: heights in a comparison with a planar trajectory, and a plane that is not the floor."""
+    """Return warnings about likely mistakes.
+
+    One is a path whose heights vary much although ``align`` ignores them. The other is a planar trajectory that is compared in
+    space with one at other heights.
+    """
     if align == "se2":
         rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]
-        sentence = "{path}: z varies by {rise:.1f} m, and is ignored: does it point up?"
+        sentence = "{path}: z varies by {rise:.1f} m and is ignored: check that its z axis points up"
         return [notice("not_planar", sentence, name, rise) for name, rise in rises if rise > MOST]
     flat, uneven = (estimate, reference) if estimate.is_planar else (reference, estimate)
     if associate_by == "interpolate" or not flat.is_planar or align in ("se3", "sim3"):
@@ -276,7 +293,7 @@ def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, 
     if apart <= RISE:
         return []
     sentence = (
-        "{planar} is planar, and {other} is up to {height:.1f} m above or below it: heights count, but not with "
-        "align se2 or associate interpolate"
+        "{planar} is planar, and {other} is up to {height:.1f} m above or below it. Errors include the difference in height: set "
+        "align se2 or associate interpolate to exclude it"
     )
     return [notice("heights_count", sentence, flat.name, uneven.name, apart)]
