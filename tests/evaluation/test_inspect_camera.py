@@ -55,15 +55,15 @@ def test_sizes(log):
         log, streams=dict(log.streams) | {"camera": ImageStream(log.streams["camera"].t[:25], files[:25])}
     )
     assert tuple(map(str, inspect(doubled).problems)) == (
-        "the camera is calibrated for images of 160x120 px, those of the log have 320x240 px",
+        "the camera is calibrated for images of 160x120 px, but the images of the log have 320x240 px",
     )
 
 
 def test_a_rig_without_camera(log):
     problems = inspect(replace(log, rig=log.rig.model_copy(update={"camera": None}))).problems
     assert tuple(map(str, problems)) == (
-        "the log has images, but its rig has no [camera]: they are not used",
-        "the log has identified pixels, but its rig has no [camera]: they are not used",
+        "the log has images, which are not used, because its rig has no [camera]",
+        "the log has identified pixels, which are not used, because its rig has no [camera]",
     )
 
 
@@ -107,11 +107,11 @@ def test_a_camera_that_looks_where_its_rig_says(tmp_path, pitch, way):
 def test_a_camera_that_looks_at_the_floor_though_its_rig_says_ahead(tmp_path):
     (problem,) = mounting_problems(turning(tmp_path, 0.0, 1.0))
     assert re.fullmatch(
-        r"images turn (1\.00|0\.9\d) times as much as the robot, as of a camera that looks at the floor, by the rig's mounting "
-        r"-?0\.00 times: is its pitch about 1\.[3-6], not 0\.0\?",
+        r"images rotate (1\.00|0\.9\d) times as much as the robot, as if the camera looks at the floor; by the rig's mounting "
+        r"the ratio is -?0\.00: is camera\.pitch about 1\.[3-6], not 0\.0\?",
         str(problem),
     )
     (problem,) = mounting_problems(turning(tmp_path, np.pi / 2, 0.0))
-    assert "as of a camera that looks ahead, by the rig's mounting 1.00 times" in str(problem)
+    assert "as if the camera looks ahead; by the rig's mounting the ratio is 1.00" in str(problem)
     (problem,) = mounting_problems(turning(tmp_path, np.pi / 2, -1.0))
     assert problem.fields["where"] == "at the ceiling"

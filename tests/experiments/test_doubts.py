@@ -11,7 +11,7 @@ from factorgraph_loc import CameraFrame, FeatureStream, InputError, PointMap, Ri
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
 from factorgraph_loc.experiments.run import RunConfig, run
 
-NO_POINTS = "straight: the map has no points that a camera could find: give --world"
+NO_POINTS = "straight: the map has no points for the camera: give --world"
 STAMPS = np.array([0.3, 0.7])
 
 
@@ -64,7 +64,7 @@ def test_a_camera_in_a_map_without_points(blank, sensor, name, settings, hint):
 @pytest.mark.parametrize("name", ["smoother", "batch", "monoslam"])
 def test_images_and_wheels_alone_make_a_map_by_themselves(blank, name, sensor):
     result = run(blank, RunConfig(name, sensors=("odometry", sensor)))
-    told = f"straight: the map has nothing that the camera could find: it is estimated ({name}.landmarks=unknown)"
+    told = f"straight: the map has no points for the camera: points are estimated ({name}.landmarks=unknown)"
     assert [*map(str, result.warnings)] == [told]
     assert result.config["settings"]["landmarks"] == "unknown"
     # not beside what may be in the map, nor where the map has points

@@ -1,4 +1,4 @@
-"""Cameras: image features and named points."""
+"""Detects image features and named points with a camera."""
 
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType

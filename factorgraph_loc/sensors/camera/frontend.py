@@ -1,7 +1,7 @@
-"""Features, tracks and fiducial markers of images: of a log, in parallel, with a cache in the user's cache folder; and online.
+"""Detects features, tracks and fiducial markers in images: in all images of a log, or in one image after the other.
 
-Cache keys are hashes of the image's bytes, the settings and the code, so a changed image or feature is computed again, and equal
-images in two logs are computed once.
+The images of a log are processed in parallel, and results are stored in the user's cache folder. A cache key is a hash of
+image, settings and code. A changed image is computed again, and equal images of two logs are computed once.
 """
 
 import hashlib
@@ -34,7 +34,7 @@ from factorgraph_loc.vision.keypoints import Integers
 from factorgraph_loc.vision.tracks import FeatureTracker
 from factors.camera.model import CameraModel
 
-# what features depend on, and what tracks depend on in addition
+# source files of factorgraph_loc.vision that cached features depend on, and those that cached tracks depend on in addition
 FEATURE_CODE = (
     "colour_features.py",
     "descriptor.py",
@@ -54,7 +54,11 @@ Size = tuple[int, int]  # width, height
 
 @dataclass(frozen=True)
 class _ImageFile:
-    """A file with the ``key`` of its features, the features if known, or the ``fault`` of the file."""
+    """An image file and the result of feature detection.
+
+    ``key``: the cache key. ``found``: the features, None if not computed yet. ``fault``: the error message of an unusable file.
+    ``other_size``: the size of an image that differs from that of the rig's camera, otherwise None.
+    """
 
     file: Path
     key: str = ""
@@ -69,15 +73,16 @@ def with_features(
     """Replace the images of a log by features and tracks. Returns the log and warnings.
 
     An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without features.
-    ``progress`` is called with the completed share. A log without images is returned unchanged.
-
-    InputError if the rig has no camera, or is calibrated for another size than all images have.
+    ``progress`` is called with the completed fraction. A log without images is returned unchanged. Raises InputError if the rig
+    has no camera, or if no image has the size that the camera is calibrated for.
     """
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return log, ()
     if log.rig.find(CameraSettings) is None:
-        raise InputError(f"{log.name}: has images, but its rig {log.rig.name} has no [camera] with its mounting")
+        raise InputError(
+            f"{log.name}: has images, but its rig {log.rig.name} has no [camera] with the camera's mounting"
+        )
     camera = log.rig.of(CameraSettings).model()
     kept = FeatureCache(cache_folder())
     images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
@@ -100,7 +105,8 @@ def _features(
     kept: FeatureCache,
     progress: Callable[[float], None],
 ) -> list[_ImageFile]:
-    """The features of N images, from the cache if possible."""
+    """Return the features of the image ``files``, from the cache ``kept`` if possible. ``size``: width and height of the
+    camera's images [px]."""
     about = f"{settings.model_dump_json()} {size} {code_version(FEATURE_CODE)} "
     new: dict[str, _ImageFile] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading, hashing and detection release the interpreter lock
@@ -117,6 +123,7 @@ def _features(
 
 
 def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
+    """Read an image's features from the cache. ``about``: text that the key depends on besides the bytes of the image."""
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:
@@ -127,7 +134,7 @@ def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
 
 
 def _find(file: Path, key: str, settings: FrontendSettings, size: Size, kept: FeatureCache) -> _ImageFile:
-    """The features of an image, which are also written to the cache, or its fault."""
+    """Compute the features of an image and write them to the cache. Returns the features, or the fault of the file."""
     try:
         image = read_image(file)
     except InputError as error:
@@ -145,7 +152,7 @@ _thread = threading.local()
 
 
 def _extractor(settings: FrontendSettings) -> Extractor:
-    """The extractor of this thread, which reuses its memory."""
+    """Return the feature extractor of this thread. An extractor reuses its memory, so threads cannot share one."""
     if getattr(_thread, "settings", None) != settings:
         _thread.settings = settings
         _thread.extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
@@ -154,7 +161,7 @@ def _extractor(settings: FrontendSettings) -> Extractor:
 
 
 def _nothing(settings: FrontendSettings) -> ImageFeatures:
-    """The result for an image without features."""
+    """Return the result of an image without features."""
     return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
 
 
@@ -166,7 +173,7 @@ def _tracks(
     camera: CameraModel,
     kept: FeatureCache,
 ) -> list[Integers]:
-    """Track numbers (K,) of each image's features, from the cache if possible."""
+    """Return the track numbers (K,) of each image's K features, from the cache ``kept`` if possible."""
     order = np.argsort(stream.t, kind="stable").tolist()
     about = f"tracks {settings.feature} {camera.intrinsics().tolist()} {code_version(TRACK_CODE)} "
     key = hashlib.sha256(
@@ -188,17 +195,18 @@ def _tracks(
 
 
 def _require_calibrated(log: Log, images: list[_ImageFile], camera: CameraModel) -> None:
-    """InputError if images can be decoded but none has the size that the camera is calibrated for."""
+    """Raise InputError if images can be decoded, but none has the size that the camera is calibrated for."""
     sizes = [image.other_size for image in images if image.other_size is not None]
     if sizes and not any(image.found for image in images):
         width, height = sizes[0]
         raise InputError(
-            f"{log.name}: the rig's camera is calibrated for images of {camera.width} x {camera.height} px, those of the "
-            f"log have {width} x {height} px, expected a calibration of their resolution"
+            f"{log.name}: the rig's camera is calibrated for images of {camera.width} x {camera.height} px, but the images of "
+            f"the log have {width} x {height} px, expected a calibration for this size"
         )
 
 
 def _doubts(log: Log, images: list[_ImageFile]) -> tuple[Notice, ...]:
+    """Return warnings about images that cannot be read, have another size, or show no features."""
     doubts = []
     for kind, what, faults in (
         (
@@ -221,7 +229,8 @@ def _doubts(log: Log, images: list[_ImageFile]) -> tuple[Notice, ...]:
 
 @cache
 def code_version(names: tuple[str, ...]) -> str:
-    """A hash of source files of this package and the versions of the libraries they use."""
+    """Return a hash of source files of :mod:`factorgraph_loc.vision`, by name, and of the versions of the libraries they
+    use."""
     package = resources.files("factorgraph_loc.vision")
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     for name in names:
@@ -229,20 +238,21 @@ def code_version(names: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-CODE = ("fiducials.py", "images.py")  # files that the result depends on
-Marked = list[tuple[int, list[list[float]]]]  # marker numbers and the pixels of their corners
+CODE = ("fiducials.py", "images.py")  # source files that cached markers depend on
+Marked = list[tuple[int, list[list[float]]]]  # the markers in an image: number, and pixels of the four corners
 
 
 def with_markers(log: Log, family: MarkerFamily) -> Log:
-    """Add the marker corners in the images of a log as the stream ``sightings``, with names ``FAMILY-NUMBER/CORNER``.
+    """Detect markers in the images of a log. Add their corners to the log as the stream ``sightings``, with names
+    ``FAMILY-NUMBER/CORNER``.
 
-    Results are cached. InputError if the log has no images, or already has sightings.
+    Results are cached. Raises InputError if the log has no images, or already has sightings.
     """
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream) or not len(stream.t):
         raise InputError(f"{log.name}: has no images to detect markers in")
     if "sightings" in log.streams:
-        raise InputError(f"{log.name}: already has sightings, expected either these or [markers]")
+        raise InputError(f"{log.name}: already has sightings, expected either sightings or [markers]")
     kept = FeatureCache(cache_folder())
     t: list[float] = []
     names: list[str] = []
@@ -276,6 +286,7 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
 
 
 def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
+    """Return the markers of a family in an image, from the cache ``kept`` if possible."""
     content = read_bytes(file, IMAGE)
     about = f"markers {family} {code_version(CODE)} "
     key = hashlib.sha256(about.encode() + content).hexdigest()
@@ -296,9 +307,10 @@ class LiveFrontend:
         self._tracker = FeatureTracker(camera)
 
     def frame(self, t: float, image: object) -> CameraFrame:
-        """The features of an image taken at ``t`` [s], an array as in :func:`~factorgraph_loc.vision.images.as_image`.
+        """Return the features of an image that was taken at ``t`` [s]. ``image``: an array as in
+        :func:`~factorgraph_loc.vision.images.as_image`.
 
-        InputError if it is no such array, or has another size than the camera is calibrated for.
+        Raises InputError if ``image`` is no such array, or has another size than the camera is calibrated for.
         """
         pixels = as_image(image, f"CameraImage at {t:.3f} s")
         height, width = pixels.shape[:2]

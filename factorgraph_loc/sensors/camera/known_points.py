@@ -1,4 +1,4 @@
-"""Points of the map seen by a camera, identified by name or by matching features."""
+"""Turns camera measurements into factors of points of the map. Points are identified by name or by matching features."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel, TiltScale
 from factors.motion import Increment, propagate
 from factors.se2 import Array
 
-DISAGREES = "camera: does not agree with the others"  # reason of a rejection
-FEW_SHARE = 0.3  # of named points: with fewer inliers, points are missing
-FEW, MANY = 6, 20  # of matched points: fewer than FEW inliers where MANY are expected means that points are missing
-UNSURE = 1.0  # m: a prediction with a larger standard deviation may miss the map
-MOST = 100  # points used per image; more add little, as errors of neighbouring points are correlated
-STEEPEST = 0.06  # rad: what tilts by more is no robot on a floor, or its camera is not mounted as the rig says
-# the survey of a named point is exact if its sigma is below this share of what `pixel_sigma` is at so many metres
+DISAGREES = "camera: does not agree with the others"  # reason of a rejection, in diagnostics
+FEW_SHARE = 0.3  # an image misses named points if a smaller fraction of them are inliers
+FEW, MANY = 6, 20  # an image misses matched points if fewer than FEW are inliers, although MANY or more are expected
+UNSURE = 1.0  # m; with a larger standard deviation of the prediction, FEW alone decides if points are missing
+MOST = 100  # points used per image; more points add little, because errors of neighbouring points are correlated
+STEEPEST = 0.06  # rad; an image that requires a larger tilt of the robot is rejected
+# a named point is exact if its survey sigma is below the fraction EXACT_SURVEY of a pixel error at the distance NEAR [m]
 EXACT_SURVEY, NEAR = 0.2, 3.0
-EXACT = 0.1  # a map is treated as exact if its errors are below this share of a pixel's, seen from 1 m
-# Pixels are so precise that one step from a poor prediction does not reach the optimum
-ITERATIONS, SETTLED = 8, 1e-3  # m, rad: convergence limit of a step
+EXACT = 0.1  # a map is exact if its errors are below this fraction of a pixel error at a distance of 1 m
+# pixels are so precise that one linearisation at a poor prediction does not reach the optimum
+ITERATIONS, SETTLED = 8, 1e-3  # number of iterations; m, rad: iterations end if the step is smaller
 
 NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
 
@@ -48,9 +48,9 @@ NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
 class Predicted:
     """The prediction for an image.
 
-    ``pose`` (3,): of the pose variable that the factor is on; ``covariance`` (3, 3): of that pose, in the body frame.
-    ``constants`` (P,): the current corrections of those camera constants that are estimated; ``spread`` (P, P): their covariance.
-    Both are None if no constant is estimated.
+    ``pose`` (3,) with body-frame ``covariance`` (3, 3): of the pose variable that the factor depends on.
+    ``constants`` (P,) with covariance ``spread`` (P, P): corrections of the estimated camera constants. None if none is
+    estimated.
     """
 
     pose: Array
@@ -60,10 +60,11 @@ class Predicted:
 
 
 class KnownPoints:
-    """Turns camera measurements into factors. Points that map or rig lack are counted as ignored, outliers as rejected.
+    """Turns camera measurements into factors of known points. Points that the map lacks are counted as ignored, outliers as
+    rejected.
 
-    ``estimated``: the camera's constants that are estimated. ``use``: see
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`.
+    ``estimated``: the camera's constants that are estimated. ``use``: how the map is used, see
+    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``name``: the name of the sensor in the diagnostics.
     """
 
     def __init__(
@@ -78,19 +79,21 @@ class KnownPoints:
         self.name = name
         self.model: CameraModel = replace(settings.model(), tempering=1.0)
         self.floor = TiltScale.guessed(self.model.tilt)
-        self._tempering = settings.tempering  # for matched points
+        self._tempering = settings.tempering  # exponent of the likelihood of matched points; named points have none
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
             self.map = without_common(setup.world.points)
         self._others_matter = use != "known"
-        self.used = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
-        self.names: tuple[str, ...] = ()  # of the points of the last factor, where they are named
+        self.used = np.empty(
+            0, dtype=np.int64
+        )  # indices of the features of the last image that match points of the map
+        self.names: tuple[str, ...] = ()  # names of the points of the last factor; () for matched features
         self._estimated = estimated
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
         if "camera" in setup.sensors and len(self.map.owners):
             self.associator = Associator(self.map, self.model)
-        self.missed = False  # whether points of the map were missing in the last image
+        self.missed = False  # True if points of the map were missing in the last image
         self._map_matters = False
         self._inexact = np.zeros(len(self.map), dtype=bool)
         if len(self.map):
@@ -102,12 +105,12 @@ class KnownPoints:
 
     @property
     def needs_twist(self) -> bool:
-        """Whether the camera's time offset is estimated."""
+        """True if the camera's time offset is estimated, so that factors depend on the robot's velocity."""
         return TIME_OFFSET in self._estimated.indices
 
     def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
-        """The detected points whose survey is inexact. For each point or marker by name: the names of its points and the
-        covariance (3, 3) of their common displacement."""
+        """Return the detected points whose survey is inexact, grouped by point or marker. Each value has the names of the
+        detected points of the group, and the covariance (3, 3) of their common displacement."""
         inexact: dict[str, tuple[list[str], Array]] = {}
         if not isinstance(m, PixelSightings) or not self._inexact.any():
             return inexact
@@ -119,7 +122,8 @@ class KnownPoints:
         return inexact
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
-        """All named points of the map without outlier rejection, on the pose at their time."""
+        """Return a factor of all named points that are in the map, without outlier rejection, on the pose at their time.
+        Returns None if there are none."""
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:
@@ -138,10 +142,11 @@ class KnownPoints:
         twist: Array | None = None,
         displaced: Mapping[str, tuple[Array, Array]] = NOT_DISPLACED,
     ) -> ReprojectionFactor | None:
-        """The factor of the known points, on the pose at the image's time or on one that lies ``offset`` before it.
+        """Return the factor of the known points in an image without outliers, or None if there are none.
 
-        ``twist`` (3,): the robot's velocity at that time, needed if the camera's time offset is estimated. ``displaced``: by name
-        how far (3,) points are from where the map has them, with its covariance, which becomes theirs.
+        ``offset``: the motion from the pose that the factor depends on to the image, None if the times are equal.
+        ``twist`` (3,): the robot's velocity at the image. It is required if the camera's time offset is estimated.
+        ``displaced``: by point name, the displacement (3,) of a point from the map, and the covariance (3, 3) of its position.
         """
         self.used = np.empty(0, dtype=np.int64)
         factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
@@ -179,7 +184,8 @@ class KnownPoints:
         return levelled
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
-        """The pose of an image without a prediction, or None, and the number of points that it seemed to show."""
+        """Return the robot's pose at an image, found without a prediction, and the number of points that the image should show.
+        The pose is None if it is not found."""
         model = self.model
         if not len(self.map):
             return None, 0
@@ -201,7 +207,8 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """A factor without points yet; None if features cannot be matched with the map."""
+        """Return a factor without points, to which matches are added. Returns None if the features cannot be matched with the
+        map."""
         self.names = ()
         if self.associator is None:
             if not self._others_matter:
@@ -215,7 +222,8 @@ class KnownPoints:
     def _matched(
         self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
     ) -> ReprojectionFactor | None:
-        """The factor of the points matched in a frame."""
+        """Match the features of a frame with the map near the predicted ``camera`` pose. Returns ``factor`` with the matched
+        points, or None without matches. ``focal``: standard deviation of the logarithm of the focal length."""
         assert self.associator is not None
         matches = self.associator.guided(m, camera, model, focal)
         self.used = matches.features
@@ -234,11 +242,12 @@ class KnownPoints:
     def _levelled(
         self, factor: ReprojectionFactor, expected: ReprojectionFactor, predicted: Predicted
     ) -> ReprojectionFactor | None:
-        """The factor with the learnt scale of the robot's tilt; ``expected``: the factor at the expected constants.
+        """Update the learnt standard deviation of the robot's tilt by an image, and return ``factor`` with it.
 
-        None if only a robot that tilts by more than :data:`STEEPEST` sees the points where they are, which is not believed.
+        ``expected``: the same factor with fixed constants. Returns None if the image requires a tilt above :data:`STEEPEST`,
+        because it is probably wrong.
         """
-        if expected.estimated:  # unknown constants would explain the tilt
+        if expected.estimated:  # errors of the constants would be mistaken for a tilt
             return factor
         pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
         tilt, noise = pixel_kernels.leaning(expected.packed(), pose, covariance)
@@ -248,7 +257,8 @@ class KnownPoints:
         return replace(factor, model=replace(factor.model, tilt=sigma))
 
     def _camera(self, expected: ReprojectionFactor, predicted: Predicted) -> CameraPose:
-        """The pose of the camera for an image, including the uncertainty of its constants."""
+        """Return the predicted pose of the camera at an image. Its covariance includes the uncertainty of the mounting and of
+        the time offset."""
         pose, covariance = predicted.pose, predicted.covariance
         if expected.offset is not None:
             noise = np.zeros((3, 3)) if expected.offset_covariance is None else expected.offset_covariance
@@ -270,14 +280,15 @@ class KnownPoints:
 
 
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
-    """The pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3), which may tilt."""
+    """Return the pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3). The covariance of the
+    result includes the tilt of the robot."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
     return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
 
 
 def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
-    """Inliers near the prediction; all points if these are too few to decide. ``focal``: standard deviation of the logarithm of the
-    focal length."""
+    """Return a mask (K,) of the points that are inliers near the prediction. All K points are inliers if there are too few to
+    decide. ``focal``: standard deviation of the logarithm of the focal length."""
     model, count = expected.model, len(expected.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
@@ -294,6 +305,6 @@ def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) ->
 
 
 def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
-    """The factor of some of its points."""
+    """Return the factor with only the selected ``rows`` of its points."""
     covariances = None if factor.point_covariances is None else factor.point_covariances[rows]
     return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=covariances)

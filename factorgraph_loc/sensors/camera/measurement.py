@@ -1,4 +1,4 @@
-"""Measurements of cameras: named points in images, and the streams of these, of images and of their features."""
+"""Measurements of cameras: images, features of images, and named points in images, with their streams and tables."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ if TYPE_CHECKING:
     from factorgraph_loc.files.tables import TableRows
 
 
-CAMERAS = ("camera", "sightings")  # channels that use the rig's camera: features, and named points
+CAMERAS = ("camera", "sightings")  # channels of the camera: images with their features, and named points in images
 
 
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
-    """Named points seen in one image: ``points``: K names; ``pixels`` (K, 2) [px], x right, y down."""
+    """K named points in an image at the time ``t`` [s]. ``points``: their names. ``pixels`` (K, 2): their positions [px], x to
+    the right, y down."""
 
     sensor: ClassVar[str] = "sightings"
     modality: ClassVar[str] = "camera"
     is_motion: ClassVar[bool] = False
-    frame: ClassVar[None] = None  # there are no features
+    frame: ClassVar[None] = None  # this measurement has no features
     t: float
     points: tuple[str, ...]
     pixels: Array
@@ -42,18 +43,19 @@ class PixelSightings:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the points."""
+        """The names of the points."""
         return self.points
 
     @property
     def count(self) -> int:
-        """Number of points."""
+        """The number of points."""
         return len(self.pixels)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraImage:
-    """An image that a program pushes. ``pixels``: (H, W) or (H, W, 3) BGR, see :func:`factorgraph_loc.vision.images.as_image`."""
+    """An image that a program pushes. ``pixels``: an array (H, W) or (H, W, 3) in the order BGR, see
+    :func:`factorgraph_loc.vision.images.as_image`."""
 
     sensor: ClassVar[str] = "camera"
     modality: ClassVar[str] = "camera"
@@ -64,12 +66,13 @@ class CameraImage:
     source: str = modality
 
 
-Pixels = PixelSightings | CameraFrame  # measurements of a camera that estimators take
+Pixels = PixelSightings | CameraFrame  # measurements of a camera that estimators process
 
 
 @dataclass(frozen=True)
 class SightingStream(Stream):
-    """Rows of named points in images: name and pixel (``u``, ``v``) [px]. Rows with equal timestamps form one measurement."""
+    """All named points in images of a log, one per row: name ``point`` and position ``u``, ``v`` [px]. Rows with equal
+    timestamps form one measurement."""
 
     kind: ClassVar[type[Any]] = PixelSightings
     point: Sequence[str]
@@ -85,18 +88,18 @@ class SightingStream(Stream):
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
-    """Image files (N,). :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
+    """The N images of a log as files. :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
 
     kind: ClassVar[type[Any]] = CameraImage
     file: Sequence[Path]
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        raise InputError("images have no measurements before feature detection")
+        raise InputError("images must be replaced by features before they are used as measurements")
 
 
 @dataclass(frozen=True)
 class FeatureStream(Stream):
-    """Features of images: ``frame`` (N,), whose own timestamps are ignored."""
+    """The features of a log's N images. The timestamps of the frames are ignored; those of the stream are used."""
 
     kind: ClassVar[type[Any]] = CameraFrame
     frame: Sequence[CameraFrame]
@@ -122,7 +125,7 @@ SIGHTINGS = Table(
     stream="factorgraph_loc.sensors.camera.measurement:SightingStream",
     is_scan=True,
 )
-# features of images, as pushed by a program
+# fields of features that a program pushes
 FEATURES = Table(
     "features",
     (
@@ -140,10 +143,11 @@ FOLDER = "camera"
 
 
 def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Path | None = None) -> ImageStream:
-    """The existing images in order of arrival; of several with one timestamp the last. They are in ``folder``, which must be
-    validated, by default that of the native format.
+    """Return the stream of the images that a table lists and that exist, in order of arrival. Of several images with the same
+    timestamp the last is kept.
 
-    InputError if a path leaves the folder or is no regular file, or a timestamp is late by more than 0.5 s.
+    ``folder``: the validated folder of the images, by default that of the native format. Raises InputError if a path leaves the
+    folder or is no regular file, or if a timestamp is more than 0.5 s late.
     """
     latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
@@ -159,22 +163,23 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Pa
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
-    """The images in a log's folder."""
+    """Return the stream of images of a log in the native format."""
     return make_images(rows["camera"], reading.t0_ns, reading.warnings)
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """The rows of images, which are copied to the folder; InputError for features, which cannot be written."""
+    """Return the rows of an image stream, and copy the images to the folder. Raises InputError for features, which cannot be
+    written."""
     if not isinstance(stream, ImageStream):
-        raise InputError(f"{writing.log}: camera holds features, expected the images they were computed from")
+        raise InputError(f"{writing.log}: the stream camera has features, expected the images they were computed from")
     return {
         "camera": {"t_ns": checks.absolute(stream.t, writing.t0_ns), "file": write_images(stream.file, writing.folder)}
     }
 
 
 def write_images(files: Sequence[Path], folder: Path) -> list[str]:
-    """Copy the images into the new folder ``camera`` in ``folder``, numbered, and return their names. InputError if one is
-    missing."""
+    """Copy the images into a new folder ``camera`` in ``folder`` and return their new names, which are numbers. Raises
+    InputError if an image is missing."""
     target = folder / FOLDER
     target.mkdir()
     names = [f"{i:06d}{file.suffix}" for i, file in enumerate(files)]
@@ -191,7 +196,7 @@ def _copy(file: Path, target: Path) -> None:
 
 
 def _image(folder: Path, source: str, name: str) -> Path | None:
-    """The path of an image in ``folder``, or None if there is no such file."""
+    """Return the path of the image ``name`` in ``folder``, or None if there is no such file."""
     try:
         path = inside(folder, name, source)
     except NoFileNameError:
@@ -204,13 +209,15 @@ BYTE = replace(FEATURES["descriptors"], kind="whole", low=0.0, high=255.0)
 
 
 def check_sightings(m: PixelSightings, where: str) -> dict[str, Any]:
-    """The fields of named points; InputError names the first invalid one."""
+    """Return the validated fields of named points. Raises InputError with the first invalid field. ``where``: the measurement's
+    name in messages."""
     points = values.names(where, "points", m.points)
     return {"points": points, "pixels": values.within(where, PAIRS, m.pixels, (len(points), 2))}
 
 
 def check_frame(m: CameraFrame | CameraImage, where: str) -> dict[str, Any]:
-    """The fields of an image's features; InputError names the first invalid one. Pixels of images are checked later."""
+    """Return the validated fields of an image's features. Raises InputError with the first invalid field. Returns {} for an
+    image, which is checked when its features are detected. ``where``: the measurement's name in messages."""
     if isinstance(m, CameraImage):
         return {}
     pixels = values.numbers(where, "pixels", m.pixels)
@@ -227,7 +234,7 @@ def check_frame(m: CameraFrame | CameraImage, where: str) -> dict[str, Any]:
 
 
 def _descriptors(where: str, value: object, count: int | None, feature: str) -> Any:
-    """Descriptors (K, D); bytes for a binary feature."""
+    """Return validated descriptors (K, D) of K = ``count`` features: bytes for a binary feature, otherwise floats."""
     rows = values.numbers(where, "descriptors", value)
     if rows.ndim != 2 or len(rows) != count:
         raise InputError(f"{where}: descriptors has shape {rows.shape}, expected ({count}, D)")

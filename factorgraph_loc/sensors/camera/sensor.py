@@ -1,8 +1,9 @@
-"""The camera sensor of a run: points of the map, by name or matched by appearance; and localization from images alone.
+"""The camera sensor of a run, and localization from images alone.
 
-For an unknown or wrong start, and for a kidnapped robot, one image with enough inliers gives the pose; otherwise
-several images must agree along the odometry. A track is suspicious if points of the map are persistently not found where they
-are predicted. If the start position is known, an image must agree with it.
+The sensor observes points of the map, which are identified by name or by appearance. At an unknown start, or after a
+kidnapping, one image with enough inliers determines the pose. Otherwise the poses by several images must agree along the
+odometry. An image must also agree with the start position if that is known. A track is suspicious if several consecutive images
+do not show the points of the map at their predicted positions.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ from factors.motion import ChainState, propagate
 from factors.se2 import Array
 from factors.update import Correction
 
-PASS = 10.0  # s: sightings within it share the error of a point's survey, if that is not estimated
-SOLVE_EVERY = 0.45  # s between solver updates; in between, images only update the newest pose, as in a filter
+PASS = 10.0  # s; sightings of a point within this time have the same survey error, so their noise is enlarged
+SOLVE_EVERY = 0.45  # s between updates of a graph's solver; other images only update the newest pose, as in a filter
 
 
 @dataclass(frozen=True)
 class PixelObservation(ResidualObservation):
-    """Points seen in one image.
+    """The observation of points in one image.
 
-    ``seen``: as a factor on the pose, and perhaps on the camera's constants and on displacements of points. ``expected`` (3,): the
-    predicted pose used to match them. ``held``: the camera's constants (P,) with their covariance (P, P), if the observation
-    depends on the pose only.
+    ``seen``: the factor of the points. It depends on the pose, and possibly on constants of the camera and displacements of
+    points. ``expected`` (3,): the pose that was predicted when the points were identified.
+    ``held``: estimates (P,) and covariance (P, P) of the camera's constants if the observation depends on the pose only.
     """
 
     iterations: ClassVar[int] = ITERATIONS
@@ -53,7 +54,7 @@ class PixelObservation(ResidualObservation):
 
     @classmethod
     def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
-        """The observation of ``seen``, whose values but for the pose are these ``blocks``."""
+        """Return the observation of a factor ``seen``, whose values after the pose are these ``blocks``."""
         return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(
@@ -86,7 +87,8 @@ class PixelObservation(ResidualObservation):
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, covariances)
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """The observation on the pose only; the uncertainty of the camera's constants and of points is added to the noise."""
+        """Return the observation as a function of the pose only. The uncertainty of the camera's constants and of displacements
+        of points is added to the noise."""
         if not self.blocks:
             return self
         seen, held, blocks = self.seen, None, self.blocks
@@ -96,7 +98,7 @@ class PixelObservation(ResidualObservation):
             assert seen.point_covariances is not None
             points, noise = seen.points.copy(), seen.point_covariances.copy()
             for row, which in enumerate(seen.moved_by):
-                if which >= 0:  # several points inform a common displacement no more than one
+                if which >= 0:  # points with a common displacement have the same error, so it must not average out
                     points[row] += values[blocks[which]]
                     noise[row] = seen.moved_by.count(which) * spreads[blocks[which]]
             seen = replace(seen, points=points, point_covariances=noise, moved_by=())
@@ -104,27 +106,27 @@ class PixelObservation(ResidualObservation):
 
 
 class CameraSensor(Sensor):
-    """A camera that sees points of the map. ``points``: matching and outlier rejection."""
+    """A camera that observes points of the map. ``points``: identifies points and rejects outliers."""
 
     modality = "camera"
     lost = "points in images were not where they were expected"
-    follows_constants = True  # matching depends on them
+    follows_constants = True  # matching depends on the estimated constants
 
     def __init__(self, binding: Binding, constants: Estimated) -> None:
         super().__init__(binding.name)
         motion, self._diagnostics = binding.motion, binding.diagnostics
         self._uncertain, self._motion = constants, motion
         self.constants = constants if binding.calibration == "all" else NOTHING
-        self._carries = binding.calibration != "particles"  # too many for particles
+        self._carries = binding.calibration != "particles"  # particles cannot estimate displacements of points
         self.points = KnownPoints(binding.setup, self._diagnostics, constants, binding.points, self.name)
-        # times [s] of recent looks at what was surveyed with an error and is not estimated
+        # times [s] of recent sightings of each inexactly surveyed point or marker whose displacement is not estimated
         self._looks: dict[str, list[float]] = defaultdict(list)
-        self._before: deque[tuple[float, TiltScale]] = deque()  # the filter of the floor before each image
+        self._before: deque[tuple[float, TiltScale]] = deque()  # the learnt tilt before each image
         self._shared = (self.name,) if constants.names else ()
         if len(self.points.map):
             self.finder = PixelFinder(self.points, motion)
-            # pixels of known points determine the pose so well that the graph need not be solved for each image, unless the
-            # camera's mounting is estimated
+            # pixels of known points determine the pose well, so a graph is not solved for each image, unless the camera's
+            # mounting is estimated
             self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:
@@ -161,7 +163,8 @@ class CameraSensor(Sensor):
         yield observation if self.constants.names or moving else observation.on_pose(values, spreads)
 
     def _looks_now(self, name: str, t: float) -> int:
-        """Add a look at a point or marker; how many there were within :data:`PASS`, with the error of its survey in common."""
+        """Record a sighting of a point or marker at ``t`` [s]. Returns the number of its sightings within :data:`PASS`
+        seconds."""
         times = [*(earlier for earlier in self._looks[name] if earlier > t - PASS), t]
         self._looks[name] = times
         return len(times)
@@ -184,7 +187,9 @@ class CameraSensor(Sensor):
 
 
 def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFactor:
-    """The factor on displacements too: the number of that of each point, or -1, ``which`` has its covariance in the state."""
+    """Return a factor that also depends on displacements of points. ``which`` (K): for each point the number of its
+    displacement among the values, or -1 for none. A point with a displacement has no survey noise, because the displacement
+    accounts for it."""
     covariances = factor.point_covariances
     if covariances is not None:
         covariances = np.where(np.array(which)[:, None, None] < 0, covariances, 0.0)
@@ -192,25 +197,27 @@ def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFa
 
 
 def bind(binding: Binding) -> CameraSensor | None:
-    """The sensor of a run, or None if it is not used. With particles, its constants are not estimated but widen the noise."""
+    """Return the camera sensor of a run, or None if the run does not use it. The particle filter does not estimate the camera's
+    constants; their uncertainty is added to the noise."""
     setup = binding.setup
     if setup.rig.find(CameraSettings) is None or not any(sensor in setup.sensors for sensor in CAMERAS):
         return None
     return CameraSensor(binding, NOTHING if binding.calibration == "none" else setup.rig.estimated("camera"))
 
 
-CLEAR, CLEAR_SHARE = 8, 0.5  # minimum number and share of inliers for a single image to be accepted
-AGREEING = 3  # images that must agree otherwise
-KEPT = 5.0  # s
-APART = 25.0  # squared Mahalanobis distance above which two poses disagree
-LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m, m, rad: lower bound of the covariance
-POOR_FRAMES, POOR_TIME = 3, 0.3  # images, and s, with missing points before a track is suspicious
+CLEAR, CLEAR_SHARE = 8, 0.5  # a single image is sufficient if it has this number and fraction of inliers
+AGREEING = 3  # otherwise so many images must agree
+KEPT = 5.0  # s; older images are discarded
+APART = 25.0  # two poses disagree if their squared Mahalanobis distance is larger
+LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m^2, m^2, rad^2; added to covariances of poses by images
+POOR_FRAMES, POOR_TIME = 3, 0.3  # a track is suspicious if points are missing in so many images, for so long [s]
 SEARCH_INTERVAL = 1.0  # s between unsuccessful searches
 
 
 @dataclass(frozen=True)
 class _Fix:
-    """A pose (3,) with body-frame ``covariance`` (3, 3) from one image."""
+    """The pose (3,) by one image, with body-frame ``covariance`` (3, 3). ``odometry``: the odometry state at the image.
+    ``clear``: True if this image alone is sufficient."""
 
     odometry: ChainState
     pose: Array
@@ -219,7 +226,7 @@ class _Fix:
 
 
 class PixelFinder:
-    """Finds poses from images; see the module."""
+    """Finds the pose from images without a prediction. It implements :class:`~factorgraph_loc.sensors.base.Finder`."""
 
     at_once = True
 
@@ -232,12 +239,12 @@ class PixelFinder:
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry state at the last image that gave a pose, or None."""
+        """The odometry state at the last image with a pose, or None."""
         return self._fixes[-1].odometry if self._fixes else None
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
-        """The poses of the last image."""
+        """The pose by the last image as the only hypothesis, or ()."""
         if not self._fixes:
             return ()
         last = self._fixes[-1]
@@ -245,14 +252,14 @@ class PixelFinder:
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last image, if it is unambiguous or other images agree."""
+        """The pose at the last image if it is unambiguous or if other images agree, otherwise None."""
         if not self._fixes or not (self._fixes[-1].clear or self._agree()):
             return None
         last = self._fixes[-1]
         return PosePrior(last.odometry.t, last.pose, se2.body_to_world(last.pose, last.covariance))
 
     def _suspicious_since(self) -> float | None:
-        """The time since which points are not where they are predicted, or None."""
+        """Return the time [s] since which images do not show points at their predicted positions, or None."""
         poor: list[float] = []
         for t, missed in reversed(self._stamps):
             if not missed:
@@ -262,14 +269,13 @@ class PixelFinder:
         return poor[-1] if enough else None
 
     def follow(self, observation: object, odometry: ChainState, view: object) -> None:
-        """Nothing to record: missing points show whether the track is lost."""
+        """Do nothing, because :meth:`refuted_since` judges the track by missing points."""
 
     def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """The time since which the track must have been wrong, after an image was processed at its ``pose`` (3,): points have
-        been missing since then, and the last images agree on another pose. None if they do not.
+        """Return the time [s] since which the track must have been wrong, or None. Call this after an image was processed.
 
-        The track's covariance is not used, because an uncertain track misses points by searching in the wrong place. Earlier
-        results from after that time are discarded.
+        The track is wrong if points have been missing since that time, and the last images agree on a pose other than ``pose``
+        (3,). The covariance of the track is not used. A large covariance would excuse a track that misses points.
         """
         self._stamps = [s for s in self._stamps if s[0] < m.t]
         self._stamps.append((m.t, self._points.missed))
@@ -284,7 +290,7 @@ class PixelFinder:
         return since if self._agree() else None
 
     def look(self, m: Pixels, odometry: ChainState) -> bool:
-        """Find the pose from an image alone; False if that fails."""
+        """Find the pose from an image alone. Returns False if no pose is found."""
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
@@ -301,21 +307,22 @@ class PixelFinder:
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Poses (N, 3) sampled from the last image's result."""
+        """Return poses (N, 3) sampled around the pose by the last image."""
         last = self._fixes[-1]
         body = last.covariance + LEAST
         return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))
 
     def clear(self) -> None:
-        """Forget the images: a new track starts, or the current one is trusted."""
+        """Discard the images, because a new track starts or the current track is trusted."""
         self._fixes, self._stamps = [], []
 
     @staticmethod
     def _is_not_from(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
+        """True if a robot that started at the known position cannot be at the pose by an image."""
         return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
-        """Whether the last images agree along the odometry."""
+        """True if the poses by the last images agree along the odometry."""
         if len(self._fixes) < AGREEING:
             return False
         *others, last = self._fixes[-AGREEING:]
@@ -327,6 +334,7 @@ class PixelFinder:
 
 
 def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
-    """Squared Mahalanobis distance of a pose from an image to a pose (3,) with body-frame covariance (3, 3)."""
+    """Return the squared Mahalanobis distance between ``pose`` (3,) with body-frame ``covariance`` (3, 3) and the pose by an
+    image."""
     error = se2.log(se2.between(pose, fix.pose))
     return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

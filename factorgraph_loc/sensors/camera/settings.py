@@ -1,4 +1,4 @@
-"""The camera settings of a rig, with those of feature detection, and the settings of simulated pixels."""
+"""Settings of a rig's camera, of feature detection, and of simulated points in images."""
 
 from __future__ import annotations
 
@@ -27,25 +27,23 @@ Lens = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Side = Annotated[int, Field(ge=16, le=100_000), InUnit("px")]
 Distance = Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")]
 Turn = Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")]
-COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # of distortion
+COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}  # possible numbers of coefficients
 WIDEST_ANGLE = math.degrees(math.atan(math.sqrt(reprojection.WIDEST)))
 
 
 class FrontendSettings(FileModel):
-    """Settings of the detection of features and markers."""
+    """Settings of feature detection in images."""
 
     feature: Feature = "colour"
-    """kind of feature to detect, if the map's points have no descriptors"""
+    """kind of feature to detect, if the points of the map do not determine it"""
     count: Annotated[int, Field(ge=10, le=20_000)] = 500
     """largest number of features per image"""
     everywhere: bool = False
-    """whether all parts of an image have equally many features, if possible, not the strongest ones; always so without a map of
-    points
-    """
+    """spread the features evenly over the image instead of using the strongest ones; always true without a map of points"""
 
 
 class CameraUncertainty(FileModel):
-    """Standard deviations of constants that differ between robots or runs; those above 0 are estimated."""
+    """Standard deviations of the camera's constants before a run. A constant is estimated if its value is above 0."""
 
     x: Distance = 0.0
     """standard deviation of the constant"""
@@ -60,13 +58,13 @@ class CameraUncertainty(FileModel):
     yaw: Turn = 0.0
     """standard deviation of a rotation about the robot's z axis"""
     focal: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """standard deviation of the focal length, relative"""
+    """relative standard deviation of the focal length"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
     """standard deviation of the constant"""
 
 
 class CameraSettings(SensorSettings):
-    """A camera. See :class:`factors.camera.model.CameraModel` for the model."""
+    """Image size, lens, mounting and noise of a camera. The model is :class:`factors.camera.model.CameraModel`."""
 
     constants: ClassVar[tuple[str, ...]] = reprojection.PARAMETERS
     width: Side = 640
@@ -78,13 +76,13 @@ class CameraSettings(SensorSettings):
     fy: Focal
     """focal length in pixels along a column"""
     cx: Pixel
-    """principal point; 0 is the centre of the upper left pixel"""
+    """column of the principal point; 0 is the centre of the left pixels"""
     cy: Pixel
-    """principal point; 0 is the centre of the upper left pixel"""
+    """row of the principal point; 0 is the centre of the upper pixels"""
     distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
     """kind of lens, as in ROS; equidistant is OpenCV's fisheye"""
     distortion: Annotated[tuple[Lens, ...], Field(min_length=4, max_length=8)] = (0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2 as in OpenCV, and k3, or k3 to k6; k1 to k4 of equidistant"""
+    """coefficients as in OpenCV: k1, k2, p1, p2, then k3 or k3 to k6; of an equidistant lens k1 to k4"""
     x: Offset = 0.0
     """position of the camera on the robot, forward"""
     y: Offset = 0.0
@@ -92,21 +90,21 @@ class CameraSettings(SensorSettings):
     z: Offset = 0.0
     """height of the camera"""
     roll: Angle = 0.0
-    """rotation about the robot's x axis, first, from looking forward"""
+    """first rotation of a camera that looks forward, about the robot's x axis"""
     pitch: Angle = 0.0
-    """rotation about the robot's y axis, then; down is positive"""
+    """second rotation, about the robot's y axis; down is positive"""
     yaw: Angle = 0.0
-    """rotation about the robot's z axis, last; left is positive"""
+    """third rotation, about the robot's z axis; left is positive"""
     pixel_sigma: Annotated[float, Field(ge=0.01, le=100.0), InUnit("px")] = 1.0
-    """standard deviation of a matched feature, including errors of lens and mounting"""
+    """standard deviation of a pixel coordinate, including errors of lens and mounting"""
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 2.0
     """scale of Huber's loss, in standard deviations"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.03
     """exponent of the likelihood of features matched with a map, whose errors are correlated between images"""
     frontend: FrontendSettings = FrontendSettings()
-    """features that are detected in images"""
+    """settings of feature detection"""
     uncertainty: CameraUncertainty = CameraUncertainty()
-    """standard deviations of constants; those above 0 are estimated"""
+    """standard deviations of constants; a constant is estimated if its value is above 0"""
 
     @model_validator(mode="after")
     def _has_its_numbers(self) -> CameraSettings:
@@ -114,7 +112,7 @@ class CameraSettings(SensorSettings):
         if len(self.distortion) not in counts:
             expected = " or ".join(map(str, counts))
             raise ValueError(
-                f"the distortion has {len(self.distortion)} numbers, {self.distortion_model} has {expected}"
+                f"distortion has {len(self.distortion)} numbers, expected {expected} for a {self.distortion_model} lens"
             )
         return self
 
@@ -154,11 +152,11 @@ class CameraSettings(SensorSettings):
 
 
 class PixelSettings(FileModel):
-    """Detection of named points."""
+    """Settings of named points in simulated images."""
 
     rate: Hertz = 5.0
-    """observations per second"""
+    """images per second"""
     max_points: Annotated[int, Field(ge=1, le=10_000)] = 20
-    """most points per image, chosen at random among the visible ones"""
+    """largest number of points per image, chosen at random among the visible ones"""
     wrong: Share = 0.0
-    """share of points that are reported at a random pixel"""
+    """fraction of points that are reported at a random pixel"""

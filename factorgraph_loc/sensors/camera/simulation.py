@@ -1,4 +1,4 @@
-"""Simulated pixels of visible named points, from the camera model without rendering."""
+"""Simulates the pixels of visible named points by the camera model, without rendering images."""
 
 import math
 from dataclasses import replace
@@ -15,12 +15,12 @@ from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.se2 import Array
 
-NEAR, FAR = 0.3, 10.0  # m of depth within which points are detected
-OBLIQUE = math.radians(75.0)  # angle to a surface's normal above which nothing on it is detected
+NEAR, FAR = 0.3, 10.0  # m; a point is detected if its depth is within these bounds
+OBLIQUE = math.radians(75.0)  # a point is detected if the angle between line of sight and surface normal is below this
 
 
 def simulate(ride: Ride) -> Simulated:
-    """The named points that the camera of a simulated drive detects, in a world with points."""
+    """Return the named points that the camera detects on a simulated drive. The result is empty without points in the world."""
     if ride.world.points is None:
         return Simulated()
     settings, camera = ride.settings.pixels, ride.rig.of(CameraSettings)
@@ -30,7 +30,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Rate [Hz] of the simulated images; ValueError if the rig has no camera."""
+    """Return {"points": the largest number of simulated detections per second}. Raises ValueError if the world has points, but
+    the rig has no camera."""
     if settings.world.points and settings.rig.find(CameraSettings) is None:
         raise ValueError("the world has points, expected a rig with a camera")
     return {"points": settings.pixels.rate * settings.world.points}
@@ -39,8 +40,11 @@ def looks(settings: Any) -> dict[str, float]:
 def pixel_stream(
     model: CameraModel, world: World, times: Array, poses: Array, settings: PixelSettings, rng: np.random.Generator
 ) -> SightingStream:
-    """The points that the camera detects at ``times`` (N,) from robot ``poses`` (N, 3): points of the map inside the image,
-    within range, not too oblique, and not occluded by walls or furniture of any height."""
+    """Simulate the points that the camera detects at ``times`` (N,) [s] from robot ``poses`` (N, 3).
+
+    A point is visible if it is inside the image, within range, not on a surface that is seen too obliquely, and not occluded.
+    Walls and furniture occlude points at any height.
+    """
     points = world.points
     assert points is not None, "the world has points"
     positions, normals = points.positions, surface_normals(world, points.positions[:, :2])
@@ -67,7 +71,8 @@ def pixel_stream(
 
 
 def surface_normals(world: World, places: Array) -> Array:
-    """Unit normals (K, 2) of the walls nearest to ``places`` (K, 2), on the side of each place."""
+    """Return the unit normal (K, 2) of the wall nearest to each position in ``places`` (K, 2). It points to the side of the
+    position."""
     best = np.full(len(places), np.inf)
     out = np.zeros((len(places), 2))
     for x1, y1, x2, y2 in world.walls:
@@ -83,7 +88,8 @@ def surface_normals(world: World, places: Array) -> Array:
 
 
 def _at_most(count: int, frames: Array, rng: np.random.Generator) -> Array:
-    """Indices of at most ``count`` random rows of each of the ``frames`` (K,), which are sorted."""
+    """Return sorted indices of at most ``count`` random rows per frame. ``frames`` (K,): the sorted frame number of each
+    row."""
     shuffled = np.lexsort((rng.random(len(frames)), frames))
     starts = np.searchsorted(frames, frames)
     return np.sort(shuffled[np.arange(len(frames)) - starts < count])

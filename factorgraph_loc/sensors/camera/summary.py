@@ -1,8 +1,8 @@
-"""Summary of a log's images and named points, with warnings, and their pictures.
+"""Summarises the images and named points of a log, with warnings, and provides the images for viewers.
 
-A check of the mounting: a robot that turns by an angle about the vertical rotates a camera by that angle times the vertical part
-of its optical axis about that axis, and the image by the opposite. So images of a floor camera turn with the robot,
-and those of a forward camera only shift.
+The mounting of the camera is checked by the rotation of images. If a robot turns by an angle, the image rotates about the
+optical axis by that angle times the downward component of the axis. Images of a camera that points at the floor rotate with the
+robot, images of a camera that points forward only shift.
 """
 
 import math
@@ -28,14 +28,17 @@ from factorgraph_loc.vision.matching import match
 from factors import se2
 from factors.se2 import Array
 
-LOOKED_AT = 40  # images that are examined, evenly over the log
-SHOWN = 5  # names in a line
+LOOKED_AT = 40  # number of images that are examined, evenly over the log
+SHOWN = 5  # number of names that a warning lists
 
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """The images: their number; of the ``looked_at`` examined ones how many are ``readable``, their ``sizes`` (WIDTHxHEIGHT:
-    count), the median number of ``features``, and the first ``fault``."""
+    """A summary of the images of a log. ``images``: their number. The other fields describe the ``looked_at`` examined images.
+
+    ``readable``: number of readable images. ``sizes``: number of images by size WIDTHxHEIGHT. ``feature``: kind of the
+    features. ``features``: their median number per image. ``fault``: the first error message, or None.
+    """
 
     images: int
     looked_at: int
@@ -48,8 +51,11 @@ class ImageSummary:
 
 @dataclass(frozen=True)
 class PixelSummary:
-    """Named points. ``frames``: timestamps; ``known``: points of the map that are seen; ``unknown``: rows by names that the map
-    lacks; ``outside``: rows outside of the image."""
+    """A summary of the named points in images of a log.
+
+    ``rows``: number of sightings. ``frames``: number of timestamps. ``known``: number of different points that are in the map.
+    ``unknown``: number of sightings of each name that the map lacks. ``outside``: number of sightings outside of the image.
+    """
 
     rows: int
     frames: int
@@ -59,7 +65,8 @@ class PixelSummary:
 
 
 def summarize(log: Log) -> Summary:
-    """``images``, an :class:`ImageSummary`, and ``pixels``, a :class:`PixelSummary`; None if the log lacks the stream."""
+    """Return a summary with warnings. Its entries are ``images``, an :class:`ImageSummary`, and ``pixels``, a
+    :class:`PixelSummary`. An entry is None if the log lacks the stream."""
     images, pixels = summarize_images(log), summarize_pixels(log)
     text = []
     if images is not None:
@@ -78,7 +85,7 @@ def summarize(log: Log) -> Summary:
 
 
 def summarize_images(log: Log) -> ImageSummary | None:
-    """Summary of the stream ``camera`` from some of its images, or None."""
+    """Return a summary of the stream ``camera`` from some of its images, or None if the log has no images."""
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return None
@@ -101,7 +108,7 @@ def summarize_images(log: Log) -> ImageSummary | None:
 
 
 def summarize_pixels(log: Log) -> PixelSummary | None:
-    """Summary of the stream ``sightings``, or None."""
+    """Return a summary of the stream ``sightings``, or None if the log lacks it."""
     stream = log.streams.get("sightings")
     if not isinstance(stream, SightingStream):
         return None
@@ -121,11 +128,11 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
 
 
 def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[Notice]:
-    """Warnings about images and named points."""
+    """Return warnings about images and named points."""
     out = list[Notice]()
     if log.rig.find(CameraSettings) is None:
         streams = [name for name, summary in (("images", images), ("identified pixels", pixels)) if summary is not None]
-        sentence = "the log has {stream}, but its rig has no [camera]: they are not used"
+        sentence = "the log has {stream}, which are not used, because its rig has no [camera]"
         out += [notice("unused_camera", sentence, name) for name in streams]
     if images is not None:
         if images.fault is not None:
@@ -150,26 +157,27 @@ def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary 
 
 
 def _calibration(log: Log, images: ImageSummary) -> list[Notice]:
+    """Return a warning if no examined image has the size that the camera is calibrated for."""
     camera = log.rig.find(CameraSettings)
     if camera is None or not images.sizes:
         return []
     size = f"{camera.width}x{camera.height}"
     sizes = [s for s in images.sizes if s != size]
     if len(sizes) == len(images.sizes):
-        sentence = "the camera is calibrated for images of {expected} px, those of the log have {size} px"
+        sentence = "the camera is calibrated for images of {expected} px, but the images of the log have {size} px"
         return [notice("image_size", sentence, size, sizes[0])]
     return []
 
 
-PAIRS, FEWEST_PAIRS = 12, 5  # of compared images, with the largest turns of the robot; fewer are not enough
-TURNS = (0.03, 0.6)  # rad between two images, least and most
+PAIRS, FEWEST_PAIRS = 12, 5  # largest and smallest number of pairs of consecutive images that are compared
+TURNS = (0.03, 0.6)  # rad; bounds of the robot's rotation between two compared images
 FEATURE, COUNT, FEWEST_MATCHES = "orb", 400, 12
-APART = 0.5  # least reported difference of the vertical parts of the optical axis
+APART = 0.5  # a warning is given if the downward component of the optical axis differs from that of the rig by more
 
 
 def mounting_problems(log: Log) -> list[Notice]:
-    """One line if the rotation of the images contradicts the mounting of the camera in the rig, else none. The check needs a
-    camera in the rig, a reference with headings, and enough usable images; otherwise there is no line."""
+    """Return a warning if the rotation of the images contradicts the mounting of the camera in the rig, otherwise []. The check
+    needs a camera in the rig, a reference with headings, and enough usable images. Without these it returns []."""
     stream, camera = log.streams.get("camera"), log.rig.find(CameraSettings)
     if not isinstance(stream, ImageStream) or camera is None or log.reference is None or not log.reference.has_heading:
         return []
@@ -183,14 +191,15 @@ def mounting_problems(log: Log) -> list[Notice]:
         return []
     where = "at the floor" if share > APART else "at the ceiling" if share < -APART else "ahead"
     sentence = (
-        "images turn {ratio:.2f} times as much as the robot, as of a camera that looks {where}, by the rig's mounting "
-        "{expected:.2f} times: is its pitch about {pitch:.1f}, not {stated:.1f}?"
+        "images rotate {ratio:.2f} times as much as the robot, as if the camera looks {where}; by the rig's mounting the ratio "
+        "is {expected:.2f}: is camera.pitch about {pitch:.1f}, not {stated:.1f}?"
     )
     return [notice("camera_mounting", sentence, share, where, expected, math.asin(share), camera.pitch)]
 
 
 def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
-    """The turns [rad] of robot and image between consecutive images, if both can be estimated."""
+    """Yield the rotations [rad] of robot and image between pairs of consecutive images with large rotations. Pairs whose image
+    rotation cannot be estimated are skipped."""
     assert log.reference is not None
     headings = log.reference.at(stream.t + log.rig.time_offset("camera"))[:, 2]
     turns = se2.wrap(np.diff(headings))
@@ -202,7 +211,8 @@ def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
 
 
 def _turned(files: Sequence[Path]) -> float | None:
-    """The rotation [rad] of an image relative to the previous one, from right to down; None if it cannot be estimated."""
+    """Return the rotation [rad] of the second of two images relative to the first, positive from right to down. Returns None if
+    it cannot be estimated."""
     finder = extractor(FEATURE, COUNT)
     features = []
     for file in files:
@@ -225,7 +235,7 @@ JPEG_QUALITY = 90
 
 
 def draw(log: Log) -> Marks:
-    """The points of the map."""
+    """Return what a viewer shows of the camera: the points of the map."""
     points = log.world.points
     positions = np.empty((0, 3)) if points is None else points.positions
     return Marks(
@@ -234,12 +244,12 @@ def draw(log: Log) -> Marks:
 
 
 def has_pictures(log: Log) -> bool:
-    """Whether the log has images or named points in images."""
+    """True if the log has images or named points in images."""
     return "camera" in log.streams or "sightings" in log.streams
 
 
 def images(log: Log) -> Iterator[tuple[float, bytes]]:
-    """Time and JPEG of each image of the camera; InputError names one that cannot be read."""
+    """Yield time [s] and JPEG bytes of each image of the camera. Raises InputError at an image that cannot be read."""
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return
@@ -248,7 +258,7 @@ def images(log: Log) -> Iterator[tuple[float, bytes]]:
 
 
 def sightings(log: Log) -> Iterator[tuple[float, tuple[str, ...], Array]]:
-    """Time, names (K) and pixels (K, 2) of the named points in each image."""
+    """Yield time [s], names (K) and pixels (K, 2) of the named points in each image."""
     stream = log.streams.get("sightings")
     if not isinstance(stream, SightingStream):
         return

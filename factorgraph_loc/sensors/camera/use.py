@@ -1,4 +1,4 @@
-"""A camera in a run: checks of the settings, and preparation of images."""
+"""Prepares a run with a camera: checks the settings, and replaces images by features."""
 
 from __future__ import annotations
 
@@ -30,33 +30,34 @@ if TYPE_CHECKING:
 
 
 def check(use: Use) -> Use:
-    """The run, with points estimated where the map has none and no other sensor needs a map, unless the user's settings say what is
-    done."""
+    """Return the run, with changed settings if the map has no points for the camera. The points are then estimated
+    (``landmarks=unknown``), with a warning. This requires an estimator that can, no other sensor that needs a map, and no
+    choice by the user."""
     motion = moving(use.sensors, TURN)
     unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use)
     if "landmarks" in use.given or not unmapped or any(name not in (*CAMERAS, *motion) for name in use.sensors):
         return use
     settings = use.settings.model_copy(update={"landmarks": "unknown"})
-    sentence = "{log}: the map has nothing that the camera could find: it is estimated ({estimator}.landmarks=unknown)"
+    sentence = "{log}: the map has no points for the camera: points are estimated ({estimator}.landmarks=unknown)"
     warning = notice("map_estimated", sentence, use.log.name, use.estimator)
     return replace(use, settings=settings, warnings=(*use.warnings, warning))
 
 
 def review(use: Use, _ending: Ending) -> Review:
-    """The warnings of a run."""
+    """Return the warnings about the camera's use of the map in a run."""
     return Review(tuple(_doubts(use)))
 
 
 def _doubts(use: Use) -> Iterator[Notice]:
-    """A map without points that the camera could find, where the estimator needs them; a known map that was not wanted."""
+    """Yield a warning if the estimator needs points that the map lacks, or if it uses a map that the settings exclude."""
     landmarks = getattr(use.settings, "landmarks", "known")
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:
-            sentence = "{log}: {estimator} does not estimate points: those of the map are used unchanged"
+            sentence = "{log}: {estimator} cannot estimate points: the points of the map are used unchanged"
             yield notice("fixed_points", sentence, use.log.name, use.estimator)
     elif _uses_camera(use) and not (use.estimates_points and landmarks != "known"):
         alternative = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
-        sentence = "{log}: the map has no points that a camera could find: give --world{alternative}"
+        sentence = "{log}: the map has no points for the camera: give --world{alternative}"
         yield notice("no_points", sentence, use.log.name, alternative)
 
 
@@ -65,7 +66,7 @@ def _uses_camera(use: Use) -> bool:
 
 
 def _has_points(use: Use) -> bool:
-    """Whether the camera is used, and the map has points that it could find."""
+    """True if the run uses the camera, and the map has points that the camera can identify."""
     points = use.log.world.points
     if points is None or not _uses_camera(use):
         return False
@@ -74,8 +75,8 @@ def _has_points(use: Use) -> bool:
 
 @dataclass(frozen=True)
 class PreparedLog:
-    """A ``log`` that can be run, with images replaced by features. ``images``: number of images whose features were computed or
-    loaded from the cache, in ``seconds``."""
+    """A ``log`` whose images are replaced by features. ``images``: number of images whose features were computed or loaded from
+    the cache. ``seconds``: the time that this took."""
 
     log: Log
     warnings: tuple[Notice, ...] = ()
@@ -84,9 +85,10 @@ class PreparedLog:
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
-    """The feature settings: those of the map's points, else those of the rig's camera.
+    """Return the settings of feature detection. The kind of feature is that of the map's points, otherwise that of the rig's
+    camera.
 
-    Without a map features are taken everywhere, since most of the strongest may be those of a thing that moves.
+    Without a map, features are spread over the image, because most of the strongest features may be on a moving object.
     """
     camera = rig.find(CameraSettings)
     settings = FrontendSettings() if camera is None else camera.frontend
@@ -96,7 +98,8 @@ def frontend_of(rig: Rig, world: World) -> FrontendSettings:
 
 
 def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
-    """Timestamps (N,) and features of a log's images after feature detection; InputError if it has none."""
+    """Return timestamps (N,) [s] and features of a log's images after feature detection. Raises InputError if the log has no
+    images."""
     stream = log.streams.get("camera")
     if not isinstance(stream, FeatureStream):
         raise InputError(f"{log.name}: has no images (camera), so there are no points to map")
@@ -104,7 +107,7 @@ def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
 
 
 def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
-    """Replace images by features if the run uses them, else by empty frames."""
+    """Replace the images of a log by features if the run uses them, otherwise by frames without features."""
     log, stream = use.log, use.log.streams.get("camera")
     if "camera" not in use.sensors or not isinstance(stream, ImageStream):
         return PreparedLog(log)
@@ -118,18 +121,18 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
 
 
 def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
-    """Frames without features; their timestamps still define the start and end of the run."""
+    """Replace images by frames without features, whose timestamps still define start and end of the run. Add a warning."""
     nothing = CameraFrame(0.0, "", np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64))
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
     sentence = "{log}: {estimator} does not use images: all {images} are ignored"
     warning = (notice("unused_images", sentence, log.name, estimator, len(stream.t)),)
-    by_name = estimator == "dead_reckoning"  # obvious from its name
-    return PreparedLog(replace(log, streams={**log.streams, "camera": frames}), () if by_name else warning)
+    is_obvious = estimator == "dead_reckoning"  # its name says that it uses odometry only
+    return PreparedLog(replace(log, streams={**log.streams, "camera": frames}), () if is_obvious else warning)
 
 
 class CameraIntake(Intake):
-    """Detects and tracks features in pushed images. Descriptors of a feature have the length of the map's, or of the first
-    frame's."""
+    """Detects and tracks features in pushed images. It checks that all descriptors of a kind of feature have the same length,
+    that of the map or of the first frame."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         points = world.points

@@ -217,7 +217,9 @@ def test_a_calibration_of_another_resolution_is_an_error(log, scale):
     for file in log.streams["camera"].file:
         cv2.imwrite(str(file), cv2.resize(cv2.imread(str(file)), None, fx=scale, fy=scale))
     size = f"{round(160 * scale)} x {round(120 * scale)}"
-    with pytest.raises(InputError, match=f"calibrated for images of 160 x 120 px, those of the log have {size} px"):
+    with pytest.raises(
+        InputError, match=f"calibrated for images of 160 x 120 px, but the images of the log have {size} px"
+    ):
         with_features(log, ORB)
 
 
