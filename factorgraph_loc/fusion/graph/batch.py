@@ -1,8 +1,9 @@
-"""The offline optimum: the whole run as one robust least-squares problem, solved once all measurements are there.
+"""The offline optimum: the whole run as one robust least-squares problem, solved after the last measurement.
 
-The losses may have many optima. One is found from the start, a second by graduated non-convexity: the losses begin wide and narrow
-to their own scale (Yang, Antonante, Tzoumas, Carlone, RA-L 5(2), 2020, here for the Geman-McClure loss). Most links
-between poses may be false, so their losses begin wide enough to be convex. The better optimum counts.
+Robust losses may have several local optima. One is found directly from the initial values. A second one is found by graduated
+non-convexity: the scales of the losses are large at first, and decrease to their normal values (Yang, Antonante, Tzoumas, Carlone,
+RA-L 5(2), 2020, here for the Geman-McClure loss). Many links between poses, such as loop closures, may be false. Their scales begin
+so large that the losses are convex. The result is the better one of the two optima.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from factors.graph import Factor, PriorFactor, Values, VectorPriorFactor, gather
 from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5
-WIDEST = 8.0  # how many times wider than its own scale a robust loss begins where the problem is solved from a guess
-NARROWED = 0.5  # width of a loss after a step, relative to the width before
+WIDEST = 8.0  # the initial factor on the scales of robust losses, if the initial values are rough
+NARROWED = 0.5  # the factor by which the scales decrease in each step
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
-    """All measurements of a graph as one problem; its robust losses are ``width`` times as wide as usual, those of links
-    ``link_width`` times."""
+    """All measurements of a graph as one problem. ``width``: a factor on the scales of robust losses. ``link_width``: that for the
+    losses of links between poses."""
     assert graph.prior is not None
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
@@ -40,7 +41,7 @@ def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> 
 
 
 def convex_width(graph: Graph, values: Values) -> float:
-    """How many times as wide the losses of links must be for all of them to be convex at ``values``, at least 1."""
+    """The factor, at least 1, on the scales of the losses of all links that makes these losses convex at ``values``."""
     linked = {name: sensor for name, sensor in graph.sensors.items() if sensor.links}
     nodes = (node for k in graph.keyframes.values() for node in k.nodes if linked and node.sensor in linked)
     return max(
@@ -50,8 +51,8 @@ def convex_width(graph: Graph, values: Values) -> float:
 
 
 def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, Solution]:
-    """The problem of a graph and the best optimum found from ``start``: directly, or with losses that begin ``widest`` times as
-    wide."""
+    """The problem of a graph, and the better one of two optima found from the values ``start``: directly, and by graduated
+    non-convexity. ``widest``: the initial factor on the scales of losses. With 1, and without links, only the first is computed."""
     problem = whole_problem(graph)
     best = problem.solve(start)
     width = max(widest, convex_width(graph, start))
@@ -61,15 +62,16 @@ def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, S
     while width > 1.0:
         values = whole_problem(graph, min(width, widest), width).solve(values, ITERATIONS_PER_WIDTH).values
         width *= NARROWED
-    # either way may end in the worse optimum
+    # either of the two may be the better optimum
     return problem, min(best, problem.solve(values), key=lambda s: s.cost)
 
 
 def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, Array]:
-    """Solve a graph with all its measurements, without sightings that cannot be of their points.
+    """Solve a graph with all its measurements. Sightings that are certainly false matches of their points are removed.
 
-    Returned are poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes; the constants are written into the graph.
-    ``is_guess``: whether the robust losses begin wider. RunFailedError where the measurements do not determine a variable.
+    ``start``: initial values of all variables. ``is_guess``: True if the initial values are rough, so that graduated non-convexity
+    is needed. Returns the poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes. The estimates of all other variables
+    are written into the graph. Raises RunFailedError if the measurements do not determine a variable.
     """
     graph.drop_astray(graph.keyframes.values(), start)
     problem, best = best_optimum(graph, start, WIDEST if is_guess else 1.0)
@@ -91,21 +93,24 @@ def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, 
 
 
 class AtTheEnd:
-    """A backend that keeps a guess, as an EKF would, and solves the problem at the end."""
+    """A backend of a graph that solves the problem only at the end of the run. During the run it has rough estimates like those of
+    an EKF, which are the initial values."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
-        self._guesses: Values = {}  # of all variables but poses
+        self._guesses: Values = {}  # rough estimates of all variables except poses
 
     def begin(self, newest: Keyframe) -> None:
-        """The graph begins, or keyframes were taken back and ``newest`` was added."""
+        """Begin with the keyframe ``newest``: at the start of the graph, or after keyframes were removed and ``newest`` was
+        added."""
         graph = self._graph
         graph.forget_landmarks(())
         self._guesses = {key: value for key, value in self._guesses.items() if key in graph.values}
         newest.causal = graph.pose, graph.covariance
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Take what was added to a keyframe, which may be new. ``guess``: of the pose of the newest one."""
+        """Accept new factors and variables on a keyframe, which may be new. ``guess``: pose and covariance of the newest keyframe,
+        or None if ``keyframe`` is an older one."""
         self._guesses |= addition.values
         if guess is not None:
             keyframe.causal = self._graph.pose, self._graph.covariance = guess
@@ -113,16 +118,16 @@ class AtTheEnd:
     extend = attach
 
     def current(self, key: int) -> Array:
-        """The newest estimate of a variable that is no pose."""
+        """The present estimate of a variable that is not a pose."""
         return self._guesses[key]
 
     def is_open(self, keyframe: int) -> bool:
-        """Whether factors may still be added to a keyframe."""
+        """True if factors may still be added to the keyframe with this number."""
         return keyframe in self._graph.keyframes
 
     is_kept = is_open
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """The optimum over the whole run."""
+        """Solve the whole run. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes."""
         poses = {k.key: k.causal[0] for k in graph.keyframes.values() if k.causal is not None}
         return solve_whole(graph, graph.constant_priors()[0] | self._guesses | poses, is_guess=True)

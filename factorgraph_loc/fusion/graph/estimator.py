@@ -1,14 +1,20 @@
-"""The graph estimators: the smoother, one factor graph over the run, and the batch solution.
+"""The graph estimators: the smoother, which is a factor graph over the run, and the batch solution.
 
-By default causal estimates come from a window, and poses older than 10 s are marginalised out. The whole problem is solved at the
-end. With ``lag = "all"`` the whole history stays in iSAM2. With a number of seconds each pose keeps its estimate at the time when
-it left the window. If landmarks or points are estimated, the default is the whole history, because a loop may close at any time.
-With ``final_only``, as in the batch, the graph is built with a guess and solved only at the end. If points are estimated, such a
-guess drifts too far for the association of sightings, and iSAM2 solves the graph online.
+By default, causal estimates come from a window: poses older than 10 s are marginalised. The whole problem is solved at the end.
+Other modes are settings:
 
-When the search rejects the track and finds another pose, the graph goes back to the time of the change, and goes on at that pose
-after a step of unknown length. Measurements are replayed in slices of fixed work, so that results do not depend on the machine;
-until the graph has caught up it does not claim to be localized.
+- ``lag = "all"`` keeps the whole history in iSAM2. This is the default if landmarks or points are estimated, because a loop may
+close
+  at any time.
+- ``lag`` in seconds sets the length of the window. The final trajectory has each pose's estimate from when the pose left the
+window.
+- ``final_only``, as in the batch, builds the graph with rough estimates and solves it only at the end. If points are estimated,
+rough
+  estimates drift too far to associate sightings with points, so iSAM2 solves the graph during the run.
+
+When the search rejects the track and finds another pose, the graph is cut at the time when the track became wrong. It continues at
+the new pose, after a step of unknown length. Later measurements are replayed in slices of fixed cost, so that results do not depend
+on the machine. The status is not ``localized`` before the replay has ended.
 """
 
 from __future__ import annotations
@@ -45,12 +51,12 @@ from factors.se2 import Array
 __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
 
 
-REPLAYED, TICK = 300, 2  # work of one slice of a replay, and of a tick; see `Sensor.work`
+REPLAYED, TICK = 300, 2  # costs of one slice of a replay, and of a tick, in the units of `Sensor.work`
 
 
 @dataclass(frozen=True)
 class _Conclusion:
-    """A graph that is solved to its end: poses (M, 3) and body-frame covariances (M, 3, 3) of all its keyframes."""
+    """A copy of the graph with its final solution: poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes."""
 
     graph: Graph
     poses: Array
@@ -60,7 +66,8 @@ class _Conclusion:
 class Smoother(Timeline):
     """Incremental factor graph (iSAM2): a window and the whole problem at the end, a fixed lag, or the full history. See above."""
 
-    estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
+    # the estimator can estimate points that the map lacks, depending on the setting `landmarks`
+    estimates_points = True
 
     def __init__(self, setup: Setup, settings: SmootherSettings) -> None:
         self._settings = settings
@@ -74,7 +81,7 @@ class Smoother(Timeline):
         self._graph = Graph(self._motion, sensors, mapper, self.diagnostics)
         self._search = self._seeking = Tracking(sensors, self._motion, setup.rng, diagnostics)
         self._search.remember()
-        # landmarks that are estimated cannot determine an unknown start
+        # estimated landmarks cannot determine an unknown start
         self.supports_unknown_start = settings.landmarks == "known"
         self._backend: Backend
         if settings.final_only and not mapper.estimates:
@@ -82,12 +89,13 @@ class Smoother(Timeline):
         else:
             self._backend = Incremental(self._graph, settings)
         self._builder = Builder(self._graph, self._backend, self._search, settings)
-        self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # at the last measurement
-        self._behind: deque[Measurement] = deque()  # measurements that are still to be replayed
-        self._conclusion: _Conclusion | None = None  # the end, until something is taken
+        # the integrated odometry at the last measurement
+        self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._behind: deque[Measurement] = deque()  # measurements that wait for the replay
+        self._conclusion: _Conclusion | None = None  # the final solution, discarded at each measurement
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian; without a heading, once the search has found it."""
+        """Start from a Gaussian prior of the pose. If the prior has no heading, the graph starts when the search has found one."""
         if not prior.has_heading:
             self._seek_heading(prior, self._search)
             return
@@ -110,7 +118,8 @@ class Smoother(Timeline):
             self._doubt(m)
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """The newest keyframe, moved along the odometry since; with ``final_only`` a guess, ``unlocalized``."""
+        """The newest keyframe's pose, predicted by odometry. With ``final_only`` it is a rough estimate with the status
+        ``unlocalized``."""
         at = self._t if t is None else max(t, self._t)
         pose, _, covariance = self._graph.moved(at)
         doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
@@ -120,30 +129,32 @@ class Smoother(Timeline):
         return PoseEstimate(at, pose, covariance, status)
 
     def learnt(self) -> Learnt:
-        """The constants and landmarks that are estimated, as the final trajectory has them."""
+        """The estimated constants and landmarks of the final solution."""
         if self._graph.prior is None:
             return _learnt(self._graph)
         end = self._concluded()
         return _learnt(end.graph, end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of the whole past at the stamps of the ticks, from the start on; empty if there was none."""
+        """The best estimate of all past poses, at the times of the ticks from the start on. Empty if the start was never found."""
         if self._graph.prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         end = self._concluded()
         return _trajectory(end.graph, end.poses, end.covariances)
 
     def final_diagnostics(self) -> Diagnostics:
-        """The diagnostics, and what the final trajectory adds to them."""
+        """The diagnostics of the run and of the final solution."""
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
     def forget(self, until: float) -> None:
-        """Forget the trajectory until this time, except for the part inside the window. Without a ``lag`` all is kept."""
+        """Delete the trajectory before the time ``until`` [s], except for the part in the window. If ``lag`` is not a number of
+        seconds, nothing is deleted."""
         if isinstance(self._backend, Incremental):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
     def _concluded(self) -> _Conclusion:
-        """A solved copy of the graph at its end. The original is not changed, so that later results do not depend on this call."""
+        """The final solution, on a copy of the graph. The graph itself is not changed, so that later results do not depend on this
+        call."""
         if self._conclusion is None:
             graph = self._graph.copy()
             graph.newest.nodes += self._builder.waiting()
@@ -167,7 +178,8 @@ class Smoother(Timeline):
         return PosePrior(t, pose, FOUND) if start is None else start.facing(float(pose[2]))
 
     def _doubt(self, m: Measurement) -> None:
-        """See whether the measurement refutes the track, and go on at the place that the search finds instead."""
+        """Check whether the search rejects the track after a measurement. If it does, continue at the pose that the search has
+        found."""
         graph, odometry = self._graph, self._odometry
 
         def track() -> Tracked:
@@ -185,9 +197,9 @@ class Smoother(Timeline):
             self._go_on(refuted, best)
 
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
-        """Remove the keyframes since the track was wrong, and replay their measurements from the ``best`` pose."""
+        """Remove the keyframes since the track became wrong, and replay their measurements, beginning at the pose ``best``."""
         graph, since = self._graph, refuted.since
-        first = graph.newest.index + 1  # the number of the first keyframe that is taken back
+        first = graph.newest.index + 1  # the number of the first keyframe to remove
         while first > 1 and graph.keyframes[first - 1].t >= since and self._backend.is_open(first - 2):
             first -= 1
         replay = self._take_back(max(since, graph.keyframes[first - 1].t))
@@ -210,7 +222,8 @@ class Smoother(Timeline):
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
-        """Where the robot was at ``t``, from the place that was found and the odometry since."""
+        """The robot's pose (3,) at time ``t`` [s], from a pose ``best`` of the search at a later time and the odometry in
+        between."""
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
 
@@ -225,7 +238,7 @@ class Smoother(Timeline):
         return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:
-        """Continue a replay by one slice of work."""
+        """Continue the replay of measurements by one slice of fixed cost."""
         work = REPLAYED
         while self._behind and work > 0:
             m = self._behind.popleft()
@@ -243,8 +256,8 @@ class Batch(Smoother):
 
 
 def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
-    """The constants and landmarks that are estimated; points at final ``poses`` of all keyframes, with their body-frame
-    ``covariances``."""
+    """The estimated constants, landmarks and points of a graph. ``poses``, ``covariances``: the final poses (3,) of all keyframes,
+    and their body-frame covariances (3, 3)."""
     blocks = [(name, graph.values[key], graph.covariances[key]) for name, key in graph.keys.items()]
     numbered = graph.keyframes.values()
     means, bodies = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
@@ -253,8 +266,11 @@ def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Arr
 
 
 def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:
-    """The trajectory from all keyframes, ``poses`` (M, 3) and body-frame ``covariances`` (M, 3, 3), at the ticks. Ticks with
-    an unknown pose are left out. See :func:`factors.motion.poses_between`."""
+    """The trajectory at the ticks, interpolated between keyframes. See :func:`factors.motion.poses_between`.
+
+    ``poses`` (M, 3), ``covariances`` (M, 3, 3): the final poses of all keyframes and their body-frame covariances. Ticks at which
+    the pose is unknown, because the robot was carried, are left out.
+    """
     newest = {tick.t: tick for tick in graph.ticks}
     stamps = np.array(sorted(newest))
     ticks = [newest[t] for t in stamps[is_known(stamps, graph.changes)].tolist()]

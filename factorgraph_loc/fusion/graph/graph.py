@@ -1,4 +1,5 @@
-"""A graph as data: its keyframes and other variables, the factors on them, and what maps points while it is solved."""
+"""The data of a factor graph: keyframes, other variables, and factors. Also the interface of mappers, which add points to a
+graph."""
 
 from __future__ import annotations
 
@@ -37,13 +38,13 @@ from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
-NOTHING_KNOWN = np.zeros(0)  # values of constants if none are estimated
+NOTHING_KNOWN = np.zeros(0)  # the values of the odometry's constants if none are estimated
 
 
 @dataclass(frozen=True)
 class Node:
-    """A factor of the graph on the variables ``keys``: one of ours with ``rows`` residuals, GTSAM's own (``native``),
-    or both, which are the same. ``sensor``: the name of the sensor that it comes from."""
+    """A factor of the graph. ``keys``: the keys of its variables. ``factor``: the factor, with ``rows`` residuals. ``native``: an
+    equivalent factor of GTSAM, which solvers prefer. At least one of both is set. ``sensor``: the name of the factor's sensor."""
 
     keys: tuple[int, ...]
     factor: Factor | None = None
@@ -57,11 +58,12 @@ Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
 
 @dataclass
 class Keyframe:
-    """A pose variable of the graph: its time, the odometry there, and the factors of what is seen from it.
+    """A pose variable of the graph.
 
-    ``from_previous``: the motion since the keyframe before, and ``factor``, the factor made of it. ``is_elsewhere``: whether the
-    robot was carried there from the keyframe before. ``causal``: the estimate while it was the newest one; ``final``: the estimate
-    with which it has left a window.
+    ``index``, ``key``: its number and its key. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time.
+    ``from_previous``: the motion since the previous keyframe. ``factor``: the factor of this motion, None until it is needed.
+    ``is_elsewhere``: True if the robot was carried from the previous keyframe to this one. ``nodes``: the factors of measurements.
+    ``causal``: the estimate while this was the newest keyframe. ``final``: the estimate when this keyframe left a window.
     """
 
     index: int
@@ -80,7 +82,8 @@ class Keyframe:
 
 
 class TickAt(NamedTuple):
-    """A stamp at which the trajectory is wanted, the number of the keyframe before it, and the odometry there."""
+    """A time ``t`` [s] at which the trajectory needs a pose. ``keyframe``: the number of the previous keyframe. ``odometry``: the
+    integrated odometry at ``t``."""
 
     t: float
     keyframe: int
@@ -89,33 +92,33 @@ class TickAt(NamedTuple):
 
 @dataclass
 class Addition:
-    """New factors of the graph, and new variables with their guesses."""
+    """New factors of the graph, and new variables with their initial ``values``."""
 
     nodes: list[Node] = field(default_factory=list)
     values: Values = field(default_factory=dict)
 
     def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
-        """Add factors, and keep them with a keyframe."""
+        """Add factors, which belong to a keyframe."""
         keyframe.nodes += nodes
         self.nodes += nodes
 
 
-# squared Mahalanobis distance of a pose from its guess; Gauss-Newton steps may diverge where points contain little information
+# Largest plausible squared Mahalanobis distance of a solved pose from its prediction. Gauss-Newton steps may diverge if points
+# contain little information.
 JUMPED = 50.0
 
 
 def jumps(guess: Guess, pose: Array) -> bool:
-    """Whether ``pose`` (3,) is where the robot, by the ``guess`` of it, cannot be."""
+    """True if a solved ``pose`` (3,) is not plausible given the prediction ``guess``."""
     return not positive.squared(se2.log(se2.between(guess[0], pose)), guess[1]) < JUMPED
 
 
 class Mapper:
-    """Makes variables of points that a sensor sees and no map has. This base class maps nothing.
+    """Adds points that a sensor observes and the map lacks to the graph, as variables. This base class adds nothing.
 
-    ``sensor``: the name of the one whose measurements it takes, "" for none. ``fewest``: number of sightings that a point of the
-    graph needs.
-    ``horizon``: number of recent keyframes that it needs. ``rejected``: why sightings of something else are rejected.
-    ``estimates``: whether points become variables. ``knows_scale``: whether their scale comes from elsewhere than the motion.
+    ``sensor``: the name of the sensor, "" for none. ``fewest``: the minimum number of sightings of a point in the graph.
+    ``horizon``: the number of recent keyframes that the mapper needs. ``rejected``: the message for rejected sightings.
+    ``estimates``: True if points become variables. ``knows_scale``: False if only odometry determines the scale of the points.
     """
 
     sensor: str = ""
@@ -126,46 +129,47 @@ class Mapper:
     knows_scale: bool = True
 
     def is_due(self, m: Any) -> bool:
-        """Whether a measurement needs a keyframe of its own."""
+        """True if a measurement must become a keyframe."""
         return False
 
     def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
-        """Add the information of a measurement from the newest keyframe to an ``addition``. Returns the corrected guess of its
-        pose."""
+        """Process a measurement at the newest keyframe, and add its factors and points to ``addition``. ``guess``: pose and
+        covariance of the keyframe. Returns these, corrected by the measurement."""
         return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:
-        """Whether a node is a sighting that cannot be of its point."""
+        """True if a node is a sighting that is certainly a false match of its point."""
         return False
 
     def point(self, node: Node) -> int | None:
-        """The key of the point that a node is a sighting of."""
+        """The key of the point if a node is a sighting of a point, otherwise None."""
         return None
 
     def leave(self, t: float) -> Sequence[int]:
-        """Keys of the points that were last seen before ``t``, which the graph has no more from now on."""
+        """Remove the points that were last observed before ``t`` [s] from the graph, and return their keys."""
         return ()
 
     def keep_only(self, keys: set[int]) -> None:
-        """Give up all points but those with these ``keys``."""
+        """Discard all points except those with these ``keys``."""
 
     def forget(self, first: Keyframe) -> Sequence[int]:
-        """Forget the keyframes before the ``first``, and the points that have left the graph and were not seen since.
+        """Delete the data of keyframes before ``first``, and of points that have left the graph and were not observed since.
         Returns the keys of these points."""
         return ()
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        """The points that were ever in the graph and are not forgotten; None without any. ``values`` and ``covariances``, by key:
-        those of the points and of the poses of keyframes."""
+        """A map of all points that were ever in the graph and are not deleted, or None. ``values``, ``covariances``: the estimates
+        of points and keyframes by key."""
         return None
 
 
 class Graph:
-    """Keyframes by number, and the other variables by key: ``values`` with covariances ``spreads``.
+    """A factor graph of a run: ``keyframes`` by number, and all other variables by key in ``values`` and ``covariances``.
 
-    ``newest``: the last keyframe, whose current estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3). ``keys``: of
-    blocks by name. ``departed``: estimates and covariances of points that have left the graph. ``t``: the newest time. Of its
-    backend, ``current(key)``: the newest estimate of a variable; ``is_open(number)``: whether a keyframe may still get factors.
+    ``newest``: the last keyframe, whose present estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3). ``keys``: the keys
+    of constants and landmarks by name. ``departed``: estimates and covariances of points that have left the graph. ``t`` [s]: the
+    newest time. The backend sets two functions: ``current(key)`` returns the present estimate of a variable, and
+    ``is_open(number)`` is True if a keyframe may still get factors.
     """
 
     newest: Keyframe
@@ -178,17 +182,17 @@ class Graph:
         self.keys = {n: constants_key(i) for i, (n, c) in enumerate(self.constants.items()) if c.names}
         self.values, self.covariances = self.constant_priors()
         self.departed: tuple[Values, Values] = {}, {}
-        self.keyframes: dict[int, Keyframe] = {}  # consecutive numbers
+        self.keyframes: dict[int, Keyframe] = {}  # by consecutive numbers
         self.ticks: list[TickAt] = []
-        self.changes: tuple[Change, ...] = ()  # when the robot was carried elsewhere
-        self.is_anchored = False  # whether the odometry of the first keyframe counts: earlier rows may still come
-        self._damping = 0.0  # the largest that covariances were computed with
+        self.changes: tuple[Change, ...] = ()  # the intervals in which the robot was carried
+        self.is_anchored = False  # False while rows of odometry from before the first keyframe may still arrive
+        self._damping = 0.0  # the largest damping that covariances needed
         self.t = -math.inf
         self.prior: PosePrior | None = None
         self.pose, self.covariance = np.full(3, np.nan), np.full((3, 3), np.nan)
 
     def begin(self, prior: PosePrior) -> Keyframe:
-        """Start from a Gaussian, at a first keyframe."""
+        """Start from a Gaussian prior of the pose. Returns the first keyframe."""
         self.prior, self.t = prior, prior.t
         self.pose = np.array(prior.pose, dtype=float)
         self.covariance = se2.world_to_body(prior.pose, prior.covariance)
@@ -197,7 +201,7 @@ class Graph:
         return self.newest
 
     def copy(self) -> Graph:
-        """An independent graph with the same content, to be solved separately."""
+        """An independent copy of the graph, which can be solved separately."""
         graph = object.__new__(Graph)
         vars(graph).update(vars(self))
         graph.diagnostics = self.diagnostics.copy()
@@ -207,22 +211,23 @@ class Graph:
         return graph
 
     def anchor(self) -> None:
-        """Take the odometry at the first keyframe from the rows that came by now, at the first measurement after a start."""
+        """Set the odometry of the first keyframe, at the first measurement after a start. By then all earlier rows have arrived."""
         self.newest.odometry, self.is_anchored = self.motion.state(self.newest.t), True
 
     def append(self, keyframe: Keyframe) -> None:
-        """Add a keyframe after all others."""
+        """Add a keyframe at the end."""
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
-        """Remove the keyframes with numbers from ``first`` on, and the ticks after them or at or after ``t``."""
+        """Remove the keyframes from number ``first`` on, and the ticks that follow these or are not before ``t`` [s]."""
         for index in range(first, self.newest.index + 1):
             del self.keyframes[index]
         self.newest = self.keyframes[first - 1]
         self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
 
     def forget(self, first: int) -> None:
-        """Forget the keyframes with numbers below ``first``, the ticks after them, and the points that were not seen since."""
+        """Delete the keyframes before number ``first``, the ticks that follow these, and the points that were not observed
+        since."""
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
@@ -231,20 +236,20 @@ class Graph:
                 departed.pop(key, None)
 
     def keyframe_before(self, t: float) -> Keyframe:
-        """The last keyframe at or before ``t``; the oldest one in the graph if all are later."""
+        """The last keyframe at or before the time ``t`` [s], or the oldest keyframe if all are later."""
         keyframe = self.newest
         while keyframe.t > t and keyframe.index - 1 in self.keyframes:
             keyframe = self.keyframes[keyframe.index - 1]
         return keyframe
 
     def since(self, keyframe: Keyframe, t: float) -> Increment:
-        """The motion from a keyframe to ``t``, as the constants have it."""
+        """The motion from a keyframe to time ``t`` [s], with the estimated constants of the odometry."""
         start = keyframe.odometry if self.is_anchored else self.motion.state(keyframe.t)
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
     def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
-        """The motion from a keyframe to ``t``, a time before the next keyframe. It is a share of the step to that keyframe by time,
-        along its arc, because the odometry may be forgotten."""
+        """The motion from a keyframe to a time ``t`` [s] before the next keyframe. It is interpolated along the arc to the next
+        keyframe in proportion to time, because the odometry may already be deleted."""
         following = self.keyframes[keyframe.index + 1]
         assert following.from_previous is not None
         step, share = self.recalibrated(following.from_previous), (t - keyframe.t) / (following.t - keyframe.t)
@@ -252,8 +257,8 @@ class Graph:
         return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
 
     def moved(self, t: float) -> tuple[Array, Array, Array]:
-        """The newest pose (3,), moved along the odometry to ``t`` if that is later, with its covariance (3, 3) in the body frame
-        and in the world frame."""
+        """The newest pose (3,), predicted to time ``t`` [s] by odometry if that is later. Also returns its covariance (3, 3) in the
+        body frame, and that in the world frame."""
         newest = self.newest
         if t <= newest.t:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
@@ -261,32 +266,34 @@ class Graph:
         return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def between(self, first: Keyframe, last: Keyframe) -> Increment:
-        """The motion between two keyframes, under the constants of the odometry."""
+        """The motion between two keyframes, with the estimated constants of the odometry."""
         return self.recalibrated(self.motion.relative(first.odometry, last.odometry))
 
     @property
     def mapped_constants(self) -> int | None:
-        """The key of the estimated constants of the sensor whose points are mapped, None without any."""
+        """The key of the estimated constants of the mapper's sensor, or None if there are none."""
         return self.keys.get(self.mapper.sensor)
 
     def recalibrated(self, increment: Increment) -> Increment:
-        """An increment under the constants of the odometry."""
+        """Correct an increment for the estimated constants of the odometry."""
         key = self.keys.get(MOTION)
         return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
     def value(self, name: str, default: Array | None = None) -> Array:
-        """The estimate of a block, or ``default`` without an estimate. KeyError if ``default`` is None."""
+        """The estimate of the constants or the landmark with this name. If it is not in the graph, ``default`` is returned, or
+        KeyError is raised if that is None."""
         if default is not None and name not in self.keys:
             return default
         return self.values[self.keys[name]]
 
     def constant_priors(self) -> tuple[Values, Values]:
-        """Means and covariances of the sensors' constants before any measurement."""
+        """The prior means and covariances of the estimated sensor constants, by key."""
         sigmas = {self.keys[name]: c.sigmas for name, c in self.constants.items() if c.names}
         return {key: np.zeros(len(s)) for key, s in sigmas.items()}, {key: np.diag(s**2) for key, s in sigmas.items()}
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
-        """A landmark or a bias that becomes a variable, as seen from a pose with body-frame ``covariance`` (3, 3); its key."""
+        """Add a landmark or a bias as a variable, and return its key. ``covariance`` (3, 3): that of the pose it was observed
+        from."""
         is_position = len(new.mean) > 1
         numbers = [index_of(key) for key in self.keys.values() if is_landmark(key) is is_position]
         first = 0 if is_position else len(self.constants)
@@ -296,12 +303,12 @@ class Graph:
         return key
 
     def node(self, keyframe: Keyframe, term: Term, sensor: str) -> Node:
-        """A term of an observation as a factor on a keyframe."""
+        """Convert a term of an observation to a node on a keyframe. ``sensor``: the name of the sensor."""
         keys = (keyframe.key, *map(self.keys.__getitem__, term.blocks))
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
     def odometry_factor(self, keyframe: Keyframe) -> tuple[Factor, tuple[int, ...]]:
-        """The factor from the previous keyframe, and its keys. Constants of the odometry do not apply while a robot is carried."""
+        """The odometry factor from the previous keyframe, and its keys. It has no odometry constants if the robot was carried."""
         assert keyframe.from_previous is not None
         keys: tuple[int, ...] = (keyframe.key - 1, keyframe.key)
         if MOTION in self.keys and not keyframe.is_elsewhere:
@@ -315,8 +322,8 @@ class Graph:
         return keyframe.factor, keys
 
     def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
-        """Remove sightings that do not fit the estimate of their point, and points with too few remaining sightings. Returns
-        whether any was removed."""
+        """Remove sightings that do not fit the estimate of their point, and points with too few remaining sightings. Returns True
+        if any was removed."""
         mapper = self.mapper
         if not mapper.estimates:
             return False
@@ -336,7 +343,7 @@ class Graph:
         return True
 
     def forget_points(self) -> None:
-        """Remove points that the remaining keyframes do not determine."""
+        """Remove points that the remaining keyframes do not determine, after keyframes were removed."""
         keyframes = self.keyframes.values()
         sightings = Counter(key for k in keyframes for node in k.nodes for key in node.keys if is_point(key))
         if self.mapper.estimates:
@@ -347,7 +354,7 @@ class Graph:
                 del self.values[key], self.covariances[key]
             self.mapper.keep_only(kept)
         for key in [k for k in self.values if is_of_keyframe(k) and index_of(k) >= self.newest.index]:
-            del self.values[key]  # the tilt of a keyframe that was taken back
+            del self.values[key]  # the tilt of a removed keyframe
 
     def forget_landmarks(self, known: Collection[int]) -> None:
         """Remove landmarks and biases that no remaining keyframe observes and no summary contains. ``known``: variables of the
@@ -358,17 +365,17 @@ class Graph:
                 del self.keys[name], self.values[key], self.covariances[key]
 
     def report_damping(self, damping: float) -> None:
-        """Note as an event that covariances needed a larger damping than before."""
+        """Add an event to the diagnostics if covariances needed a larger damping than before."""
         if damping > self._damping:
             self._damping = damping
             self.diagnostics.event(self.t, "damped", DAMPED, damping=damping)
 
     def unsolved(self, error: Exception) -> RunFailedError:
-        """The error of a graph that cannot be solved, with the time and the variable that is to blame."""
+        """Make the error of a graph that cannot be solved. It names the time, and the variable that is not determined."""
         return RunFailedError(f"the graph cannot be solved at {self.t:.3f} s: {self.reason(error)}")
 
     def reason(self, error: Exception) -> str:
-        """An error of the solver, or of GTSAM's, in one line."""
+        """Describe an error of this solver or of GTSAM in one line."""
         key = blamed(error)
         if key is None:
             lines = str(error).strip().splitlines()
@@ -376,7 +383,7 @@ class Graph:
         return f"the measurements do not determine {self._named(key)}"
 
     def _named(self, key: int) -> str:
-        """A variable in words."""
+        """The description of a variable for users."""
         if is_of_keyframe(key):
             return f"the {'pose' if is_pose(key) else 'tilt'} at {self.keyframes[index_of(key)].t:.3f} s"
         if is_point(key):

@@ -1,7 +1,8 @@
-"""A graph kept solved by iSAM2 (Kaess et al., IJRR 31(2), 2012), with its full history or with a window.
+"""Incremental solution of a graph by iSAM2 (Kaess et al., IJRR 31(2), 2012), with the full history or with a window.
 
-A solver of GTSAM is unusable after an exception in an update. Its factors and values are therefore also kept here. After a failure
-a new solver is built from these copies, once. If the new solver fails as well, the run ends with an error.
+A window is a fixed-lag smoother: poses that are older than the lag are marginalised. A solver of GTSAM is unusable after an
+exception in an update. Factors and values are therefore also stored here. After a failure a new solver is built from them once. If
+the new solver also fails, the run ends with an error.
 """
 
 from __future__ import annotations
@@ -23,58 +24,62 @@ from factors import positive, se2
 from factors.graph import GTSAM_ERRORS, Values, index_of, is_constant, is_landmark, is_of_keyframe, tilt_key
 from factors.se2 import Array
 
-ITERATIONS_AFTER_FAILURE = 10
+ITERATIONS_AFTER_FAILURE = 10  # maximum number of batch iterations to initialise a new solver after a failure
 LAG = 10.0  # s: default length of the window for causal estimates
-# m, rad, or the unit of a constant: a variable is linearised again after this change; in a window with points after a smaller one,
-# as its oldest points are soon linearised permanently. Updates between checks of that.
+# A variable is linearised again if it has changed by this much, in m, rad, or the unit of a constant. The limit is smaller in a
+# window with points, because the linearisation of its oldest points soon becomes permanent. The last value is the number of updates
+# between checks of the limit.
 MOVED, NEAR_POINTS, CHECKED_EVERY = 0.05, 0.02, 10
 ROUNDING = 1e-6  # s: rounding error of differences of times
 
 
 class Incremental:
-    """The backend of the smoother; see the module."""
+    """The backend of the smoother, which solves the graph during the run. See the module."""
 
     def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
-        self._waits = settings.landmarks != "known"  # what is seen between keyframes: an update takes long then
+        # True if factors from between keyframes wait for the next keyframe, because updates are slow when landmarks are estimated
+        self._waits = settings.landmarks != "known"
         self._maps = graph.mapper.estimates
         self._margin = WITH_POINTS if self._maps else MARGIN
-        # whether the final trajectory is that of the whole problem; and the length of the window, None where all is in the solver
+        # True if the final trajectory is the solution of the whole problem; the length [s] of the window, None for the full history
         self._is_whole = settings.lag is None or settings.lag == math.inf
         self._lag = None if settings.lag == math.inf else settings.lag
         links = any(sensor.links for sensor in graph.sensors.values())
         if settings.lag is None and not (self._waits or self._maps or links):
             self._lag = LAG
-        # how long observations may wait for the solver
+        # the time [s] for which factors may wait for an update of the solver
         every = max((sensor.solve_every for sensor in graph.sensors.values()), default=0.0)
         defers = not self._waits and (self._lag is None or self._lag >= 2.0 * every)
         self._solve_every = every if defers else 0.0
-        # keys of constants whose covariance is needed during the run
+        # the keys of constants whose covariance sensors need during the run
         self._followed = {
             graph.keys[name]
             for name, sensor in graph.sensors.items()
             if sensor.follows_constants and name in graph.keys
         }
-        self._failed: list[str] = []  # reasons of factors that could not be linearised
+        self._failed: list[str] = []  # the reasons why factors could not be linearised
         self._solver = self._new_solver()
-        self._waiting = Addition()
-        self._solved = -math.inf  # the time of the newest keyframe in the solver
+        self._waiting = Addition()  # the factors and variables that wait for the next update
+        self._solved = -math.inf  # s; the time of the newest keyframe in the solver
         self._oldest = 0  # the number of the oldest keyframe that has not left the window
 
     def forget(self, until: float) -> None:
-        """Forget keyframes until this time that have left the window. All are kept if the whole problem is solved at the end."""
+        """Delete the keyframes before the time ``until`` [s] that have left the window. None is deleted if the whole problem is
+        solved at the end."""
         graph = self._graph
         if self._is_whole or not graph.keyframes or until < next(iter(graph.keyframes.values())).t:
             return
-        # sightings of points that wait are in the newest keyframes
+        # the newest keyframes are needed, because they contain sightings of points that are not yet variables
         last = min(graph.keyframe_before(until).index, self._oldest, graph.newest.index - graph.mapper.horizon)
         graph.forget(min(last, self._solver.oldest))  # a rebuilt solver needs the rest
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """The whole graph, solved to the end: poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes.
+        """The final poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes of ``graph``, a copy of the graph.
 
-        With a set lag a pose has its estimate at the time when it left the window. Poses in the window have the current estimate,
-        poses that wait for the solver the predicted one."""
+        If the setting ``lag`` is a number, a pose has the estimate with which it left the window. Poses in the window have their
+        present estimate. Poses that wait for the solver have a predicted estimate. Otherwise the whole problem is solved.
+        """
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)
         estimates = [keyframe.causal for keyframe in graph.keyframes.values()]
@@ -95,7 +100,7 @@ class Incremental:
         return np.array([p for p, _ in known]), np.array([c for _, c in known])
 
     def _newest_values(self, graph: Graph) -> Values:
-        """The newest estimates of all variables of a copy of the graph."""
+        """The present estimates of all variables of ``graph``, a copy of the graph."""
         known = self._waiting.values | {k.key: k.final[0] for k in graph.keyframes.values() if k.final is not None}
         keys = [*(k.key for k in graph.keyframes.values()), *graph.values]
         return known | {key: self._solver.value(key) for key in keys if key not in known}
@@ -109,7 +114,8 @@ class Incremental:
         self._start_again(newest, summary)
 
     def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
-        """Take a new keyframe with the ``guess`` of its pose, and what came with it."""
+        """Accept a new keyframe with new factors and variables. ``guess``: the predicted pose of the keyframe, and its
+        covariance."""
         keyframe.causal = guess
         addition.nodes.insert(0, self._odometry_node(keyframe))
         addition.values[keyframe.key] = guess[0]
@@ -119,35 +125,36 @@ class Incremental:
             self._update(addition)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Take what was added to a keyframe that is in the graph. ``guess``: pose and covariance of the newest keyframe after the
-        update, where it is that."""
+        """Accept new factors and variables on an existing keyframe. ``guess``: its pose corrected by the factors, with covariance,
+        or None if ``keyframe`` is not the newest."""
         if guess is None or not (self._waits or keyframe.t < self._solved + self._solve_every):
             self._update(addition)
             return
-        if self._waits:  # what its error has in common with that of landmarks only the graph knows
+        # the corrected covariance ignores correlations with estimated landmarks, so keep that of the solver
+        if self._waits:
             guess = guess[0], self._graph.covariance
         self._wait(addition, guess)
 
     def _wait(self, addition: Addition, guess: Guess) -> None:
-        """Keep what is to enter the solver with its next update; until then the newest pose is ``guess``."""
+        """Store new factors and variables for the next update of the solver. Until then the newest pose is ``guess``."""
         self._waiting.nodes += addition.nodes
         self._waiting.values |= addition.values
         self._graph.pose, self._graph.covariance = guess
 
     def current(self, key: int) -> Array:
-        """The newest estimate of a variable that is in the graph."""
+        """The present estimate of a variable in the solver."""
         return self._solver.value(key)
 
     def is_open(self, keyframe: int) -> bool:
-        """Whether factors may still be added to a keyframe."""
+        """True if factors may still be added to the keyframe with this number, because it is in the window."""
         return keyframe >= self._oldest and keyframe in self._graph.keyframes
 
     def is_kept(self, keyframe: int) -> bool:
-        """Whether a keyframe is part of the final problem."""
+        """True if the keyframe with this number is part of the final problem."""
         return self._is_whole or self.is_open(keyframe)
 
     def _update(self, addition: Addition) -> None:
-        """Solve with an addition and the waiting factors. After a failure a new solver tries again."""
+        """Update the solver with new and waiting factors. After a failure a new solver is built."""
         newest, nodes, values = self._graph.newest, addition.nodes, addition.values
         if self._waiting.nodes or self._waiting.values:
             nodes, values = self._waiting.nodes + nodes, self._waiting.values | values
@@ -169,9 +176,9 @@ class Incremental:
             self._graph.diagnostics.reject(f"factor: {self._failed.pop()}")
 
     def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
-        """Bring the newest pose with its covariance up to date, and those constants and landmarks that an update touched.
+        """Read estimates from the solver after an update: the newest pose, and the variables ``touched`` by the update.
 
-        Of constants and points the covariance is not needed before the end, and it takes time: only those of landmarks are read.
+        Covariances take time. They are read only for the pose, landmarks, and constants whose covariance a sensor needs.
         """
         graph = self._graph
         newest.causal = graph.pose, graph.covariance = self._marginal(newest.key)
@@ -184,13 +191,15 @@ class Incremental:
                 graph.values[key] = self._value(key)
 
     def _value(self, key: int) -> Array:
+        """The solver's estimate of a variable. Raises IndeterminateError if it is not finite."""
         value = self._solver.value(key)
         if not all(map(math.isfinite, value.tolist())):
             raise IndeterminateError(key)
         return value
 
     def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
-        """Estimate and covariance of a variable; ``known``: that covariance, if known; ``graph``: where to report, of a copy."""
+        """The estimate and covariance of a variable. ``known``: the covariance if it is already computed. ``graph``: a copy of the
+        graph whose diagnostics get the event of a damping."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if known is None else known
@@ -205,11 +214,15 @@ class Incremental:
         return value, positive.sound(covariance)
 
     def _leave(self, window: Window, now: float, new: Collection[int]) -> None:
-        """Keep the estimates of the keyframes older than the lag, before updates marginalise them out, and of the constants that
-        are in the solver by now, which are all but the ``new`` ones."""
+        """Store the final estimates of keyframes that are older than the lag, before the next update marginalises them.
+
+        ``now`` [s]: the time of the newest keyframe. ``new``: keys of variables that are not yet in the solver. The estimates of
+        all constants and landmarks in the solver are stored too.
+        """
         assert self._lag is not None
         graph, oldest = self._graph, self._graph.keyframes[self._oldest]
-        if not self._maps:  # those read before leave by now: both takes time
+        # keyframes whose estimates are stored already leave now; storing and leaving together would take longer
+        if not self._maps:
             window.lag = now - oldest.t + ROUNDING
         if oldest.t >= now - self._lag - self._margin:
             return
@@ -220,7 +233,7 @@ class Incremental:
         self._oldest = oldest.index
         constants = [key for key in graph.values if key not in new and is_constant(key)]
         points = graph.mapper.leave(now - self._lag)
-        # of a start of the whole problem the covariance is not asked
+        # if the whole problem is solved at the end, these estimates are only its initial values, and need no covariances
         asked = [] if self._is_whole else [*(k.key for k in leaving), *constants, *points]
         marginals = window.covariances(asked) if asked else {}
         for k in leaving:
@@ -232,14 +245,15 @@ class Incremental:
             for key in constants:
                 graph.values[key], graph.covariances[key] = self._marginal(key, marginals.get(key))
         except GTSAM_ERRORS:
-            pass  # the causal estimates stay
-        first = window.oldest  # what is still in the solver is needed where that is rebuilt
+            pass  # the causal estimates remain
+        first = window.oldest  # variables that a rebuilt solver needs are kept
         for key in [key for key in graph.values if is_of_keyframe(key) and index_of(key) < first]:
             del graph.values[key]
         self._forget(points, marginals)
 
     def _forget(self, points: Iterable[int], marginals: Mapping[int, Array]) -> None:
-        """Keep estimates and covariances of points that leave the window. ``marginals``: the covariances that are known."""
+        """Store the estimates and covariances of points that leave the window, and remove the points from the graph. ``marginals``:
+        covariances that are already computed, by key."""
         for key in points:
             try:
                 estimate = self._marginal(key, marginals.get(key))
@@ -249,10 +263,11 @@ class Incremental:
             del self._graph.values[key], self._graph.covariances[key]
 
     def _start_again(self, newest: Keyframe, summary: MarginalSummary | None, *, failed: bool = False) -> None:
-        """A new solver with what is in the graph; ``failed``: whether the one before did. RunFailedError where it fails.
+        """Build a new solver from the graph.
 
-        A window begins with the ``summary`` of what has left it, and with all measurements that this does not hold; else the graph
-        begins with the priors.
+        ``summary``: the information of variables that have left the window. The new solver begins with it and with all measurements
+        that it does not contain. If it is None, the solver begins with the priors. ``failed``: True if the previous solver failed.
+        Raises RunFailedError if the new solver fails.
         """
         graph, first = self._graph, 0 if summary is None else summary.oldest
         self._solver, self._waiting, self._solved = self._new_solver(failed=failed), Addition(), newest.t
@@ -262,7 +277,7 @@ class Incremental:
         guesses |= {key: value for key, value in graph.departed[0].items() if key in known}
         graph.drop_astray(keyframes[1:], guesses)
         try:
-            if summary is not None:  # what is marginalised is linearised there, and fits to nothing else
+            if summary is not None:  # marginal factors are valid only at their own linearisation points
                 guesses |= {key: value for key, value in summary.at.items() if key in guesses}
             elif failed:
                 guesses = whole_problem(graph).solve(guesses, ITERATIONS_AFTER_FAILURE).values
@@ -284,39 +299,42 @@ class Incremental:
         return [start, *(gtsam.PriorFactorVector(key, mean, gaussian(covariances[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
-        """The time of each variable of a window that begins; points are as if they were seen now."""
+        """The time [s] of each variable of a new window, which decides when it leaves. Points get the time of the newest
+        keyframe."""
         now = keyframes[-1].t
         oldest = -math.inf if self._lag is None else now - self._lag - self._margin
         stamps = {key: now if key in self._graph.values else oldest for key in values}
         return stamps | {key: k.t for k in keyframes for key in (k.key, tilt_key(k.index)) if key in values}
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
+        """The odometry factor from the previous keyframe."""
         step = keyframe.from_previous
         assert step is not None
         if self._maps or (MOTION in self._graph.keys and not keyframe.is_elsewhere):
             factor, keys = self._graph.odometry_factor(keyframe)
             return Node(keys, factor, 3)
-        # GTSAM's own factors are not linearised again when points move
+        # without points and constants, GTSAM's own factor is faster
         previous, noise = keyframe.key - 1, gtsam.noiseModel.Gaussian.Covariance(step.covariance)
         native = gtsam.BetweenFactorPose2(previous, keyframe.key, gtsam.Pose2(*step.delta), noise)
         return Node((previous, keyframe.key), native=native)
 
     def _new_solver(self, *, failed: bool = False) -> FullHistory | Window:
+        """An empty solver. ``failed``: True if the previous solver failed."""
         parameters = gtsam.ISAM2Params()
-        # Cholesky loses long stretches of dead reckoning as indeterminate; with points it takes half the time
+        # Cholesky fails for long dead reckoning, which is numerically indeterminate. With points it takes half the time of QR.
         parameters.setFactorization("CHOLESKY" if self._maps and not failed else "QR")
-        # far from where a point was first taken to be its factors mean nothing
+        # points move far from their initial positions, where the linearisation of their factors becomes meaningless
         parameters.relinearizeSkip = 1 if self._maps else CHECKED_EVERY
         if self._lag is None:
             return FullHistory(parameters, MOVED, self._failed.append)
         parameters.findUnusedFactorSlots = True
         threshold = NEAR_POINTS if self._maps else MOVED
-        # with points poses leave one at a time, so that a rebuilt window soon linearises at its former points
+        # with points, poses leave one by one, so that the linearisation points of a rebuilt window are soon final again
         return Window(parameters, threshold, self._failed.append, self._lag + self._margin if self._maps else math.inf)
 
 
 def _is_definite(covariance: Array) -> bool:
-    """Whether a covariance (D, D) is finite and has a Cholesky root."""
+    """True if a covariance (D, D) is finite and has a Cholesky root."""
     try:
         return math.isfinite(np.linalg.cholesky(covariance).sum())
     except np.linalg.LinAlgError:

@@ -1,13 +1,13 @@
-"""The keyframe rule: where poses of the graph are, and which of them each measurement belongs to.
+"""The keyframe rule: the times of the graph's pose variables (keyframes), and the keyframe of each measurement.
 
-A keyframe is added at a measurement that comes at least an interval after the last keyframe. The interval is the sensor's
-``keyframe_every``, or longer where landmarks are estimated. A sensor that gathers always has its own. A mapper of points may need
-a keyframe earlier (``is_due``), and at a tick one is added after :data:`LONGEST_INTERVAL`. Other measurements, late ones included,
-become factors on the keyframe before them, displaced by the odometry since.
+A measurement becomes a keyframe if the last keyframe is at least an interval older. The interval is the sensor's
+``keyframe_every``, or longer if landmarks are estimated. A mapper of points may need a keyframe earlier (``is_due``). A tick
+becomes a keyframe after :data:`LONGEST_INTERVAL`. All other measurements, including late ones, become factors on the previous
+keyframe, with the odometry since that keyframe as an offset.
 
-Sensors that gather, as RFID readers do, come many times a second, each time with little information. Their observations on one
-keyframe become few factors, which enter the graph with the next keyframe. Until then the newest pose is updated by them alone, as
-in a filter.
+Some sensors, such as RFID readers, measure many times a second, each time with little information. Such a sensor gathers: the
+observations on one keyframe are combined into a few factors, which enter the graph together with the next keyframe. Until then
+these observations update only the newest pose, as in a filter.
 """
 
 from __future__ import annotations
@@ -32,15 +32,19 @@ from factors.graph import VectorPriorFactor
 from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
-ITERATIONS_OF_GUESS = 1
-MAPPING_KEYFRAME_INTERVAL = 0.5  # s, where landmarks are estimated too
-LONGEST_INTERVAL = 1.0  # s between poses of the graph while measurements come
+ITERATIONS_OF_GUESS = 1  # iterations of a correction of the newest pose before the graph is solved
+MAPPING_KEYFRAME_INTERVAL = 0.5  # s; interval between keyframes if landmarks are estimated
+LONGEST_INTERVAL = 1.0  # s; a tick becomes a keyframe after this time
 
-Backend = AtTheEnd | Incremental  # keeps the graph solved, or its guess
+Backend = AtTheEnd | Incremental  # solves the graph
 
 
 class _KeyframeView:
-    """The graph as sensors read it: the estimate ``pose`` and ``covariance`` of one keyframe."""
+    """The state of the graph as sensors read it, for a measurement on one keyframe.
+
+    ``guess``: pose and covariance of the keyframe. ``offset``: the motion from the keyframe to the measurement, None for zero.
+    ``newest``: True if the keyframe is the newest one.
+    """
 
     localized = True
 
@@ -82,16 +86,17 @@ class _KeyframeView:
 
 
 class Builder:
-    """Builds a graph as measurements come; see the module."""
+    """Builds a graph from measurements during a run. See the module."""
 
     def __init__(self, graph: Graph, backend: Backend, search: Tracking, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
         graph.current, graph.is_open = backend.current, backend.is_open
-        self._waiting: list[Observation] = []  # of a sensor that gathers, on the newest keyframe
-        self._gatherer: Sensor | None = None  # that sensor
+        # gathered observations on the newest keyframe that are not yet in the graph
+        self._waiting: list[Observation] = []
+        self._gatherer: Sensor | None = None  # the sensor of these observations
 
     def pass_time(self, odometry: ChainState) -> None:
-        """A tick, with the ``odometry`` there."""
+        """Process a tick. ``odometry``: the integrated odometry at its time."""
         graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
         if t - graph.newest.t >= LONGEST_INTERVAL:
@@ -99,7 +104,8 @@ class Builder:
         graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
     def take(self, m: Measurement, odometry: ChainState) -> bool:
-        """Take a measurement, with the ``odometry`` at its time; False where it is too late."""
+        """Process a measurement. ``odometry``: the integrated odometry at its time. Returns False if it is too late and is
+        ignored."""
         graph, sensor = self._graph, self._graph.sensors[m.source]
         graph.t = max(graph.t, m.t)
         if self._needs_keyframe(m, sensor):
@@ -122,7 +128,7 @@ class Builder:
         return True
 
     def _needs_keyframe(self, m: Measurement, sensor: Sensor) -> bool:
-        """Whether a measurement is to have a keyframe at its time."""
+        """True if a keyframe must be added at the time of the measurement."""
         since, interval = m.t - self._graph.newest.t, sensor.keyframe_every
         if not sensor.gathers and self._settings.landmarks != "known":
             interval = MAPPING_KEYFRAME_INTERVAL
@@ -130,27 +136,28 @@ class Builder:
         return since >= interval or (since > 0.0 and m.source == mapper.sensor and mapper.is_due(m))
 
     def gather(self) -> list[Node]:
-        """Turn the observations that wait on the newest keyframe into its factors."""
+        """Convert the gathered observations on the newest keyframe to factors of the keyframe, and return these."""
         nodes = self.waiting() if self._waiting else []
         self._graph.newest.nodes += nodes
         self._waiting = []
         return nodes
 
     def waiting(self) -> list[Node]:
-        """Factors of the observations that wait on the newest keyframe and are in no graph yet."""
+        """The factors of the gathered observations on the newest keyframe, without adding them to the keyframe."""
         if self._gatherer is None:
             return []
         terms = self._gatherer.gathered(self._waiting)
         return [self._graph.node(self._graph.newest, term, self._gatherer.name) for term in terms]
 
     def clear(self) -> None:
-        """Discard the observations that wait, as a new track begins."""
+        """Discard the gathered observations, because a new track begins."""
         self._waiting = []
 
     def _gather_from(
         self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None, guess: Guess
     ) -> None:
-        """Correct the ``guess`` of the newest pose by the observations of a sensor, and keep these until :meth:`gather`."""
+        """Correct the newest pose by the observations of a sensor that gathers, and store the observations until :meth:`gather`.
+        ``guess``: the newest pose and its covariance."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
@@ -165,8 +172,8 @@ class Builder:
     def _observe(
         self, sensor: Sensor, m: Measurement, view: _KeyframeView, odometry: ChainState, addition: Addition | None
     ) -> bool:
-        """Add the observations of a measurement to an ``addition``, or where that is None to those that wait; the estimate of the
-        newest keyframe in the ``view`` is corrected by each. Returns whether any was applied."""
+        """Convert a measurement to observations, and add these to ``addition``, or to the gathered ones if it is None. If the
+        keyframe is the newest, each observation corrects its estimate in ``view``. Returns True if any observation was accepted."""
         applied = False
         for observation in sensor.observe(m, view):
             if isinstance(observation, Link):
@@ -198,6 +205,7 @@ class Builder:
         return applied
 
     def _add_keyframe(self, odometry: ChainState, m: Measurement | None) -> None:
+        """Add a keyframe, with the measurement at its time if there is one."""
         graph, newest, t = self._graph, self._graph.newest, odometry.t
         keyframe = Keyframe(newest.index + 1, t, *graph.motion.travelled(newest.odometry, t))
         pose, covariance, _ = graph.moved(t)
@@ -218,10 +226,11 @@ class Builder:
         guess: Guess | None,
         addition: Addition,
     ) -> Guess | None:
-        """Turn a measurement into factors of ``keyframe``; returned is the guess of its pose, updated by them.
+        """Convert a measurement to factors of ``keyframe``. Returns the pose and covariance of the keyframe, corrected by them.
 
-        The guess is where the graph linearises first, and what the robust weights are computed at. Without one the keyframe is an
-        older one: what is not yet in the graph stays out, and the innovation is that of its causal estimate.
+        ``guess``: pose and covariance of the newest keyframe, at which the graph linearises first. None if ``keyframe`` is an older
+        one.
+        Then innovations are relative to its causal estimate, and None is returned.
         """
         graph, sensor = self._graph, self._graph.sensors[m.source]
         expected = keyframe.causal if guess is None else guess
@@ -236,7 +245,8 @@ class Builder:
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
-        """A factor on a keyframe and an earlier one, which waits for the final problem if that has left the solver."""
+        """Add a factor on a keyframe and an earlier one. If the earlier one has left the solver, the factor is only part of the
+        final problem."""
         earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
@@ -244,8 +254,8 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add a landmark to the graph, with the sightings that determine it or with its prior. If the poses of most sightings have
-        left the graph, its current estimate is the prior."""
+        """Add a landmark to the graph, with its earlier sightings or with its prior. If the poses of most sightings have left the
+        graph, the present estimate of the landmark is the prior."""
         graph = self._graph
         key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean

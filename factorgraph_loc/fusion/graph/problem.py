@@ -1,12 +1,12 @@
-"""The whole run as one nonlinear least-squares problem, solved in one piece.
+"""A nonlinear least-squares problem of a whole graph, and its marginal covariances.
 
-Levenberg-Marquardt in Python. Our factors are linearised here, where the values are at hand, because each callback from GTSAM would
-copy all of them. A row of poses with constants, which a run is without loops and points, is solved by compiled code
-(:mod:`factors.chain`), anything else with GTSAM's sparse elimination.
+The problem is solved by Levenberg-Marquardt in Python. Factors are linearised in Python, because a callback from GTSAM would copy
+all values. A run without loop closures and points is a chain of poses with common constants, which compiled code solves
+(:mod:`factors.chain`). Any other graph is solved by GTSAM's sparse elimination.
 
-Of marginal covariances Cholesky loses half of the digits, and takes a long chain of dead reckoning for indeterminate; QR keeps them
-(Golub, van Loan, "Matrix Computations", section 5.3). Where that fails too a share of each variable's own information, the damping,
-is added.
+Marginal covariances by Cholesky decomposition lose half of the digits, and long dead reckoning appears indeterminate. QR
+decomposition is more accurate (Golub, van Loan, "Matrix Computations", section 5.3), and is used if Cholesky fails. If QR fails
+too, a small fraction of each variable's information is added to its diagonal. This fraction is called damping.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from factors.graph import (
 from factors.least_squares import LEAST, MAX_ITERATIONS, descended
 from factors.se2 import Array
 
-DAMPINGS = (0.0, 1e-10, 1e-7)
-DAMPED = "covariances: the graph hardly determines them, relative damping of {damping:g}"  # sentence of the event
-_NEAR = re.compile(r"variable\s+(\d+)")  # in GTSAM's message about an indeterminate system
-MOST_PARAMETERS = 40  # the solver is dense in the parameters: above this number GTSAM's sparse elimination is faster
+DAMPINGS = (0.0, 1e-10, 1e-7)  # are tried one after the other
+DAMPED = "covariances: the graph hardly determines them, relative damping of {damping:g}"  # message of the event
+_NEAR = re.compile(r"variable\s+(\d+)")  # the key in GTSAM's message about an indeterminate system
+MOST_PARAMETERS = 40  # with more parameters, GTSAM's sparse elimination is faster than the chain solver
 Placed = tuple[Factor, tuple[int, ...]]  # a factor with the keys of its variables
 State = tuple[Array, Array]  # poses (N, 3), and parameters (P,)
 
 
 class IndeterminateError(RuntimeError):
-    """A graph does not determine its variables; ``key``: one of these, None where that is not known."""
+    """The error of a graph that does not determine its variables. ``key``: the key of one of these variables, None if unknown."""
 
     def __init__(self, key: int | None) -> None:
         super().__init__("the solution is not determined")
@@ -57,14 +57,15 @@ class IndeterminateError(RuntimeError):
 
 @dataclass(frozen=True)
 class Covariances:
-    """Marginal covariances (d, d) by key, and the relative ``damping`` that they were computed with."""
+    """Marginal covariances (d, d) by key, and the relative ``damping`` that was needed to compute them."""
 
     by_key: dict[int, Array]
     damping: float
 
 
 def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys: Sequence[int]) -> Covariances:
-    """Marginal covariances of the variables ``keys``; IndeterminateError where no damping helps. ``sizes``: of all variables."""
+    """The marginal covariances of the variables ``keys`` of a linear graph. ``sizes``: the number of components of each variable of
+    the graph. Raises IndeterminateError if the graph does not determine a variable even with damping."""
     result = _solved(graph, keys, robust=False)
     if isinstance(result, dict):
         return Covariances(result, 0.0)
@@ -76,7 +77,7 @@ def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys
 
 
 def blamed(error: Exception) -> int | None:
-    """The variable that ours or one of GTSAM's errors names, None where it names none."""
+    """The key of the variable that an IndeterminateError or an error of GTSAM names, or None."""
     if isinstance(error, IndeterminateError):
         return error.key
     near = _NEAR.search(str(error))
@@ -86,6 +87,7 @@ def blamed(error: Exception) -> int | None:
 def _solved(
     graph: gtsam.GaussianFactorGraph, keys: Sequence[int], *, robust: bool
 ) -> dict[int, Array] | IndeterminateError:
+    """The marginal covariances by key, or the error. ``robust``: True to use QR instead of Cholesky."""
     order = gtsam.Ordering.OrderingType.COLAMD
     marginals: dict[int, Array] = {}
     try:
@@ -95,10 +97,10 @@ def _solved(
         else:
             tree = graph.eliminateMultifrontal(order, gtsam.EliminateQR)
             for key in keys:
-                conditional = tree.marginalFactor(key, gtsam.EliminateQR)  # owns what R() shows
+                conditional = tree.marginalFactor(key, gtsam.EliminateQR)  # R() is a view of its memory
                 root = np.linalg.inv(conditional.R())
                 marginals[key] = np.asarray(root @ root.T, dtype=float)
-    except (RuntimeError, IndexError) as error:  # IndexError: a variable that no factor is on
+    except (RuntimeError, IndexError) as error:  # IndexError: a variable without factors
         return IndeterminateError(blamed(error))
     except np.linalg.LinAlgError:
         return IndeterminateError(key)
@@ -109,7 +111,7 @@ def _solved(
 
 
 def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
-    """The graph with a prior on each variable. Its information is the share ``damping`` of that of the variable's factors."""
+    """The graph with a prior on each variable, whose information is ``damping`` times the diagonal of the graph's information."""
     keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
     ends = np.cumsum([sizes[key] for key in keys])
     # the last column is that of the right side
@@ -122,7 +124,8 @@ def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping:
 
 
 class Chained:
-    """``factors`` on poses, each on one or on two that follow one another, and on the vectors that all have in common."""
+    """A problem that is a chain of poses. Each factor depends on one pose or on two consecutive poses, and optionally on vectors,
+    such as sensor constants. ``factors``: the factors with the keys of their variables."""
 
     def __init__(self, factors: Sequence[Placed]) -> None:
         keys = {key for _, of in factors for key in of}
@@ -134,7 +137,7 @@ class Chained:
 
     @property
     def fits(self) -> bool:
-        """Whether the factors are such."""
+        """True if the factors form such a chain."""
         place = {key: i for i, key in enumerate(self._poses)}
         for _, keys in self._factors:
             numbers = [place[key] for key in keys if key in place]
@@ -143,7 +146,7 @@ class Chained:
         return bool(self._poses)
 
     def begin(self, values: Values) -> State | None:
-        """The state at ``values``; None if it has too many parameters."""
+        """Convert values by key to a state for the chain solver. Returns None if the vectors have too many components."""
         ends = np.cumsum([0, *(len(values[key]) for key in self._vectors)]).tolist()
         if ends[-1] > MOST_PARAMETERS:
             return None
@@ -155,7 +158,7 @@ class Chained:
         return np.array([values[key] for key in self._poses]), parameters
 
     def values(self, state: State) -> Values:
-        """A state as values by key."""
+        """Convert a state to values by key."""
         poses, parameters = state
         vectors = {key: parameters[columns] for key, columns in self._columns.items()}
         return dict(zip(self._poses, poses, strict=True)) | vectors
@@ -164,7 +167,7 @@ class Chained:
         return sum(stack.cost(*state) for stack in self._stacks)
 
     def system(self, state: State) -> chain.System:
-        """The normal equations at a state."""
+        """The normal equations of the problem, linearised at a state."""
         poses, parameters = state
         jacobian, residual = np.zeros((len(self._first), 6 + len(parameters))), np.zeros(len(self._first))
         begin = 0
@@ -175,8 +178,8 @@ class Chained:
         return chain.normal(len(poses), self._first, jacobian, residual)
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """The state after a step of Levenberg and Marquardt, and the largest component of the step; None where the problem is
-        nearly singular."""
+        """One step of Levenberg and Marquardt. Returns the new state and the largest absolute component of the step. Returns None
+        if the problem is nearly singular."""
         try:
             is_solved, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
@@ -187,7 +190,7 @@ class Chained:
         return (se2.compose(state[0], se2.exp(poses)), state[1] + parameters), float(largest)
 
     def covariances(self, values: Values) -> Covariances | None:
-        """Marginal covariances of all variables; None if they need higher precision."""
+        """The marginal covariances of all variables. None if this solver is not accurate enough for them."""
         state = self.begin(values)
         if state is None:
             return None
@@ -202,7 +205,7 @@ class Chained:
         return Covariances(dict(zip(self._poses, of_poses, strict=True)) | shared, 0.0)
 
     def _stacked(self, values: Values) -> list[Stack]:
-        """The factors by kind."""
+        """Combine factors of one kind to stacks, which are linearised together."""
         place = {key: i for i, key in enumerate(self._poses)}
         kinds: defaultdict[Hashable, list[Placed]] = defaultdict(list)
         for factor, keys in self._factors:
@@ -221,19 +224,21 @@ class Chained:
 
 
 def _kind(factor: Factor, keys: tuple[int, ...]) -> Hashable:
-    """A key that is equal for factors linearised by one call; None for a factor linearised separately."""
+    """A key that is equal for factors that are linearised by one call. None for a factor that is linearised separately."""
     kind = cast(Stackable, factor).kind if _is_stackable(type(factor)) else None
     return None if kind is None else (type(factor), kind, *[key for key in keys if not is_pose(key)])
 
 
 @cache
 def _is_stackable(kind: type[Factor]) -> bool:
-    """Whether factors of a class become stacks. It is cached, because the check takes longer than a linearisation."""
+    """True if factors of a class can be combined to stacks. The result is cached, because the check takes longer than a
+    linearisation."""
     return hasattr(kind, "kind") and hasattr(kind, "stack")
 
 
 class _Others:
-    """Factors of any kind, each linearised separately."""
+    """A stack of factors of different kinds, each linearised separately. ``placed``: factors with the keys of their variables.
+    ``place``: the number of each pose by key. ``columns``: the parameters of each vector by key."""
 
     def __init__(self, placed: Sequence[Placed], place: dict[int, int], columns: dict[int, slice]) -> None:
         self._placed, self._place, self._columns = placed, place, columns
@@ -267,26 +272,26 @@ class _Others:
 
 @dataclass(frozen=True)
 class Solution:
-    """Values of all variables, and the cost."""
+    """A solution of a problem: the values of all variables, and the robust cost."""
 
     values: Values
     cost: float
 
 
 class Problem:
-    """Factors, each with the keys of its variables."""
+    """A nonlinear least-squares problem. ``factors``: the factors with the keys of their variables."""
 
     def __init__(self, factors: Sequence[tuple[Factor, tuple[int, ...]]]) -> None:
         self._factors = factors
 
     @cached_property
     def _chain(self) -> Chained | None:
-        """The problem as a row of poses, None where it is none."""
+        """The problem as a chain of poses, or None if it is not a chain."""
         chain = Chained(self._factors)
         return chain if chain.fits else None
 
     def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
-        """The optimum found from a guess, or where ``max_iterations`` lead."""
+        """Find a local optimum from initial ``values``. After ``max_iterations`` the best values so far are returned."""
         chain = self._chain
         begin = None if chain is None else chain.begin(values)
         if chain is not None and begin is not None:
@@ -295,8 +300,8 @@ class Problem:
         return Solution(*descended(self.cost, self._moved, values, max_iterations)[:2])
 
     def _moved(self, values: Values, damping: float) -> tuple[Values, float] | None:
-        """The values after a step of Levenberg and Marquardt, and the largest component of the step; None where the problem is
-        nearly singular."""
+        """One step of Levenberg and Marquardt. Returns the new values and the largest absolute component of the step. Returns None
+        if the problem is nearly singular."""
         linear = self.linearize(values)
         curvature = {key: np.full(len(value), LEAST) for key, value in values.items()}
         for i in range(linear.size()):
@@ -315,19 +320,20 @@ class Problem:
         return {key: retract(key, value, step.at(key)) for key, value in values.items()}, largest
 
     def cost(self, values: Values) -> float:
-        """The robust cost, infinite where it is not a number."""
+        """The robust cost at ``values``. It is infinite if the sum of the factors' costs is NaN."""
         cost = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
         return math.inf if math.isnan(cost) else cost
 
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
-        """All factors, linearised with their robust weights."""
+        """All factors, linearised at ``values`` with their robust weights."""
         graph = gtsam.GaussianFactorGraph()
         for factor in jacobian_factors(self._factors, values):
             graph.add(factor)
         return graph
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
-        """Marginal covariances of variables at a solution, poses in the body frame. IndeterminateError if there are none."""
+        """The marginal covariances of variables at a solution, those of poses in the body frame. ``keys``: variables that are
+        needed; the result may have more. Raises IndeterminateError if the graph does not determine a variable."""
         marginals = None if self._chain is None else self._chain.covariances(values)
         if marginals is not None:
             return marginals

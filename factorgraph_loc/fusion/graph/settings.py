@@ -22,15 +22,17 @@ class GraphSettings(FileModel):
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
+    """Convert ``all`` to infinity, and check the bounds of other values."""
     return math.inf if value in ("all", math.inf) else bounded(value)
 
 
 def _written(lag: float | None) -> float | str | None:
+    """The value of ``lag`` in files: ``all`` for infinity."""
     return "all" if lag == math.inf else lag
 
 
 class SmootherSettings(GraphSettings):
-    """Settings of the smoother. ``lag`` is infinite in Python for ``all`` in files."""
+    """Settings of the smoother. The value ``all`` of ``lag`` in files is infinity in Python."""
 
     lag: Annotated[
         float | None, Field(ge=0.1, le=3600.0), InUnit("s"), WrapValidator(_lag), PlainSerializer(_written)

@@ -1,14 +1,15 @@
-"""iSAM2 with the full history, and with a window that poses leave, behind one set of methods.
+"""Two incremental solvers with one interface: iSAM2 with the full history, and iSAM2 with a window (fixed-lag smoother).
 
-A callback from GTSAM copies all variables, and returns to Python for each factor. So our own factors are linearised here, where
-iSAM2 linearises its variables, and replaced in the update that moves these. Were one left behind, the factors would no longer agree
-on what a turn of the whole graph does to the poses, and would contain false information on the heading (Huang, Mourikis,
-Roumeliotis, International Journal of Robotics Research 29(5), 2010).
+Callbacks from GTSAM would copy all variables for each factor. Therefore this module linearises the factors of measurements at the
+linearisation points of iSAM2. When iSAM2 moves a linearisation point, all factors on the variable are replaced in the same update.
+Otherwise the factors would disagree on the effect of a rotation of the whole graph, and would contain false information on the
+heading (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010).
 
-iSAM2 never linearises again the variables of marginal factors, as these cannot follow. But far from the estimate a factor means
-nothing. So ours are linearised at the estimate there, too, with the nearest Jacobian that agrees with the marginal factors on such
-turns (Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014, section V). That is a smaller change if all
-that is held may follow the estimates by one translation, which does not change the information of marginal factors on turns.
+Marginal factors are linear and cannot be linearised again, so iSAM2 holds the linearisation points of their variables. A factor of
+a measurement that is linearised far from the estimate is meaningless. Such factors are therefore linearised at the estimate. Their
+Jacobian is replaced by the nearest one that agrees with the marginal factors on rotations and translations of the whole graph
+(Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014, section V). To make this change small, all held
+points may follow the estimates by one common translation, which does not change the information of marginal factors.
 """
 
 from __future__ import annotations
@@ -43,19 +44,21 @@ from factors.graph import (
 )
 from factors.se2 import Array
 
-# s that a pose may stay longer in a window, so that several are read at a time; less with points, which make it large
+# A pose may stay this much longer [s] in a window than the lag, so that several estimates are read together. The second value is
+# for windows with points, which are large.
 MARGIN, WITH_POINTS = 2.0, 1.0
-FOREVER = 1e300  # s; a lag with which only the variables with the stamp minus infinity leave
+FOREVER = 1e300  # s; with this lag only variables with the time minus infinity leave a window
 
 
 class FullHistory:
-    """An incremental solver that keeps its whole graph. After an error of GTSAM in a method the solver is unusable.
+    """An incremental solver that keeps its whole graph. It is unusable after an error of GTSAM in any method.
 
-    ``threshold``: how far iSAM2 lets a variable move from where it is linearised, in m, rad or the units of constants.
-    ``on_failure``: called with the reason if a factor cannot be linearised. That factor is left out.
+    ``threshold``: the change of a variable, in m, rad or the units of constants, after which it is linearised again.
+    ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
 
-    Constants are in all branches of iSAM2's tree, and in each update. To read an estimate iSAM2 therefore solves the whole tree.
-    Variables of the last update are at the root and are solved separately.
+    Sensor constants are in all branches of iSAM2's elimination tree. To read an estimate, iSAM2 would therefore solve the whole
+    tree.
+    The variables of the last update are at the root of the tree. They are solved separately, which is faster.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
@@ -64,10 +67,11 @@ class FullHistory:
         parameters.setRelinearizeThreshold(threshold)
         self._isam = self._solver = gtsam.ISAM2(parameters)
         self._ours = LinearFactors(threshold, parameters.relinearizeSkip, on_failure)
-        self._touched: Collection[int] = ()  # by the last update
+        self._touched: Collection[int] = ()  # the keys of variables in the last update
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        """Add factors and new variables with their guesses; ``t`` is the time of new poses."""
+        """Add factors and new variables, and solve. ``values``: initial values of the new variables. ``t`` [s]: the time of new
+        poses."""
         self.begin((), nodes, values, {})
         self._touched = {key for node in nodes for key in node.keys}
 
@@ -78,46 +82,49 @@ class FullHistory:
         values: Values,
         stamps: Mapping[int, float],
     ) -> None:
-        """The first update, with the time of each variable, and with ``factors`` of GTSAM's besides."""
+        """The first update of a new solver. ``factors``: factors of GTSAM, such as priors and marginal factors. ``nodes``: factors
+        of measurements. ``values``: initial values. ``stamps``: the time [s] of each variable."""
         graph, removed = self._ours.added(self._isam, factors, nodes, values)
         self._ours.place(self._isam.update(graph, to_gtsam(values), removed).getNewFactorsIndices())
         self._touched = ()
 
     @property
     def oldest(self) -> int:
-        """The number of the oldest pose that a new solver would begin with after a failure."""
+        """The number of the oldest pose that a new solver would need after a failure."""
         return 0
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        """The information of all variables that have left the graph, from before the last update if that ``failed``; None if none
-        has left."""
+        """The information of all variables that have left the solver, or None if none has left. ``failed``: True if the last update
+        failed; then the information is that from before the update."""
         return None
 
     def value(self, key: int) -> Array:
-        """Estimate of a variable."""
+        """The present estimate of a variable."""
         if key not in self._touched:
             return read(self._isam, key)
         step = np.linalg.solve(*self._isam.marginalFactor(key).jacobian())
         return retract(key, self._ours.at[key], np.asarray(step, dtype=float))
 
     def covariance(self, key: int) -> Array:
-        """Marginal covariance of a variable, poses in the body frame."""
+        """The marginal covariance of a variable. That of a pose is in the body frame."""
         return np.asarray(self._solver.marginalCovariance(key))
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
-        """All factors, linearised where the solver has them, and the sizes of their variables by key."""
+        """All factors, linearised at the solver's linearisation points, and the number of components of each variable by key."""
         isam = self._solver if isinstance(self._solver, gtsam.ISAM2) else self._solver.getISAM2()
         at = isam.getLinearizationPoint()
         sizes = {key: 3 if is_pose(key) else len(at.atVector(key)) for key in at.keys()}  # noqa: SIM118
         return isam.getFactorsUnsafe().linearize(at), sizes
 
 
+# A copy of a window's state: all factors, the linearisation points of iSAM2, those of a new window, and the slots of the
+# measurements' factors.
 _State = tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Values, frozenset[int]]
 
 
 class Window(FullHistory):
-    """A solver that marginalises poses older than ``lag`` [s] out with each update. An update without such poses takes less time,
-    because iSAM2 then puts the newest pose at the root of its tree."""
+    """A fixed-lag smoother: each update marginalises poses older than ``lag`` [s]. An update without such poses is faster, because
+    iSAM2 then puts the newest pose at the root of its elimination tree."""
 
     _solver: gtsam.IncrementalFixedLagSmoother
 
@@ -127,15 +134,14 @@ class Window(FullHistory):
         super().__init__(parameters, threshold, on_failure)
         self.lag = lag
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
-        self._stamps: dict[int, float] = {}  # of the variables that may leave
-        # at the begin or the last marginalisation: all factors, linearisation points of iSAM2, those of a new window, and slots of
-        # our factors
+        self._stamps: dict[int, float] = {}  # s; the time of each variable that may leave
+        # the state at the begin or after the last marginalisation
         self._left: _State = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         stamps = dict.fromkeys(values, t)
         for node in nodes:
-            if is_point(node.keys[-1]):  # points leave when they are seen no more
+            if is_point(node.keys[-1]):  # the time of a point is that of its last sighting
                 stamps[node.keys[-1]] = t
         self.begin((), nodes, values, stamps)
 
@@ -158,7 +164,8 @@ class Window(FullHistory):
                 graph.add(factor)
                 start.insert(key, np.zeros(1))
             stamps = {**stamps, **dict.fromkeys(holding, -math.inf)}
-        elif min(self._stamps.values()) < now - self.lag:  # GTSAM may fail where others leave in the same update
+        # never together with the variables of `_holding`: GTSAM may fail then
+        elif min(self._stamps.values()) < now - self.lag:
             leaving = [key for key, t in self._stamps.items() if t < now - self.lag]
             stamps = {**stamps, **dict.fromkeys(filter(is_constant, self._ours.at), now)}
             lag = self.lag
@@ -175,7 +182,8 @@ class Window(FullHistory):
         return read(self._solver, key)
 
     def covariances(self, keys: Sequence[int]) -> dict[int, Array]:
-        """Marginal covariances by key, from one elimination of the window. Empty if that fails or a variable has left."""
+        """The marginal covariances of several variables by key, from one elimination of the window. Empty if the elimination fails,
+        or if a variable has left."""
         order = gtsam.Ordering()
         for key in keys:
             order.push_back(key)
@@ -204,8 +212,12 @@ class Window(FullHistory):
 
 
 def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[int, gtsam.NonlinearFactor]:
-    """Factors without information between variables of marginal ``factors`` and new variables, by the key of the latter. The new
-    variables leave immediately. iSAM2 then treats the former like its own separators and keeps their linearisation points."""
+    """Auxiliary factors that make iSAM2 hold the linearisation points of the variables of marginal ``factors``.
+
+    Each is a factor without information between one of these variables and a new auxiliary variable, which leaves immediately.
+    iSAM2 never moves the linearisation point of a variable next to one that has left. Returns the factors by the key of the
+    auxiliary variable. ``values``: the values of the variables.
+    """
     marginal = (factor.keys() for factor in factors if isinstance(factor, gtsam.LinearContainerFactor))
     fixed = dict.fromkeys(key for keys in marginal for key in keys)
     unit, out = gtsam.noiseModel.Unit.Create(1), dict[int, gtsam.NonlinearFactor]()
@@ -217,18 +229,22 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
 
 
 class LinearFactors:
-    """Our factors in a solver, and the linearisation points of its variables. Variables that moved by ``threshold`` are linearised
-    again, at every ``skip``-th update. ``on_failure`` is called with the reason if a factor cannot be linearised. That factor is
-    left out."""
+    """The factors of measurements in a solver, and the linearisation points of the solver's variables.
+
+    ``threshold``: variables that have changed by this much are linearised again. ``skip``: this is checked at every ``skip``-th
+    update.
+    ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
+    """
 
     def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
         self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
         self._updates = 0
-        self.at: Values = {}  # linearisation point of each variable
-        self._held: Values = {}  # linearisation points that iSAM2 does not move, up to a common translation
-        self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)  # the factors on each, by their identity
-        self._slots: set[int] = set()
-        self._added: list[_Linear] = []  # those of the last update, with their places in it as slots
+        self.at: Values = {}  # the linearisation point of each variable
+        self._held: Values = {}  # the linearisation points that iSAM2 does not move, after a common translation
+        # the factors on each variable, by their identity
+        self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)
+        self._slots: set[int] = set()  # the slots of the factors in the solver
+        self._added: list[_Linear] = []  # the factors of the last update
 
     def added(
         self,
@@ -237,8 +253,12 @@ class LinearFactors:
         nodes: Sequence[Node],
         values: Values,
     ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
-        """The factors that the next update adds, and the slots of those that it removes: factors on variables that it will
-        linearise elsewhere are replaced. Call :meth:`place` after the update."""
+        """Prepare an update of the solver. Call :meth:`place` after the update.
+
+        ``factors``: new factors of GTSAM. ``nodes``: new factors of measurements. ``values``: initial values of new variables.
+        Returns a graph of the factors to add, and the slots of the factors to remove. Factors on variables that will be linearised
+        again are replaced.
+        """
         self._updates += 1
         self._added = self._moved(solver) if self.at and not self._updates % self._skip else []
         removed = [linear.slot for linear in self._added] if self._added else []
@@ -259,22 +279,23 @@ class LinearFactors:
         for linear, linearized in zip(self._added, jacobian_factors(ours, self.at, self._on_failure), strict=True):
             linear.slot = graph.size()
             keys = linear.node.keys
-            # a factor needs no linearisation point of its own if the solver never moves that of its variables
+            # a factor on a held variable needs its own linearisation point
             is_fixed = self._held and not self._held.keys().isdisjoint(keys)
             graph.add(self._on_held(keys, linearized) if is_fixed else gtsam.LinearContainerFactor(linearized))
         return graph, removed
 
     def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
-        """A linearised factor on what the solver holds, with the point that it is linearised at."""
+        """A linearised factor on variables of which at least one is held, with its linearisation point. Its Jacobian is corrected
+        so that it agrees with the marginal factors, see the module."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
-        if sum(map(is_place, keys)) > 1:  # else it contains the position in the world
-            jacobian = unaware(jacobian, motions)
+        if sum(map(is_place, keys)) > 1:  # a factor on one position has absolute information, which must not be removed
+            jacobian = project_out_gauge(jacobian, motions)
         factor = gaussian_factor(keys, -right, np.split(jacobian, ends[:-1], axis=1))
         return gtsam.LinearContainerFactor(factor, to_gtsam({key: self.at[key] for key in keys}))
 
     def place(self, slots: Sequence[int]) -> None:
-        """Take where the solver has put what was added."""
+        """Store the ``slots`` that the solver has given to the added factors."""
         for linear in self._added:
             linear.slot = slots[linear.slot]
             self._slots.add(linear.slot)
@@ -291,7 +312,7 @@ class LinearFactors:
 
     @property
     def framed(self) -> Values:
-        """The linearisation points of a new solver; variables that are held keep their relative positions."""
+        """The linearisation points for a new solver. Held variables keep their relative positions."""
         return self.at | self._held
 
     @property
@@ -300,23 +321,24 @@ class LinearFactors:
         return frozenset(self._slots)
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
-        """The factors that the next update linearises at other points."""
+        """The factors that the next update must replace, because a linearisation point of their variables changes."""
         keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
         change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
         moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]
         if not moved:
             return []
         isam = solver if isinstance(solver, gtsam.ISAM2) else solver.getISAM2()
-        fixed = isam.getFixedVariables()  # what marginal factors are on
+        fixed = isam.getFixedVariables()  # the variables of marginal factors
         anew = [key for key in moved if not fixed.count(key)]
         self.at |= {key: read(solver, key) for key in anew}
         anew += self._followed({key: read(solver, key) for key in keys if is_place(key) and fixed.count(key)})
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
     def _followed(self, estimates: Values) -> list[int]:
-        """The variables with fixed linearisation points whose factors must be linearised again, given the ``estimates`` of all.
+        """The held variables whose factors must be linearised again. ``estimates``: the present estimates of all held variables.
 
-        Empty if all are poses: in a known map GTSAM's factors of the odometry are not linearised again."""
+        Empty if all are poses, because in a known map the odometry factors are GTSAM's own and are not replaced.
+        """
         if all(map(is_pose, estimates)):
             return []
         for key in estimates:
@@ -332,7 +354,7 @@ class LinearFactors:
 
 @dataclass(slots=True, eq=False)
 class _Linear:
-    """One of our factors, and its slot in the solver."""
+    """The factor of a measurement, and its slot in the solver."""
 
     node: Node
     slot: int = -1
@@ -341,8 +363,13 @@ class _Linear:
 _PLACED = attrgetter("node.factor", "node.keys", "node.rows")
 
 
-def unaware(jacobian: Array, motions: Array) -> Array:
-    """The matrix nearest to a ``jacobian`` (m, n) whose product with the ``motions`` (n, 3) of its variables is zero (Hesch,
-    Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014, section V)."""
+def project_out_gauge(jacobian: Array, motions: Array) -> Array:
+    """Remove the gauge directions from a Jacobian: the matrix nearest to ``jacobian`` (m, n) whose product with ``motions`` is
+    zero.
+
+    ``motions`` (n, 3): the changes of the variables when the whole graph moves or rotates, from
+    :func:`factors.graph.frame_motions`. Source: Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014,
+    section V.
+    """
     basis = np.linalg.qr(motions)[0]
     return np.asarray(jacobian - jacobian @ basis @ basis.T)

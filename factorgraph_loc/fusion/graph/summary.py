@@ -1,8 +1,8 @@
-"""The information that a window keeps on marginalised variables.
+"""The information that a fixed-lag smoother (window) has on marginalised variables, to rebuild the window after a failure.
 
-GTSAM marginalises a variable into linear factors on its neighbours in the graph. These factors and the priors contain all
-information outside of the window's own measurements, correlations included. A rebuilt window begins with them. Marginals of single
-variables would count common measurements twice, and lose the correlations.
+GTSAM replaces a marginalised variable by linear factors on its neighbours in the graph. These marginal factors and the priors
+contain all information except the measurements in the window, including correlations. A rebuilt window begins with them. Marginal
+covariances of single variables would not be enough: they would count common measurements twice, and lose the correlations.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import gtsam
 from factorgraph_loc.fusion.graph.graph import Node
 from factors.graph import Values, index_of, is_of_keyframe, is_pose, to_gtsam
 
-KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)
+KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorVector)  # marginal factors and priors
 
 
 def oldest_pose(keys: Iterable[int]) -> int:
@@ -25,7 +25,8 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class MarginalSummary:
-    """``factors``: marginal ones, and priors; ``keys`` of all variables of the graph; ``at``: their linearisation points."""
+    """The information of a window without its own measurements. ``factors``: marginal factors and priors. ``keys``: the keys of all
+    variables of the window. ``at``: their linearisation points."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     keys: frozenset[int]
@@ -35,13 +36,16 @@ class MarginalSummary:
     def of(
         cls, graph: gtsam.NonlinearFactorGraph, points: gtsam.Values, at: Values, ours: Collection[int] = ()
     ) -> MarginalSummary:
-        """The summary of a graph. ``points``: linearisation points of iSAM2; ``at``: those of the summary; ``ours``: slots of our
-        factors, which are not marginal."""
+        """Make the summary of a solver's graph.
+
+        ``points``: the linearisation points of iSAM2. ``at``: the linearisation points of the summary. ``ours``: the slots of the
+        measurements' factors in the graph, which are left out.
+        """
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         values = to_gtsam(at)
 
         def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
-            """The factor with linearisation points, which it lacks in iSAM2: there its variables are never linearised again."""
+            """The marginal factor with linearisation points. It has none in iSAM2, which never moves those of its variables."""
             return gtsam.LinearContainerFactor(
                 gtsam.LinearContainerFactor(factor.factor(), points).linearize(values), values
             )
@@ -57,12 +61,12 @@ class MarginalSummary:
         return oldest_pose(self.keys)
 
     def before_pose(self, pose: int) -> MarginalSummary:
-        """The summary without the poses from the index ``pose`` on. Their keys are used again."""
+        """The summary without the poses from index ``pose`` on, because new poses will have their keys."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
-        """The factors on the variables ``present``. All others are marginalised out."""
+        """The factors on the variables ``present``. All other variables are marginalised out."""
         kept: list[gtsam.NonlinearFactor] = []
         linear, gone, at = gtsam.GaussianFactorGraph(), set[int](), to_gtsam(self.at)
         for factor in self.factors:
@@ -82,8 +86,11 @@ class MarginalSummary:
 
 
 def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
-    """Whether a graph of the variables ``present`` needs a factor in addition to its summary. ``known``: variables of the summary,
-    which contains priors of all variables but poses, and factors on poses that have left."""
+    """True if a rebuilt window must get the factor ``node`` in addition to its summary.
+
+    ``present``: the keys of the window's variables. ``known``: the keys of the summary's variables. The summary already contains
+    the priors of its variables except poses, and the factors on poses that have left.
+    """
     if any(key not in present for key in node.keys):
         return False
     return any(map(is_pose, node.keys)) or node.keys[0] not in known
