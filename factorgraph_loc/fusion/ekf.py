@@ -45,12 +45,13 @@ class EkfSettings(FilterSettings):
     """Settings of the EKF."""
 
     iterations: Annotated[int, Field(ge=1, le=20)] = 1
-    """linearisations of an update; 1 is the plain one, more linearise again at the updated pose (Bell and Cathey, 1993);
-    sensors such as pixels and tags have as many as they need"""
+    """number of linearisations of an update; more than 1 is the iterated EKF (Bell and Cathey, 1993); updates by pixels and
+    tags ignore this setting and iterate as often as needed"""
     self_calibration: bool = True
-    """whether constants with an uncertainty in the rig are states"""
+    """whether sensor constants that have an uncertainty in the rig are estimated"""
     landmarks: MapUse = "known"
-    """known: the map is fixed, without other landmarks; extended: the others are estimated; unknown: all are estimated"""
+    """known: landmarks of the map are fixed, others are ignored; extended: landmarks that the map lacks are estimated too; unknown:
+    all landmarks are estimated"""
 
 
 class _State(NamedTuple):

@@ -31,9 +31,9 @@ class FilterSettings(FileModel):
     """Settings of every filter."""
 
     max_delay: Annotated[float, Field(ge=0.0, le=5.0), InUnit("s")] = 0.5
-    """how late a measurement may come; later ones are counted and dropped"""
+    """largest delay of a measurement; later measurements are counted and ignored"""
     smooth: bool = True
-    """whether the final trajectory uses all measurements, else it repeats the causal one"""
+    """whether the final trajectory uses all measurements; otherwise it equals the causal estimates"""
 
 
 class _Checkpoint(NamedTuple):

@@ -62,20 +62,20 @@ class ParticleFilterSettings(FilterSettings):
     """Settings of the particle filter. With ``kld`` their number is chosen by KLD sampling (Fox, IJRR 22(12), 2003)."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
-    """number of particles; with kld the largest"""
+    """number of particles; with kld the maximum number"""
     kld: bool = False
-    """whether no more particles are resampled than their spread needs"""
+    """whether the number of particles is adapted to the spread of the poses"""
     min_particles: Annotated[int, Field(ge=10, le=1_000_000)] = 500
-    """smallest number of particles, with kld"""
+    """minimum number of particles with kld"""
     resample_below: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.5
-    """effective sample size, as a share of the particles, below which they are resampled"""
+    """effective sample size, as a fraction of the number of particles, below which they are resampled"""
     smoothing_trajectories: Annotated[int, Field(ge=10, le=10_000)] = 100
-    """trajectories drawn backwards for the final result"""
+    """number of trajectories that are drawn backwards for the final result"""
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0), InUnit("s")] = 1.0
-    """time between the clouds through which these are drawn"""
+    """time between the stored particle sets through which these trajectories are drawn"""
     self_calibration: bool = True
-    """whether constants with an uncertainty in the rig travel with each particle; not the time offset of landmarks, and not
-    constants of a camera, which widen its noise"""
+    """whether each particle estimates the sensor constants that have an uncertainty in the rig, except the time offset of
+    landmarks, and constants of a camera, which increase its noise instead"""
 
 
 class _CloudView(FilterView):

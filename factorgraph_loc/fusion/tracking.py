@@ -79,7 +79,7 @@ def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
 
 # messages of events
 LOST = "lost: {why} since {since:.1f} s"
-JUMPED = f"{LOST}; goes on at another place"
+JUMPED = f"{LOST}; the estimate continues at another pose"
 SLIPS = "the odometry contradicts the observations since {since:.1f} s: the motion is not known"
 
 

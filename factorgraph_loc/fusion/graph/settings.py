@@ -13,12 +13,12 @@ class GraphSettings(FileModel):
     """Settings of every graph estimator."""
 
     max_delay: Annotated[float, Field(ge=0.0, le=4.0), InUnit("s")] = 0.5
-    """how late a measurement may come; later ones are counted and dropped"""
+    """largest delay of a measurement; later measurements are counted and ignored"""
     self_calibration: bool = True
-    """whether constants with an uncertainty in the rig are variables"""
+    """whether sensor constants that have an uncertainty in the rig are estimated"""
     landmarks: MapUse = "known"
-    """known: the map is fixed, without other landmarks; extended: the others are estimated; unknown: all are estimated, the
-    default of runs with only images and measured motion if the map has no points"""
+    """known: landmarks of the map are fixed, others are ignored; extended: landmarks that the map lacks are estimated too; unknown:
+    all landmarks are estimated, the default of runs with only images and odometry if the map has no points"""
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
@@ -37,11 +37,11 @@ class SmootherSettings(GraphSettings):
     lag: Annotated[
         float | None, Field(ge=0.1, le=3600.0), InUnit("s"), WrapValidator(_lag), PlainSerializer(_written)
     ] = None
-    """length of the window, behind which poses are final, or all: the full history is kept solved. By default causal estimates
-    come from a window of 10 s and the final trajectory from the whole problem; with loops, or where landmarks or
-    points are estimated, all"""
+    """length of the window; older poses are final. The value all keeps the full history in the solver. By default, causal
+    estimates come from a window of 10 s and the final trajectory from the whole problem; with loops, or if landmarks or points
+    are estimated, the default is all"""
     smooth: bool = True
-    """whether the final trajectory uses all measurements, else it repeats the causal one"""
+    """whether the final trajectory uses all measurements; otherwise it equals the causal estimates"""
     final_only: bool = False
     """whether the problem is solved only at the end, without causal estimates"""
 
