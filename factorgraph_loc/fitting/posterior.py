@@ -179,8 +179,7 @@ def by_block(scores: Array, block: Integers) -> Array:
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
     """Divide several logs into blocks of ``length`` seconds, which are numbered consecutively. ``times``: the times [s] of each
-    log.
-    Returns the block number of each time, for all logs in one array."""
+    log. Returns the block number of each time, for all logs in one array."""
     out: list[Integers] = []
     first = 0
     for t in times:

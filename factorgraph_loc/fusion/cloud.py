@@ -98,8 +98,7 @@ class Cloud:
         pose are modelled as Gaussian. Otherwise resampling would leave few distinct constants long before landmarks determine them.
 
         Returns the shrunk cloud, and the covariance (3+P, 3+P) of the kernel for the pose's body-frame perturbation and the
-        constants.
-        If the cloud has several modes, the kernel does not change the poses.
+        constants. If the cloud has several modes, the kernel does not change the poses.
         """
         weights = self.weights
         middle, _ = self.moments

@@ -66,8 +66,7 @@ class Guard:
 
     def computing(self, what: str, t: float | None = None) -> Self:
         """A context for a request to the estimator. ``what``: the requested result, such as "the estimate", for messages. ``t``
-        [s]:
-        its time, or None."""
+        [s]: its time, or None."""
         self._computing, self._of = what, t
         return self
 

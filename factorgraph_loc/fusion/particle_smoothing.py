@@ -55,8 +55,8 @@ class BackwardSimulation:
 
     ``kept``: records with clouds, in order of time. ``count``: the number of trajectories.
     ``increment(start, end)``: returns the odometry between two records.
-    ``moved(cloud, increment)``: returns the poses (N, 3) of a cloud after an increment, without noise, and their transition (3,
-    3+P) from body-frame perturbation and constants.
+    ``moved(cloud, increment)``: returns the poses (N, 3) of a cloud after an increment, without noise, and their transition
+    (3, 3+P) from body-frame perturbation and constants.
     ``changes``: the intervals [s] in which the robot was carried to another place.
     """
 

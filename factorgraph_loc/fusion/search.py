@@ -3,8 +3,8 @@
 Some sensors can find a pose from their own measurements (:class:`~factorgraph_loc.sensors.base.Finder`). Other sensors, such as
 RFID, can only weigh given poses. For these, particles anywhere in the map (:mod:`.population`) are weighed by the measurements of
 all sensors together. The particles are weighed in slices of fixed cost (:meth:`Search.advance`), so that measurements are not
-delayed.
-:mod:`.tracking` compares the estimated poses with their observations, and starts a search if they contradict each other.
+delayed. :mod:`.tracking` compares the estimated poses with their observations, and starts a search if they contradict each
+other.
 """
 
 from __future__ import annotations
@@ -177,8 +177,7 @@ class Search:
     @property
     def _leading(self) -> Finder | Population | None:
         """The source of the present result: a finder that needs only one measurement, otherwise the particles, otherwise any
-        finder.
-        None if no source is informative yet."""
+        finder. None if no source is informative yet."""
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):

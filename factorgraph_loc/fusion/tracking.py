@@ -161,8 +161,7 @@ class Tracking(Search):
 
         ``m``: the measurement or tick. ``track()``: returns the track's estimate at that time. ``pose_at(t, best)``: returns the
         robot's pose (3,) at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now. Returns None if the track is not
-        rejected.
-        If it is rejected, :attr:`best` is the robot's pose.
+        rejected. If it is rejected, :attr:`best` is the robot's pose.
         """
         if isinstance(m, Tick) and not self.waits:
             return None
@@ -271,8 +270,7 @@ class _Compared(NamedTuple):
 
 class SlipMonitor:
     """Detects from a track's observations that the odometry is wrong. It then marks the ``motion`` as unknown and adds an event to
-    the
-    ``diagnostics``."""
+    the ``diagnostics``."""
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
@@ -365,9 +363,8 @@ def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
 
 
 def beyond(covariance: Array, distance: float) -> float:
-    """The probability that the position of a Gaussian pose differs from its mean by more than ``distance`` [m]. ``covariance`` (3,
-    3):
-    that of the pose."""
+    """The probability that the position of a Gaussian pose differs from its mean by more than ``distance`` [m].
+    ``covariance`` (3, 3): that of the pose."""
     angle = math.pi * np.arange(180) / 180.0
     direction = np.column_stack((np.cos(angle), np.sin(angle)))
     curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)

@@ -206,8 +206,8 @@ class OdometryChain:
         state.
 
         Returns five values: the odometry state at ``t``; the predicted pose (3,); the first three rows (3, S) of the transition
-        matrix, whose remaining rows are those of the identity; the covariance (3, 3) of the motion; the predicted covariance (S,
-        S).
+        matrix, whose remaining rows are those of the identity; the covariance (3, 3) of the motion; the predicted covariance
+        (S, S).
         """
         size = len(covariance)
         at, transition, noise, out = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
@@ -236,8 +236,8 @@ class OdometryChain:
     ) -> tuple[Array, Array, Array]:
         """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to time ``t`` [s].
 
-        ``constants`` (P,): corrections of the estimated odometry constants. Returns the pose (3,), its body-frame covariance (3,
-        3), and its covariance (3, 3) of (x, y, heading) in the world frame.
+        ``constants`` (P,): corrections of the estimated odometry constants. Returns the pose (3,), its body-frame covariance
+        (3, 3), and its covariance (3, 3) of (x, y, heading) in the world frame.
         """
         known = self._knots, self._count, self._constants, self._noise
         contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order

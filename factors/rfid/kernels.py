@@ -156,8 +156,8 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
 
 @compiled
 def _unread(packed: Packed, rounds: Integers) -> Array:
-    """For each of K measurements, the negative log-likelihood that a tag out of range is missed, and its mean and variance (K,
-    3)."""
+    """For each of K measurements, the negative log-likelihood that a tag out of range is missed, and its mean and variance
+    (K, 3)."""
     out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
     for k in range(len(rounds)):
         out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])

@@ -12,8 +12,8 @@ Place = TypeVar("Place", float, Array)
 
 
 def linear(place: Array, count: int) -> tuple[Integers, Array]:
-    """Linear interpolation at ``place`` (N,) among ``count`` knots. Returns the indices (N, 2) of the knots and their weights (N,
-    2), or (N, 1) for a single knot. Places outside are clipped."""
+    """Linear interpolation at ``place`` (N,) among ``count`` knots. Returns the indices (N, 2) of the knots and their weights
+    (N, 2), or (N, 1) for a single knot. Places outside are clipped."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)

@@ -18,8 +18,8 @@ Let c and s be cosine and sine of psi - arg S, and m the mean of the gradient dp
 
 with the distance d [m] from the antenna to the tag, w = 1 - cosine of the angle from the boresight, and c the cosine of the angle
 between the tag's facing and the direction to the antenna (0 if unknown): Rappaport, "Wireless Communications", 2002, eq. 4.69a,
-with a series for the gains. Residuals have a Student density, because reflections cause outliers (Lange, Little, Taylor, JASA 84,
-1989); its Fisher information is ``(dof + 1) / (dof + 3) / sigma^2``.
+with a series for the gains. Residuals have a Student density, because reflections cause outliers
+(Lange, Little, Taylor, JASA 84, 1989); its Fisher information is ``(dof + 1) / (dof + 3) / sigma^2``.
 """
 
 from __future__ import annotations

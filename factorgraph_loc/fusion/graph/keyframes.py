@@ -229,8 +229,7 @@ class Builder:
         """Convert a measurement to factors of ``keyframe``. Returns the pose and covariance of the keyframe, corrected by them.
 
         ``guess``: pose and covariance of the newest keyframe, at which the graph linearises first. None if ``keyframe`` is an older
-        one.
-        Then innovations are relative to its causal estimate, and None is returned.
+        one. Then innovations are relative to its causal estimate, and None is returned.
         """
         graph, sensor = self._graph, self._graph.sensors[m.source]
         expected = keyframe.causal if guess is None else guess

@@ -57,8 +57,7 @@ class FullHistory:
     ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
 
     Sensor constants are in all branches of iSAM2's elimination tree. To read an estimate, iSAM2 would therefore solve the whole
-    tree.
-    The variables of the last update are at the root of the tree. They are solved separately, which is faster.
+    tree. The variables of the last update are at the root of the tree. They are solved separately, which is faster.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
