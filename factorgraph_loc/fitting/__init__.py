@@ -1,3 +1,3 @@
-"""Maximum a posteriori estimates of shared parameters, and intervals of shares."""
+"""Maximum a posteriori estimates of parameters that several logs have in common, and confidence intervals of proportions."""
 
 __all__ = ["posterior", "shares"]

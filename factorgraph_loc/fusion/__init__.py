@@ -1,4 +1,4 @@
-"""The estimators but monoSLAM and active localization, behind one interface (:mod:`factorgraph_loc.fusion.base`)."""
+"""The estimators except monoSLAM and active localization, with one interface (:mod:`factorgraph_loc.fusion.base`)."""
 
 __all__ = [
     "base",

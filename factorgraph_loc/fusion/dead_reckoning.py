@@ -16,7 +16,7 @@ from factors.se2 import Array
 
 
 class DeadReckoningSettings(FilterSettings):
-    """Settings of dead reckoning. It has only those of every filter."""
+    """Settings of dead reckoning: only the settings that all filters have."""
 
 
 class _PoseRecord(NamedTuple):

@@ -74,7 +74,7 @@ class _State(NamedTuple):
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def with_block(self, new: NewVariable) -> _State:
-        """The state with one more block, for a new variable that is correlated with the rest."""
+        """The state with one more variable, such as a landmark, which is correlated with the rest of the state."""
         size, columns = len(self.covariance), self.layout.columns
         cross, own = new.joint(self.covariance, columns)
         end = size + len(new.mean)
@@ -247,7 +247,8 @@ class Ekf(Filter):
         self._doubt(tick)
 
     def _doubt(self, m: Measurement) -> None:
-        """Check whether the search rejects the track. If it does, continue at the pose that the search has found."""
+        """Check whether the observations contradict the estimated poses. If they do, continue at the pose that the search has
+        found."""
         view = _View(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         best = self._search.best if refuted is not None else None

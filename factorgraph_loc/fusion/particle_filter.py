@@ -319,7 +319,7 @@ class ParticleFilter(Filter):
             self._state = self._sampled_cloud(self._t) or self._state
 
     def _doubt(self, m: Measurement) -> None:
-        """Check whether the search rejects the track. If it does, draw particles from the search."""
+        """Check whether the observations contradict the particles. If they do, draw particles from the search."""
         view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:

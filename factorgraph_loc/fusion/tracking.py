@@ -44,7 +44,7 @@ UNSURE = 5.0
 NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
 CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known with variances of its position below this sum
 PROBATION = 5.0  # s; for this time after a rejection the new track is not yet reported as localized
-# Covariance that is added to a pose from the search (standard deviations in m, m, rad). It is large, because the same measurements
+# Covariance of a pose from the search, as a prior (standard deviations in m, m, rad). It is large, because the same measurements
 # are also factors of a graph, and because the odometry that moved the search's particles may have failed.
 FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 APART = 16.0  # squared Mahalanobis distance: above it a pose differs from the track

@@ -1,4 +1,4 @@
-"""Pixels of points in space: model, kernels, factors."""
+"""Pixels of points in space: camera model, compiled functions, factors."""
 
 __all__ = [
     "factor",

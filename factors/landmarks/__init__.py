@@ -1,3 +1,3 @@
-"""Ranges and bearings of landmarks: model and factor."""
+"""Ranges and bearings of landmarks: measurement model and factor."""
 
 __all__ = ["factor", "kernels", "model"]

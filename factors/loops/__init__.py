@@ -1,3 +1,3 @@
-"""Loops: a place that is met again, as a robust factor on two poses."""
+"""Loop closures as robust factors on two poses."""
 
 __all__ = ["factor"]

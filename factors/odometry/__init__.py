@@ -1,3 +1,3 @@
-"""Increments of wheel odometry: model, integration, kernels."""
+"""Wheel odometry: noise model, integration to relative poses, factors."""
 
 __all__ = ["chain", "factor", "kernels", "model"]

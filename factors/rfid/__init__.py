@@ -1,4 +1,4 @@
-"""RFID tags: detection, strength and phase."""
+"""Likelihoods and factors of RFID measurements: reads and misses, signal strength, phase."""
 
 from factors.rfid.model import BeamModel, DetectionModel, GridModel, LogisticModel
 

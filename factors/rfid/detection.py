@@ -218,7 +218,7 @@ class RfidLikelihood:
     def joint_score(
         self, pose: Array, parameters: Array, counts: TagReadCounts, estimated: Sequence[int] | None = None
     ) -> Score:
-        """The score of one pose (3,) with given ``parameters`` (Q,), with derivatives by both.
+        """The tempered negative log-likelihood of ``counts`` at one pose (3,) and ``parameters`` (Q,), with derivatives by both.
 
         ``estimated`` (P,): the indices of the parameters in the derivatives. None means all. The gradient is (1, 3 + P), and the
         information (1, 3 + P, 3 + P), by the body-frame perturbation of the pose and by these parameters.
@@ -231,7 +231,7 @@ class RfidLikelihood:
         return Score(np.array((nll,)), gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, counts: TagReadCounts) -> Score:
-        """The score of ``counts`` at poses (N, 3)."""
+        """The tempered negative log-likelihood of ``counts`` at poses (N, 3), with derivatives by the poses."""
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
         no_columns = np.full(len(self.parameters), -1, dtype=np.int64)
         alpha = float(self.model.tempering)

@@ -113,8 +113,8 @@ class RfidFactor:
         return out
 
     def score(self, values: Sequence[Array]) -> Score:
-        """The score of one pose (3,) and the estimated parameters (P,), with gradient (1, 3 + P) and information
-        (1, 3 + P, 3 + P)."""
+        """The tempered negative log-likelihood at one pose (3,) and the estimated parameters (P,), with gradient (1, 3 + P) and
+        information (1, 3 + P, 3 + P)."""
         if not self.estimated:
             return self.likelihood.score(values[0], self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)

@@ -121,7 +121,7 @@ def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArr
 def mixture(
     odds: float, elsewhere: float, e: float, mean: float, variance: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """The likelihood of a tag that may not be as surveyed (:mod:`factors.rfid.tag_states`).
+    """The likelihood of a tag that may be weak, moved or dead instead of as surveyed (:mod:`factors.rfid.tag_states`).
 
     ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`. ``e``, ``mean``, ``variance``: the untempered
     negative log-likelihood of a tag as surveyed, and its mean and variance over all outcomes. ``none``: the untempered negative
@@ -178,7 +178,7 @@ def _add_tag(
     slope: Array,
     curve: Array,
 ) -> tuple[float, float, float]:
-    """The negative log-likelihood of one tag as surveyed in K measurements, and its mean and variance over all outcomes.
+    """The negative log-likelihood in K measurements of one tag that works and is where the map has it. Also its mean and variance.
 
     Writes, for each measurement, the derivative ``slope`` (K,) by the read probability and the Fisher information ``curve`` (K,) on
     that probability, both 0 out of reach. Writes the derivatives ``by`` (K, 7) of the probability by the antenna's position in the
@@ -344,8 +344,8 @@ def by_tag(
     rounds: Integers,
     hits: Integers,
 ) -> tuple[Array, Array, Array]:
-    """For each of T tags as surveyed, at one pose (3,): the untempered negative log-likelihood (T,), and its gradient (T, 5) and
-    information (T, 5, 5) by the pose (3) and by the tag's position in the world (2)."""
+    """For each of T tags that work and are where the map has them, at one pose (3,): the untempered negative log-likelihood (T,),
+    and its gradient (T, 5) and information (T, 5, 5) by the pose (3) and by the tag's position in the world (2)."""
     scans, tags, size = len(antennas), len(points), 5
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
     at, far, by = np.empty((scans, ROW)), _unread(packed, rounds), np.empty((scans, PLACE))

@@ -55,8 +55,8 @@ class MissTable(NamedTuple):
     """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is relative to that
     of a tag out of reach.
 
-    ``surveyed`` (H, S, S): that of a tag as surveyed, untempered, for H heights.
-    ``folded`` (H, S, S): that of a tag that may not be as surveyed, tempered.
+    ``surveyed`` (H, S, S): that of a tag that works and is where the map has it, untempered, for H heights.
+    ``folded`` (H, S, S): that of a tag that may be weak, moved or dead, tempered.
     ``cell`` [m]: the size of a cell. ``reach`` [m]: the distance beyond which both are zero.
     """
 
@@ -275,8 +275,8 @@ def _log_likelihood(
 def _of_tag(
     model: Antennas, scan: Scan, x: float, y: float, height: float, nx: float, ny: float, levels: Integers, w: int
 ) -> float:
-    """The untempered log-likelihood of one tag as surveyed, relative to that of misses out of reach, from the tables of each
-    antenna.
+    """The untempered log-likelihood of one tag that works and is where the map has it, relative to that of misses out of reach,
+    from the tables of each antenna.
 
     ``x``, ``y``, ``height``, ``nx``, ``ny``: position and facing of the tag in the robot frame. ``levels`` (A,): the tables of the
     tag. ``w``: its number among the exceptional tags, -1 if it was not read.

@@ -30,7 +30,7 @@ Array32 = NDArray[np.float32]
 Measured = tuple[Array, Integers, Integers]  # offsets, antennas and rounds of read counts
 Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T) and hits (K, T)
 
-CELL = 0.05  # m
+CELL = 0.05  # m; size of a cell of a table
 COARSE = 8  # number of cells along each side of a block, for which the largest value is stored
 FACINGS = 9  # number of layers, for evenly spaced cosines of the facing from -1 to 1
 NEGLIGIBLE = 15.0  # logarithm of the ratio of two likelihoods above which the smaller one is neglected

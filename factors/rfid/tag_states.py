@@ -93,7 +93,7 @@ class TagStates:
         self._weights = np.tile(prior, (count, 1))  # log-probabilities of the states of each tag, not normalised
         self._prior, self._moved, self._raised = prior, moved, 0.0
         self.prior = _odds(prior)
-        self.odds: Array = np.full(count, self.prior)  # log-odds (T,) of not as surveyed against as surveyed
+        self.odds: Array = np.full(count, self.prior)  # the log-odds (T,) that each tag is weak, moved or dead
         self._doubtful: Integers | None = None  # the cached result of `doubtful`, None if it must be computed
         # the evidence of the last seconds: time, tags, and the log-likelihoods of their states
         self._evidence: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
@@ -101,7 +101,7 @@ class TagStates:
 
     @property
     def doubtful(self) -> Integers:
-        """The indices of tags, ascending, that are not as surveyed with a probability above :data:`BELIEVED`."""
+        """The indices of tags, ascending, that are weak, moved or dead with a probability above :data:`BELIEVED`."""
         if self._doubtful is None:
             self._doubtful = np.flatnonzero(self.odds > LIMIT)
         return self._doubtful
@@ -133,7 +133,7 @@ class TagStates:
             self.last_read = max(self.last_read, t)
 
     def expect(self, tags: Integers, evidence: Array) -> Array:
-        """The log-likelihood (U,) of a scan's reads and misses of ``tags`` (U,) if these are not as surveyed (``elsewhere``).
+        """The log-likelihood (U,) of a scan's reads and misses of ``tags`` (U,) if these are weak, moved or dead (``elsewhere``).
 
         ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative to that of
         misses out of range.
@@ -271,7 +271,7 @@ def _log_sum(weights: Array, evidence: Array) -> float:
 
 @compiled
 def _odds(weights: Array) -> float:
-    """The log-odds that a tag is not as surveyed. ``weights``: the log-probabilities of its states."""
+    """The log-odds that a tag is weak, moved or dead. ``weights``: the log-probabilities of its states."""
     return float(_log_sum(weights[DEAD:], np.zeros(len(weights) - DEAD)) - weights[0])
 
 
@@ -290,7 +290,7 @@ def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
 
 @compiled
 def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
-    """Exclude the state dead for ``tags``. Returns True if this changes which tags are doubtful."""
+    """Exclude the state dead for ``tags``. Returns True if this changes which tags are believed to be weak, moved or dead."""
     changed = False
     for t in tags:
         if weights[t, DEAD] > -np.inf:

@@ -97,7 +97,7 @@ def log_likelihood(
 
 @compiled
 def mixed(own: float, odds: float, elsewhere: float) -> float:
-    """The log-likelihood of a tag that may not be as surveyed. ``own``: the log-likelihood if it is as surveyed. ``odds``,
+    """The log-likelihood of a tag that may be weak, moved or dead. ``own``: the log-likelihood if it is none of these. ``odds``,
     ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`."""
     if odds == -np.inf or elsewhere == -np.inf:
         return own

@@ -1,3 +1,3 @@
-"""The graph estimators: keyframes, the solver iSAM2, and the batch solution of a whole run."""
+"""The estimators with factor graphs: keyframes, incremental solution by iSAM2, and the batch solution of a whole run."""
 
 __all__ = ["estimator", "graph", "problem", "settings"]

@@ -4,13 +4,11 @@ By default, causal estimates come from a window: poses older than 10 s are margi
 Other modes are settings:
 
 - ``lag = "all"`` keeps the whole history in iSAM2. This is the default if landmarks or points are estimated, because a loop may
-close
-  at any time.
-- ``lag`` in seconds sets the length of the window. The final trajectory has each pose's estimate from when the pose left the
-window.
+  close at any time.
+- ``lag`` in seconds sets the length of the window. The final trajectory has each pose's estimate from when the pose left
+  the window.
 - ``final_only``, as in the batch, builds the graph with rough estimates and solves it only at the end. If points are estimated,
-rough
-  estimates drift too far to associate sightings with points, so iSAM2 solves the graph during the run.
+  rough estimates drift too far to associate sightings with points, so iSAM2 solves the graph during the run.
 
 When the search rejects the track and finds another pose, the graph is cut at the time when the track became wrong. It continues at
 the new pose, after a step of unknown length. Later measurements are replayed in slices of fixed cost, so that results do not depend
@@ -178,7 +176,7 @@ class Smoother(Timeline):
         return PosePrior(t, pose, FOUND) if start is None else start.facing(float(pose[2]))
 
     def _doubt(self, m: Measurement) -> None:
-        """Check whether the search rejects the track after a measurement. If it does, continue at the pose that the search has
+        """Check whether the observations contradict the estimated poses. If they do, continue at the pose that the search has
         found."""
         graph, odometry = self._graph, self._odometry
 

@@ -40,7 +40,8 @@ from factors.least_squares import LEAST, MAX_ITERATIONS, descended
 from factors.se2 import Array
 
 DAMPINGS = (0.0, 1e-10, 1e-7)  # are tried one after the other
-DAMPED = "the graph hardly determines some covariances, which needed a relative damping of {damping:g}"  # message of the event
+# message of the event
+DAMPED = "the graph hardly determines some covariances, which needed a relative damping of {damping:g}"
 _NEAR = re.compile(r"variable\s+(\d+)")  # the key in GTSAM's message about an indeterminate system
 MOST_PARAMETERS = 40  # with more parameters, GTSAM's sparse elimination is faster than the chain solver
 Placed = tuple[Factor, tuple[int, ...]]  # a factor with the keys of its variables
@@ -137,7 +138,7 @@ class Chained:
 
     @property
     def fits(self) -> bool:
-        """True if the factors form such a chain."""
+        """True if each factor depends on one pose or on two consecutive poses, so that this class can solve the problem."""
         place = {key: i for i, key in enumerate(self._poses)}
         for _, keys in self._factors:
             numbers = [place[key] for key in keys if key in place]

@@ -311,7 +311,7 @@ class LinearFactors:
 
     @property
     def framed(self) -> Values:
-        """The linearisation points for a new solver. Held variables keep their relative positions."""
+        """The linearisation points for a new solver. The variables of marginal factors keep their relative positions."""
         return self.at | self._held
 
     @property
