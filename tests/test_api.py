@@ -58,7 +58,7 @@ def test_simulated_logs_are_those_of_the_same_seed(office, tmp_path):
     fgloc.simulate("office", 3, changes=SHORT, out=tmp_path / "log")
     (read,) = fgloc.load(str(tmp_path / "log"))
     assert np.array_equal(read.streams["odometry"].dx, office.streams["odometry"].dx)
-    with pytest.raises(fgloc.InputError, match="images need out"):
+    with pytest.raises(fgloc.InputError, match="images is true, but out is missing"):
         fgloc.simulate("office", images=True)
 
 

@@ -68,7 +68,7 @@ def test_a_trajectory_comes_back_from_an_array_and_a_table(trajectory):
         kind.from_numpy(trajectory.to_numpy()[::-1])
     with pytest.raises(fgloc.InputError, match="the table has no column x, expected t, x, y"):
         kind.from_polars(table.drop("x"))
-    with pytest.raises(fgloc.InputError, match="column y has values that are no numbers"):
+    with pytest.raises(fgloc.InputError, match="column y has values that are not numbers"):
         kind.from_polars(table.with_columns(y=pl.lit("left")))
 
 

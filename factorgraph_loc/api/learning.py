@@ -1,4 +1,4 @@
-"""``fgloc calibrate``, ``map`` and ``features evaluate`` as functions."""
+"""The commands ``fgloc calibrate``, ``map`` and ``features evaluate`` as functions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -32,11 +32,13 @@ def calibrate(
     overwrite: bool = False,
     progress: Callable[[float, float], None] | None = None,
 ) -> calibration.Calibration:
-    """Calibrate a rig from logs, all with reference poses or all without. Writes ``out`` (``NAME.rig.toml``) and
-    ``NAME.report.html`` next to it."""
+    """Calibrate a rig from logs, and write it to ``out`` (``NAME.rig.toml``), with a report ``NAME.report.html`` next to it.
+
+    All logs must have a reference, or all must have none. ``progress`` is called with the work done and the whole work.
+    """
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = load_all(logs, rig, world)
-    # learnt grids are kept here until the rig is written, so that a failed calibration leaves nothing behind
+    # learnt grids are stored here until the rig is written, so that a failed calibration leaves no files
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / file.name.removesuffix(RIG)
         result = calibration.calibrate(loaded, run, progress=progress, grids=grids)
@@ -47,7 +49,7 @@ def calibrate(
 
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:
-    """The path of the report of a rig; InputError if the rig's name is invalid or the file exists."""
+    """Return the path of the report of the rig ``out``. Raises InputError if the name is invalid, or if a file exists."""
     return output.with_ending(out, RIG, ".report.html", overwrite=overwrite)
 
 
@@ -71,7 +73,8 @@ def build_map(
 ) -> maps.MadeMap:
     """Estimate a map of landmarks, RFID tags or points from a log. Writes ``out`` (``NAME.world.toml``) and a picture next to it.
 
-    For the arguments see :class:`~factorgraph_loc.experiments.maps.MapOptions`. ``progress`` is called with the fraction done.
+    The other arguments are those of :class:`~factorgraph_loc.experiments.maps.MapOptions`. ``progress`` is called with the fraction
+    of the work that is done.
     """
     maps.plot_path(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
@@ -89,7 +92,11 @@ def features(
     overwrite: bool = False,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> pl.DataFrame:
-    """Evaluate point features on images of planar scenes: folders of sequences, or photographs, which are warped."""
+    """Evaluate point features on ``images`` of planar scenes, and write the scores to the folder ``out``.
+
+    ``images``: folders of image sequences, or photographs, which are warped. ``features``: names of the features to compare.
+    ``count``: maximum number of features in an image. ``progress`` is called with the work done and the whole work.
+    """
     require_free(Path(out), feature_scores.FILES, overwrite=overwrite)
     chosen = [Feature(name, extractor(name, count).detectAndCompute) for name in features]
     scores = feature_scores.evaluate_all(find_sequences([Path(path) for path in images]), chosen, progress)

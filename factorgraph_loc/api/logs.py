@@ -1,4 +1,4 @@
-"""``fgloc datasets``, ``info``, ``convert``, ``manifest`` and ``simulate`` as functions."""
+"""The commands ``fgloc datasets``, ``info``, ``convert``, ``manifest`` and ``simulate`` as functions."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -25,14 +25,14 @@ from factorgraph_loc.simulation import simulate as make_log
 
 
 def datasets(data_root: str | Path | None = None) -> list[Dataset]:
-    """The logs with a name; ``present``: whether their files exist."""
+    """Return the known data sets, whose names can be given as logs. ``data_root``: the folder of their files."""
     return describe(data_root)
 
 
 def info(
     log: LogLike, *, rig: RigLike | None = None, world: WorldLike | None = None, out: str | Path | None = None
 ) -> Inspection:
-    """Summarize a log, with warnings about its content. ``out``: a picture (PNG) of the log from above to write."""
+    """Return a summary of a log, with warnings about its content. ``out``: a PNG file to write, a picture of the log from above."""
     loaded = read_log(log, rig=rig, world=world)
     if out is not None:
         draw([loaded], Path(out))
@@ -40,7 +40,7 @@ def info(
 
 
 def draw(logs: Sequence[Log], path: Path) -> None:
-    """Write the picture of the only log. InputError for several, and for a path that is no PNG file."""
+    """Write a picture of the one log in ``logs``. Raises InputError if there are several, or if ``path`` is not a PNG file."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: expected a name that ends in .png")
     if len(logs) != 1:
@@ -60,16 +60,16 @@ def convert(
     world: WorldLike | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a log as a new folder in the native format.
-
-    ``overwrite`` replaces a log that ``out`` is.
-    """
+    """Write a log as the folder ``out`` in the native format. ``overwrite``: replace a log in the folder ``out``."""
     write_native(read_log(log, rig=rig, world=world), out, format, overwrite=overwrite)
 
 
 def manifest(log: str | Path) -> Proposal:
-    """Propose a manifest for a folder of tables or a ROS bag: which file or topic is which sensor. Its ``text``, written to a file
-    in its ``folder`` and checked, can be read as a log. InputError if the log cannot be read."""
+    """Propose a manifest for a folder of tables or a ROS bag, which states which file or topic is which sensor.
+
+    Write its ``text`` to a file in its ``folder`` and check it. That file can then be read as a log. Raises InputError if the
+    folder or the bag cannot be read.
+    """
     path = Path(log)
     propose = manifest_of_folder if path.is_dir() and not is_bag(path) else manifest_of_bag
     return propose(path, Path.cwd())
@@ -86,14 +86,15 @@ def simulate(
 ) -> Log:
     """Simulate a log with known ground truth. The same seed gives the same bytes.
 
-    ``what``: a preset, a TOML file, or settings. ``changes``: nested tables, such as ``{"drive": {"duration": 60.0}}``.
-    ``out``: a new folder for the log in the native format; required with ``images``, which are rendered into it.
+    ``what``: a preset, a TOML file, or settings. ``changes``: changed settings as nested tables, such as
+    ``{"drive": {"duration": 60.0}}``. ``images``: render the images of the camera into ``out``. ``out``: a new folder in which to
+    write the log in the native format.
     """
     if isinstance(what, SimulationSettings) and changes:
         raise InputError("changes apply to a preset or a file, but settings are given")
     settings = what if isinstance(what, SimulationSettings) else named_settings(str(what), changes)
     if images and out is None:
-        raise InputError("images need out, a folder to write the log to")
+        raise InputError("images is true, but out is missing: give a folder in which to write the log")
     log = make_log(settings, seed)
     if out is None:
         return log
@@ -109,7 +110,7 @@ def simulate(
 def _write_with_images(
     log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Callable[[float, float], None]
 ) -> None:
-    """Render the images into a temporary folder first, so that the log is written completely or not at all."""
+    """Write a log with rendered images. They are rendered into a temporary folder, so that no incomplete log is written."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(folder) as rendered:

@@ -1,5 +1,7 @@
-"""``fgloc estimators``, ``sensors``, ``readers``, ``presets``, ``policies`` and ``rigs`` as functions: what there is to choose
-from."""
+"""The commands ``fgloc estimators``, ``sensors``, ``readers``, ``presets``, ``policies`` and ``rigs`` as functions.
+
+They list the available choices.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,9 +29,9 @@ ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
 
 @dataclass(frozen=True)
 class NamedSettings:
-    """A reader of logs, a preset of simulations or a policy of active robots, with one sentence ``about`` it.
+    """A reader of logs, a preset of simulations, or a policy of active localization. ``about``: one sentence about it.
 
-    ``settings``: the options of a reader, the settings of a preset without those of its rig, or those that all policies share.
+    ``settings``: the options of a reader, the settings of a preset except its rig, or the settings that all policies share.
     """
 
     name: str
@@ -39,8 +41,10 @@ class NamedSettings:
 
 @dataclass(frozen=True)
 class SensorDescription:
-    """A sensor: one sentence on it, its names in ``sensors``, the columns of its tables, and the settings in its sections of the
-    rig."""
+    """A sensor. ``about``: one sentence about it. ``channels``: its names in the option ``sensors``.
+
+    ``tables``: the columns of each of its tables. ``rig``: the settings in each of its sections of the rig.
+    """
 
     name: str
     about: str
@@ -50,31 +54,34 @@ class SensorDescription:
 
 
 def known_estimators() -> list[Description]:
-    """The estimators, each with the sensors that it takes and its settings."""
+    """Return the estimators, each with the sensors that it uses and its settings."""
     return [describe(name) for name in ESTIMATORS]
 
 
 def known_readers() -> list[NamedSettings]:
-    """The readers of logs, each with its options."""
+    """Return the readers of logs, each with its options."""
     return [describe_reader(name) for name in READERS]
 
 
 def describe_reader(name: str) -> NamedSettings:
-    """The description of a reader; InputError for an unknown one."""
+    """Return the description of the reader ``name``. Raises InputError if there is no such reader."""
     module = reader(name)
     return NamedSettings(name, first_sentence(module), tuple(settings_in(module.Options)))
 
 
 def known_sensors() -> list[SensorDescription]:
-    """The sensors, each with the columns of its tables and its settings in the rig."""
+    """Return the sensors, each with the columns of its tables and its settings in the rig."""
     return [describe_sensor(name) for name in SENSORS]
 
 
 def describe_sensor(name: str) -> SensorDescription:
-    """The description of a sensor, by its name or that of a channel; InputError for an unknown one."""
+    """Return the description of a sensor. ``name``: its name, or a name in the option ``sensors``.
+
+    Raises InputError if there is no such sensor.
+    """
     described = sensor(name)
     tables: dict[str, dict[str, Column]] = {}
-    for table in all_tables(described):  # several of one name are alternatives
+    for table in all_tables(described):  # several tables with one name are alternatives
         tables.setdefault(table.name, {}).update({column.name: column for column in table.columns})
     return SensorDescription(
         described.name,
@@ -86,29 +93,29 @@ def describe_sensor(name: str) -> SensorDescription:
 
 
 def known_presets() -> list[NamedSettings]:
-    """The presets of simulations, each with its settings."""
+    """Return the presets of simulations, each with its settings."""
     return [describe_preset(name) for name in PRESETS]
 
 
 def describe_preset(name: str) -> NamedSettings:
-    """The description of a preset of simulations; InputError for an unknown one."""
+    """Return the description of a preset of simulations. Raises InputError if there is no such preset."""
     settings = settings_in(SimulationSettings, default=preset(name))
     return NamedSettings(name, PRESETS[name], tuple(s for s in settings if not s.key.startswith("rig.")))
 
 
 def known_policies() -> list[NamedSettings]:
-    """The policies of active robots, each with the settings of their runs."""
+    """Return the policies of active localization, each with the settings of a run."""
     settings = tuple(settings_in(ActiveSettings))
     return [NamedSettings(name, about, settings) for name, about in POLICIES.items()]
 
 
 def known_rigs() -> dict[str, Rig]:
-    """The rigs of known logs and simulations by name, and the default one."""
+    """Return by name the rigs of known logs and of simulations, and the default rig."""
     return {name: make() for name, (_, make) in sources_of_rigs().items()}
 
 
 def sources_of_rigs() -> dict[str, tuple[str, Callable[[], Rig]]]:
-    """The rigs by name: whose each is, and how it is made."""
+    """Return by name, for each known rig, a text that states to what it belongs, and a function that makes it."""
     default: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
     recorded = {name: ("a known log", partial(read_rig, file)) for name, file in shipped().items()}
     return default | recorded | {name: ("fgloc simulate", lambda name=name: preset(name).rig) for name in PRESETS}
@@ -140,7 +147,7 @@ def new_rig(
 
 
 def write_new_rig(rig: Rig, remarks: list[str], file: Path, *, overwrite: bool) -> None:
-    """Write a rig with remarks and the meaning of each key. InputError if the file exists, unless it is to ``overwrite``."""
+    """Write a rig with remarks and the meaning of each key. Raises InputError if the file exists and ``overwrite`` is false."""
     if file.exists() and not overwrite:
-        raise InputError(f"{file}: exists already; choose another name or give --overwrite")
+        raise InputError(f"{file}: exists already: choose another name, or use --overwrite")
     write_text(file, rig_text(rig, [ADVICE, *remarks]))

@@ -1,4 +1,4 @@
-"""``fgloc view``, ``export`` and ``score`` as functions: stored results for viewers and other programs, and their scores."""
+"""The commands ``fgloc view``, ``export`` and ``score`` as functions."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -36,12 +36,13 @@ def view(
     rrd: str | Path | None = None,
     bind: str = LOOPBACK,
 ) -> None:
-    """Show a log and its runs over time, in Rerun.
+    """Show a log and its runs over time in the viewer Rerun.
 
-    ``results``: folders of runs or comparisons, and their log if :func:`~factorgraph_loc.api.logs.datasets` does not list it; or
-    a log alone. ``rrd``: file to write for the viewer instead of opening it. ``bind``: IP address that the viewer
-    listens on, without credentials; only this machine reaches the default one. InputError if ``rerun-sdk`` is not installed, the
-    viewer does not start, or the file cannot be written.
+    ``results``: folders of runs or comparisons, or only a log. The log of the runs must be given too, unless
+    :func:`~factorgraph_loc.api.logs.datasets` lists it.
+    ``rrd``: a file to write for the viewer instead of opening it.
+    ``bind``: the IP address on which the viewer listens, without password. Only this machine reaches the default address.
+    Raises InputError if ``rerun-sdk`` is not installed, if the viewer does not start, or if the file cannot be written.
     """
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
     show(log, runs, None if rrd is None else Path(rrd), bind)
@@ -54,10 +55,10 @@ def export(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> list[Path]:
-    """Write runs for Foxglove and RViz, or the final trajectory of a run, the reference of a log or the points of its map for other
-    programs; return the files.
+    """Write results for other programs. Returns the written files.
 
-    ``results``: as for :func:`view`. ``out``: its suffix selects the format: .mcap, .tum, .kitti or .ply.
+    ``results``: folders of runs or a log, see :func:`view`. ``out``: a file. Its suffix selects the content: .mcap for runs in
+    Foxglove and RViz, .tum or .kitti for the final trajectory of a run or the reference of a log, .ply for the points of the map.
     """
     require_format(Path(out))
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
@@ -69,9 +70,9 @@ def _listed(results: LogLike | Sequence[LogLike]) -> list[LogLike]:
 
 
 def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, list[StoredRun]]:
-    """The log among ``results``, or else the common log of all runs there, and the runs.
+    """Return the log and the runs in ``results``. Without a log in ``results``, it is the known data set with the name in the runs.
 
-    InputError if there are several logs, or if the log of the runs is not known by its name.
+    ``read``: reads a log. Raises InputError if there are several logs, or if no known data set has the name of the log of the runs.
     """
     places = [Path(name) for name in results if not isinstance(name, Log) and is_results(Path(name))]
     logs = [name for name in results if isinstance(name, Log) or Path(name) not in places]
@@ -83,21 +84,21 @@ def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, l
     if not logs and not named:
         raise InputError("there are no results, expected folders of runs, or a log")
     if not logs and len(named) > 1:
-        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected one of these logs to be given too")
+        raise InputError(f"{places[0]}: contains runs on the logs {listed(named)}: give one of these logs, too")
     if not logs and named[0] not in manifests():
         raise InputError(
-            f"{places[0]}: is of the log {named[0]}, which `fgloc datasets` does not list, expected that log to be given too"
+            f"{places[0]}: is a run on the log {named[0]}, which `fgloc datasets` does not list: give that log, too"
         )
     log = read(logs[0] if logs else named[0])
     of_log = [folder for folder in folders if folder.log == log.name]
     if folders and not of_log:
-        raise InputError(f"{places[0]}: holds runs of {listed(named)}, expected some of the log {log.name}")
+        raise InputError(f"{places[0]}: contains runs on the logs {listed(named)}, expected runs on the log {log.name}")
     return log, read_runs(of_log, log)
 
 
 def show(log: Log, runs: list[StoredRun], rrd: Path | None, bind: str) -> None:
-    """Open the viewer, or write a file for it. InputError if ``rerun-sdk`` is not installed."""
-    # Rerun prints the errors that it raises, unless RUST_LOG says otherwise when it is imported
+    """Open the viewer, or write the file ``rrd`` for it. Raises InputError if ``rerun-sdk`` is not installed."""
+    # Rerun also prints the errors that it raises, unless RUST_LOG is "off" when it is imported
     is_set = "RUST_LOG" in os.environ
     os.environ.setdefault("RUST_LOG", "off")
     try:
@@ -114,18 +115,18 @@ def show(log: Log, runs: list[StoredRun], rrd: Path | None, bind: str) -> None:
 
 
 def require_format(out: Path) -> None:
-    """InputError if the suffix of a file is that of no format."""
+    """Raise InputError if the suffix of ``out`` is not among the formats of exports."""
     if out.suffix not in FORMATS:
         raise InputError(f"{out}: has the suffix {quoted(out.suffix)}, expected one of {', '.join(FORMATS)}")
 
 
 def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
-    """Write a log and its runs, or a trajectory, in the format of the suffix; return the files."""
+    """Write a log and its runs, a trajectory, or points of a map, in the format of the suffix of ``out``. Returns the files."""
     if out.suffix == ".mcap":
         write_mcap(log, runs, out)
     elif out.suffix == ".ply":
         if log.world.points is None:
-            raise InputError(f"{log.name}: its map has no points to write, expected one with points (--world)")
+            raise InputError(f"{log.name}: its map has no points to write: give a map with points (--world)")
         write_ply(log.world.points, out)
     else:
         return write_trajectory(_trajectory(log, runs, out), out, log.t0_ns)
@@ -134,17 +135,17 @@ def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
 
 def _only(runs: list[StoredRun], out: Path) -> StoredRun:
     if len(runs) != 1:
-        count = f"there are {len(runs)} ({listed(run.name for run in runs)})" if runs else "there is none"
-        raise InputError(f"{out}: holds one run, and {count}, expected the folder of one run")
+        count = f"{len(runs)} runs are given ({listed(run.name for run in runs)})" if runs else "no run is given"
+        raise InputError(f"{out}: a file of this format contains one run, but {count}: give the folder of one run")
     return runs[0]
 
 
 def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory:
-    """The final trajectory of the run, or the reference of a log without runs."""
+    """Return the final trajectory of the one run, or the reference of the log if there are no runs."""
     if runs:
         return _only(runs, out).final
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference to write, expected the folder of a run too")
+        raise InputError(f"{log.name}: has no reference to write: give the folder of a run, too")
     return log.reference
 
 
@@ -162,11 +163,12 @@ def score(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> TrajectoryScore:
-    """Score any trajectory against any other; ``figures`` of the returned score are the errors, in metres and radians.
+    """Score a trajectory against another. The field ``figures`` of the returned score has the errors, in metres and radians.
 
-    ``estimate``, ``reference``: trajectories whose times are of one clock, or what names one for ``fgloc score``. For the other
-    arguments see :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. ``out``: folder for the files that ``fgloc
-    score`` writes. InputError if a trajectory cannot be read, or the two have nothing in common.
+    ``estimate``, ``reference``: trajectories with times of the same clock, or texts that name trajectories as in ``fgloc score``.
+    ``out``: a folder in which to write the files of ``fgloc score``. For the other arguments see
+    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. Raises InputError if a trajectory cannot be read, or if the
+    two have no times in common.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""``fgloc run`` as a function."""
+"""The command ``fgloc run`` as a function."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,8 +26,11 @@ SMOOTHER = "smoother"
 
 @dataclass(frozen=True)
 class Run:
-    """The outcome of a run: its ``result``, its ``scores`` as in ``metrics.json``, and the constants of the rig that were
-    ``learnt`` from the log, if asked for."""
+    """The outcome of a run.
+
+    ``result``: the estimates. ``scores``: the scores, as in ``metrics.json``. ``learnt``: the constants of the rig that were
+    estimated from the log, empty unless requested.
+    """
 
     result: RunResult
     scores: dict[str, Any]
@@ -58,9 +61,11 @@ def run(
 ) -> Run:
     """Run one estimator on one log and score the result.
 
-    For the arguments see :class:`~factorgraph_loc.model.scoring.RunConfig`. ``learn``: learn the rig from the log itself, for
-    the final trajectory alone. ``align``: also score after this alignment with the reference. ``out``: folder for the files that
-    ``fgloc run`` writes.
+    ``learn``: estimate the constants of the rig from the log itself, for the final trajectory only.
+    ``align``: an alignment with the reference, after which scores are computed again.
+    ``out``: a folder in which to write the files of ``fgloc run``.
+    ``progress`` is called with the fraction of the work that is done.
+    For the other arguments see :class:`~factorgraph_loc.model.scoring.RunConfig`.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)
@@ -84,12 +89,12 @@ def run(
 def run_and_learn(
     log: Log, config: RunConfig, progress: Callable[[float], None] | None = None
 ) -> tuple[RunResult, Knowledge]:
-    """Run an estimator on a log, learn the rig from the log by turns with the smoother, and compute the final trajectory with it.
+    """Run an estimator on a log, estimate the rig from the same log, and compute the final trajectory with the estimated rig.
 
-    The learnt rig depends on the whole log. Causal estimates therefore use the given rig, as all else in the result but the final
-    trajectory. ``progress`` is called with the fraction done. The effective configuration of the result has the ``learnt_rig``
-    too. Raises InputError if the log has too little information, and the errors of
-    :func:`~factorgraph_loc.experiments.run.run`.
+    The smoother and the calibration of the rig alternate. The estimated rig depends on the whole log, so only the final trajectory
+    uses it. All other results use the given rig. The effective configuration of the result has the estimated rig as ``learnt_rig``.
+    ``progress`` is called with the fraction of the work that is done. Raises InputError if the log has too little information, and
+    the errors of :func:`~factorgraph_loc.experiments.run.run`.
     """
     report = progress or (lambda _share: None)
     runs = TURNS + 2

@@ -1,3 +1,3 @@
-"""Results for viewers: Rerun, Foxglove, RViz."""
+"""Exports of logs and results for the viewers Rerun, Foxglove and RViz."""
 
 __all__ = ["rerun_scene", "rerun_viewer", "ros", "runs"]

@@ -1,8 +1,8 @@
-"""Export of a log and its runs as a Rerun recording (https://rerun.io), along the time of the log.
+"""Exports a log and its runs as a Rerun recording (https://rerun.io).
 
-Everything is in the world frame [m], z up; the timeline ``log_time`` counts seconds from the log's start. All data are sent as
-columns: Rerun 0.41 writes broken files for single values logged with ``set_time(duration=...)``. The library ``rerun-sdk`` is
-optional: without it these modules cannot be imported.
+All positions are in the world frame [m], z up. The timeline ``log_time`` counts seconds from the start of the log. All data are
+sent as columns, because Rerun 0.41 writes broken files for single values logged with ``set_time(duration=...)``. The library
+``rerun-sdk`` is optional. Without it, this module cannot be imported.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from factors.camera import model as reprojection
 from factors.se2 import Array
 
 TIMELINE = "log_time"
-WORLD, CAMERA = "/world", "/camera"  # the latter without a robot pose
-FRUSTUM = 0.4  # m from the camera to its image
+WORLD, CAMERA = "/world", "/camera"  # CAMERA is used if there is no pose of the robot
+FRUSTUM = 0.4  # m from the drawn camera to its image
 BATCH = 16  # images per message
-NEAREST = 300  # map points drawn into an image
+NEAREST = 300  # maximum number of map points that are drawn into an image
 PLOTS, EVENTS = "/plots", "/events"
-LINE, POINT = 0.02, 0.06  # m: radii
-ARROW = 0.6  # m
+LINE, POINT = 0.02, 0.06  # m: radii of lines and points
+ARROW = 0.6  # m: length of the arrow of a heading
 
 
 def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
-    """Write a file that ``rerun FILE`` opens.
+    """Write a log and its runs to a file that ``rerun FILE`` opens.
 
     Raises InputError if an image cannot be read, or the file cannot be written.
     """
@@ -58,13 +58,15 @@ def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 
 
 def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
-    """Open the viewer, or use one that is open. ``bind``: IP address that a new viewer listens on; only this machine reaches the
-    default one.
+    """Show a log and its runs in the Rerun viewer. A viewer that is open is used.
 
-    Raises InputError as :func:`write_rrd` does, without a display, and if the viewer does not start.
+    ``bind``: the IP address on which a new viewer listens. Only this machine reaches the default address. Raises InputError if an
+    image cannot be read, if there is no display, or if the viewer does not start.
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
-        raise InputError("there is no display to open the viewer on, expected --rrd FILE to view it elsewhere")
+        raise InputError(
+            "there is no display to open the viewer on: use --rrd FILE to write a file for another machine"
+        )
     recording = rr.RecordingStream("fgloc")
     with open_viewer(bind) as url:
         recording.connect_grpc(url, default_blueprint=_blueprint(log, runs))
@@ -84,7 +86,7 @@ def _record(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
 
 
 def _map(recording: rr.RecordingStream, log: Log) -> None:
-    """Walls and mapped objects (landmarks, tags, points), and when each was observed."""
+    """Draw walls and mapped objects (landmarks, tags, points), and highlight each object when it was observed."""
     if log.world.walls:
         walls = np.array(log.world.walls).reshape(-1, 2, 2)
         lines = np.concatenate((walls, np.zeros((len(walls), 2, 1))), axis=2)
@@ -114,7 +116,7 @@ def _lamps(recording: rr.RecordingStream, what: str, positions: Mapping[str, Arr
 
 
 def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
-    """The estimates of a run and their errors."""
+    """Draw the estimates of a run, and plot their errors and events over time."""
     at = f"{WORLD}/{run.name}"
     _path(recording, f"{at}/final", run.final, colour)
     _trail(recording, f"{at}/causal", run.causal, colour)
@@ -143,14 +145,14 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
 
 
 def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """A whole trajectory, at all times."""
+    """Draw a whole trajectory, visible at all times."""
     lines = [_on_floor(part) for part in scene.segments(trajectory)]
     if lines:
         recording.log(at, rr.LineStrips3D(lines, radii=LINE / 2.0, colors=colour), static=True)
 
 
 def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """The path driven so far, as segments shown from their time on; none across a gap."""
+    """Draw the path up to the current time, as segments that appear at their times. A gap has no segment."""
     positions = trajectory.poses[:, :2]
     near = np.diff(trajectory.t) <= scene.GAP
     pieces = np.stack((positions[:-1], positions[1:]), axis=1)
@@ -158,14 +160,14 @@ def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 
 def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Array, colour: Colour) -> None:
-    """A line (L, 2) of ``lines`` (K, L, 2) for each of the times ``t`` (K,)."""
+    """Draw one of the ``lines`` (K, L, 2), each with L points, at each of the times ``t`` (K,) [s]."""
     if len(t):
         recording.send_columns(at, _times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
         recording.log(at, rr.LineStrips3D.from_fields(radii=LINE, colors=colour), static=True)
 
 
 def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """The robot over time, as an arrow where its heading is known."""
+    """Draw the robot over time, as a point, and as an arrow if its heading is known."""
     if not len(trajectory):
         return
     half = trajectory.poses[:, 2] / 2.0 if trajectory.has_heading else np.zeros(len(trajectory))
@@ -179,7 +181,7 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 
 def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
-    """Record images with the identified points and the predicted map points, as a picture in front of the first robot."""
+    """Record images with identified points and predicted map points. They are drawn in front of the robot of the first run."""
     settings = log.rig.find(CameraSettings)
     if settings is None or not pictures_of.has_pictures(log):
         return
@@ -216,13 +218,16 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
 def _pixels_over_time(
     recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
 ) -> None:
-    """Points (K, 2) in each image, shifted by half a pixel: the viewer's origin is a corner of the first pixel, not its centre."""
+    """Draw ``pixels`` (K, 2) in the image at each of the times ``t`` [s]. ``labels``: the names of all points.
+
+    Points are shifted by half a pixel, because the viewer's origin is a corner of the first pixel, not its centre.
+    """
     columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
     recording.send_columns(at, _times(t), columns.partition([len(p) for p in pixels]))
 
 
 def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
-    """Pixels (K, 2) of the nearest ``points`` (P, 3) visible from ``pose`` (3,), none if the pose is unknown."""
+    """Return the pixels (K, 2) of the nearest ``points`` (P, 3) in the image from ``pose`` (3,). None are visible if it is NaN."""
     if not np.isfinite(pose).all():
         return np.empty((0, 2))
     pixels, depths = reprojection.predict(model, pose, points)
@@ -231,7 +236,10 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
 
 
 def _carried(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
-    """The entity path of the drawn camera, and the trajectory of its robot: of the first run that has one, else the reference."""
+    """Return the entity path of the drawn camera, and the trajectory of its robot, or None.
+
+    The trajectory is that of the first run that has one, else the reference.
+    """
     for run in runs:
         if len(run.played()):
             return f"{WORLD}/{run.name}/robot/camera", run.played()
@@ -239,12 +247,12 @@ def _carried(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | Non
 
 
 def _times(t: Array) -> list[rr.TimeColumn]:
-    """Seconds of the log as a Rerun time column."""
+    """Return times of the log (N,) [s] as a time column of Rerun."""
     return [rr.TimeColumn(TIMELINE, duration=t)]
 
 
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
-    """Layout of the viewer: the plan from above and, if present, camera, errors and events at its side."""
+    """Return the layout of the viewer: a view from above and, beside it, the camera, errors and events, if there are any."""
     past = rrb.VisibleTimeRanges(
         timeline=TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
     )
@@ -276,7 +284,10 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
 
 
 def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
-    """Centre (2,) and larger side [m] of everything drawn; at least 5 m, to keep the viewpoint outside of a small scene."""
+    """Return the centre (2,) [m] and the larger side [m] of the drawn scene.
+
+    The side is at least 5 m, to keep the viewpoint outside of a small scene.
+    """
     parts = [run.final.poses[:, :2] for run in runs] + [np.array(log.world.walls).reshape(-1, 2)]
     parts += [marks.positions[:, :2] for marks, _, _ in scene.layers(log) if not marks.dense]
     if log.reference is not None:
@@ -289,5 +300,5 @@ def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
 
 
 def _on_floor(points: Array) -> Array:
-    """Points (..., 2) as (..., 3) with z = 0."""
+    """Return planar points (..., 2) as points in space (..., 3) with z = 0."""
     return np.concatenate((points, np.zeros((*points.shape[:-1], 1))), axis=-1)

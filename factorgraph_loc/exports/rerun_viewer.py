@@ -1,7 +1,7 @@
-"""The process of the Rerun viewer.
+"""Starts the process of the Rerun viewer.
 
-The viewer has no credentials, and ``rerun.spawn`` makes it listen on all network interfaces. It is therefore started here, with an
-address to listen on.
+The viewer requires no password, and ``rerun.spawn`` makes it listen on all network interfaces. This module starts it instead, so
+that it listens on one address.
 """
 
 import ipaddress
@@ -18,17 +18,17 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
 
 PORT = 9876
-COMMAND = (sys.executable, "-P", "-m", "rerun_cli")  # -P: no modules of the working folder
+COMMAND = (sys.executable, "-P", "-m", "rerun_cli")  # -P: Python imports no modules from the working folder
 LOOPBACK = "127.0.0.1"
-PATIENCE = 30.0  # s for the viewer to start
+PATIENCE = 30.0  # s: maximum time for the viewer to start
 
 
 @contextmanager
 def open_viewer(bind: str) -> Iterator[str]:
-    """The URL of an open or a new viewer for :meth:`rerun.RecordingStream.connect_grpc`.
+    """Yield the URL of a viewer for :meth:`rerun.RecordingStream.connect_grpc`. Starts a viewer unless one is open.
 
-    A new viewer listens on the address ``bind`` and stays open after the end of this process. InputError if ``bind`` is no IP
-    address, or if the viewer does not start or is closed before the end of the block.
+    A new viewer listens on the IP address ``bind`` and stays open after the end of this process. Raises InputError if ``bind`` is
+    no IP address, if the viewer does not start, or if it is closed before the end of the block.
     """
     host = _reachable(bind)
     url = f"rerun+http://{f'[{host}]' if ':' in host else host}:{PORT}/proxy"
@@ -38,19 +38,19 @@ def open_viewer(bind: str) -> Iterator[str]:
         while process is not None and not _is_listening(host):
             if process.poll() is not None or time.monotonic() > latest:
                 raise InputError(
-                    f"the viewer did not start{_reason(printed)}; --rrd FILE writes a file that `rerun FILE` opens"
+                    f"the viewer did not start{_reason(printed)}: use --rrd FILE to write a file that `rerun FILE` opens"
                 )
             time.sleep(0.1)
         try:
             yield url
-        except RuntimeError as error:  # of rerun
+        except RuntimeError as error:  # raised by the library rerun
             raise InputError(f"{host}:{PORT}: no viewer answers there: {error}{_reason(printed)}") from error
         if process is not None and process.poll() is not None:
             raise InputError(f"the viewer was closed{_reason(printed)}")
 
 
 def _reachable(bind: str) -> str:
-    """The address at which this machine reaches a server that listens on ``bind``."""
+    """Return the address at which this machine reaches a server that listens on ``bind``. Raises InputError for no IP address."""
     try:
         address = ipaddress.ip_address(bind)
     except ValueError as error:
@@ -69,13 +69,13 @@ def _is_listening(host: str) -> bool:
 
 
 def _start(bind: str, printed: BinaryIO) -> "subprocess.Popen[bytes]":
-    """Start the viewer in a session of its own, so that it is not closed with the terminal."""
+    """Start the viewer in its own session, so that it stays open when the terminal is closed. ``printed``: gets its output."""
     command = [*COMMAND, "--bind", bind, "--port", str(PORT), "--expect-data-soon"]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=printed, stderr=printed, start_new_session=True)
 
 
 def _reason(printed: BinaryIO) -> str:
-    """The error that the viewer printed."""
+    """Return ": " and the error in the output of the viewer, or "" if there is none."""
     printed.seek(0)
     lines = printed.read().decode(errors="replace").splitlines()
     return next((f": {line.removeprefix('Error: ')}" for line in lines if line.startswith(("Error", "thread "))), "")

@@ -1,8 +1,7 @@
-"""Export of a log and its runs as an MCAP file (https://mcap.dev) with standard messages of ROS 2, which Foxglove, RViz and
-``ros2 bag play`` read.
+"""Exports a log and its runs as an MCAP file (https://mcap.dev) with standard messages of ROS 2.
 
-Poses are in the frame ``map``, stamped with the absolute time of the log. The library ``rosbags`` is optional and imported only
-where it is used.
+Foxglove, RViz and ``ros2 bag play`` read such files. Poses are in the frame ``map``, with absolute timestamps. The library
+``rosbags`` is optional and imported only where it is used.
 """
 
 import heapq
@@ -26,9 +25,9 @@ from factorgraph_loc.sensors.camera import summary as pictures_of
 from factors.se2 import Array
 
 MAP, BASE, CAMERA, REFERENCE = "map", "base_link", "camera", "reference"
-PLANAR = np.array((0, 1, 5))  # x, y and the rotation about z in the covariances of ROS
+PLANAR = np.array((0, 1, 5))  # indices of x, y and the rotation about z in the covariances of ROS
 NO_ESTIMATE = np.array([-1.0, *[0.0] * 35])  # covariance of a value that is not estimated, as in sensor_msgs
-LATEST = 2**31 * 10**9  # ns: stamps of ROS have 32 bits of seconds
+LATEST = 2**31 * 10**9  # ns: timestamps of ROS have 32 bits for seconds
 DOT, POINT, LINE, LETTERS = 0.12, 0.03, 0.02, 0.15  # m: diameters, width of a line, height of letters
 LINES, SPHERES, TEXT = 5, 7, 9  # types of a marker: LINE_LIST, SPHERE_LIST, TEXT_VIEW_FACING
 
@@ -36,14 +35,16 @@ Message = tuple[int, str, str, Any]  # time [ns], topic, type, content
 
 
 def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
-    """Write an MCAP file.
+    """Write a log and its runs to an MCAP file with these topics:
 
-    Topics: for each run NAME ``/NAME/odometry`` (causal estimates with covariances), ``/NAME/path`` (the final trajectory) and
-    ``/NAME/markers`` (learnt landmarks); ``/reference/odometry`` and ``/reference/path``; ``/tf``, the same poses as frames;
-    ``/markers`` (walls, tags, landmarks and points of the map); ``/camera/image/compressed``. The robot's frame is ``base_link``,
-    or ``NAME/base_link`` if there are several runs, and ``reference/base_link``.
+    - ``/NAME/odometry``, ``/NAME/path``, ``/NAME/markers`` for the run NAME: causal estimates with covariances, the final
+      trajectory, and estimated landmarks
+    - ``/reference/odometry`` and ``/reference/path``
+    - ``/tf``: the poses of robots as frames ``base_link`` (``NAME/base_link`` for several runs) and ``reference/base_link``
+    - ``/markers``: walls, tags, landmarks and points of the map
+    - ``/camera/image/compressed``
 
-    Raises InputError if ``rosbags`` is not installed, a stamp is not between 1970 and 2038, or an image cannot be read.
+    Raises InputError if ``rosbags`` is not installed, a timestamp is not between 1970 and 2038, or an image cannot be read.
     """
     require_rosbags()
     from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415 - an optional library
@@ -57,7 +58,7 @@ def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
                 *_sources(log, runs, _Maker(store.types)), key=lambda m: m[0]
             ):
                 if not 0 <= t_ns < LATEST:
-                    raise InputError(f"{log.name}: {topic} has a stamp of {t_ns} ns, expected one from 1970 to 2038")
+                    raise InputError(f"{log.name}: {topic} has the timestamp {t_ns} ns, expected one from 1970 to 2038")
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(connections[topic], t_ns, store.serialize_cdr(content, kind))
@@ -65,7 +66,7 @@ def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 
 
 def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[Iterator[Message]]:
-    """All messages, as streams ordered by time."""
+    """Yield all messages, as several iterators of which each is ordered by time."""
     moving = [(run.name, BASE if len(runs) == 1 else f"{run.name}/{BASE}", run.played(), run.final) for run in runs]
     if log.reference is not None:
         moving.append((REFERENCE, f"{REFERENCE}/{BASE}", log.reference, log.reference))
@@ -84,7 +85,7 @@ def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[It
 
 
 def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
-    """The walls and what the sensors have in the map."""
+    """Return the shapes of the walls, and of the landmarks, tags and points in the map."""
     ends = [(x, y, 0.0) for x, y in np.array(log.world.walls).reshape(-1, 2).tolist()]
     shapes = [make.shape("walls", LINES, LINE, DARK, ends)] if ends else []
     for marks, positions, _ in scene.layers(log):
@@ -96,7 +97,7 @@ def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
 
 
 def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_Maker") -> Iterator[Message]:
-    """Each pose as odometry and as a transform, with its covariance, or zeros where that is unknown."""
+    """Yield each pose as a transform, and as odometry with its covariance. An unknown covariance is zero."""
     covariances = np.zeros((len(trajectory), 6, 6))
     if trajectory.covariances is not None:
         known = np.isfinite(trajectory.covariances).all(axis=(1, 2))
@@ -116,7 +117,7 @@ def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_M
 
 
 def _planar(trajectory: Trajectory) -> list[list[float]]:
-    """x, y and heading, which is 0 where it is undefined."""
+    """Return x, y and heading of each pose. The heading is 0 if the trajectory has no headings."""
     return np.where((True, True, trajectory.has_heading), trajectory.poses, 0.0).tolist()  # type: ignore[no-any-return]
 
 
@@ -129,7 +130,7 @@ def _images(log: Log, make: "_Maker") -> Iterator[Message]:
 
 
 class _Maker:
-    """Makes messages from their types and fields."""
+    """Makes ROS messages from their types and fields. ``types``: the classes of messages by the name of their type."""
 
     def __init__(self, types: Mapping[str, Any]) -> None:
         self._types = types
@@ -138,7 +139,7 @@ class _Maker:
         return self._types[kind.replace("/", "/msg/")](**fields)
 
     def message(self, t_ns: int, topic: str, kind: str, **fields: Any) -> Message:
-        """A message of a topic."""
+        """Return a message with its time ``t_ns`` [ns], topic and type."""
         return t_ns, topic, kind.replace("/", "/msg/"), self(kind, **fields)
 
     def header(self, t_ns: int, frame: str) -> Any:
@@ -164,7 +165,7 @@ class _Maker:
         return self.message(start_ns, topic, "nav_msgs/Path", header=self.header(start_ns, MAP), poses=poses)
 
     def markers(self, t_ns: int, topic: str, shapes: Sequence[Mapping[str, Any]]) -> Message:
-        """An array of the shapes that :meth:`shape` and :meth:`dots` give, numbered."""
+        """Return a MarkerArray message of ``shapes`` from :meth:`shape` and :meth:`dots`."""
         empty = {
             "header": self.header(t_ns, MAP),
             "action": 0,  # ADD
@@ -184,7 +185,7 @@ class _Maker:
         return self.message(t_ns, topic, "visualization_msgs/MarkerArray", markers=made)
 
     def dots(self, name: str, positions: Mapping[str, Array], colour: Colour) -> list[dict[str, Any]]:
-        """Spheres at positions (3,), with their names above."""
+        """Return the shapes of spheres at ``positions`` (3,) [m] by label, and of their labels above them. ``name``: namespace."""
         places = {label: position.tolist() for label, position in positions.items()}
         labels = [
             self.shape(f"{name}: names", TEXT, LETTERS, colour, [], text=label, at=(x, y, z + DOT))
@@ -203,7 +204,11 @@ class _Maker:
         text: str = "",
         at: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> dict[str, Any]:
-        """The fields of a marker that are particular to it."""
+        """Return the fields of a marker in which markers differ.
+
+        ``name``: namespace. ``kind``: type of the marker. ``size``: diameter, width or height [m]. ``points``: its points [m].
+        ``text``: its text, at the position ``at`` [m].
+        """
         red, green, blue = (value / 255.0 for value in colour)
         return {
             "ns": name,

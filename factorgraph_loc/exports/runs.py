@@ -1,4 +1,4 @@
-"""Results of runs, read from the folders that ``fgloc run``, ``fgloc compare`` and ``fgloc experiment`` write."""
+"""Reads results of runs from the folders that ``fgloc run``, ``fgloc compare`` and ``fgloc experiment`` write."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.trajectory import Trajectory
 from factors.se2 import Array
 
-STORE = "store"  # of several runs
-COMPLETE = results.FILES[-1]  # written last, so that its presence marks a complete run
-MARGIN = 60.0  # s that an estimate may lie outside of its log
+STORE = "store"  # the folder of the runs of a comparison or an experiment
+COMPLETE = results.FILES[-1]  # the file that is written last, so that its presence marks a complete run
+MARGIN = 60.0  # s by which an estimate may be before the start or after the end of its log
 
 
 class _Landmark(FileModel, extra="ignore"):
@@ -31,13 +31,13 @@ class _Landmark(FileModel, extra="ignore"):
 
 
 class _Learnt(FileModel, extra="ignore"):
-    """The part of ``learnt.json`` that is read."""
+    """The landmarks in ``learnt.json``, the file of estimates other than poses. Its other content is not read."""
 
     landmarks: dict[str, _Landmark]
 
 
 class RunFolder(FileModel, extra="ignore"):
-    """The folder of a run, with what is read of its effective configuration, ``config.toml``."""
+    """The folder of a run, and those keys of its effective configuration, ``config.toml``, that are needed here."""
 
     path: Path
     log: Annotated[str, Field(min_length=1)]
@@ -48,11 +48,11 @@ class RunFolder(FileModel, extra="ignore"):
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A stored run; times in seconds from the start of its log.
+    """A stored run. Times are in seconds from the start of its log.
 
-    ``causal``: the estimates from the first localized one on; ``final``: the trajectory estimated from the whole log; both may
-    be empty. ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``) stamps (K,) and values (K,) for
-    the estimates of :meth:`played`. ``landmarks``: learnt by the estimator. ``events``: time and text.
+    ``causal``: causal estimates from the first localized one on. ``final``: the trajectory that is estimated from the whole log.
+    Both may be empty. ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``), times (K,) and values (K,)
+    for the estimates of :meth:`played`. ``landmarks``: estimated landmarks by name. ``events``: time and text of each event.
     """
 
     name: str
@@ -64,20 +64,20 @@ class StoredRun:
     events: tuple[tuple[float, str], ...]
 
     def played(self) -> Trajectory:
-        """The trajectory shown over time: the causal one, or the final one of an estimator without causal estimates."""
+        """Return the trajectory to show over time: the causal one, or the final one if there are no causal estimates."""
         return self.causal if len(self.causal) else self.final
 
 
 def is_results(path: Path) -> bool:
-    """Whether ``path`` is a result folder of a run, a comparison or an experiment."""
+    """True if ``path`` is a result folder of a run, a comparison or an experiment."""
     return (path / COMPLETE).is_file() or ((path / results.INDEX).is_file() and (path / STORE).is_dir())
 
 
 def find_runs(path: Path) -> list[RunFolder]:
-    """The successful runs of a result folder. Raises InputError if there is none."""
+    """Return the successful runs of a result folder. Raises InputError if there is none."""
     folders = [path] if (path / COMPLETE).is_file() else _stored(path) if is_results(path) else []
     if not folders:
-        raise InputError(f"{path}: holds no results, expected a folder that `fgloc run` or `fgloc compare` wrote")
+        raise InputError(f"{path}: contains no results, expected a folder that `fgloc run` or `fgloc compare` wrote")
     return [
         parse_model(RunFolder, read_toml(folder / results.CONFIG) | {"path": folder}, folder / results.CONFIG)
         for folder in folders
@@ -85,7 +85,7 @@ def find_runs(path: Path) -> list[RunFolder]:
 
 
 def _stored(path: Path) -> list[Path]:
-    """The folders of the successful runs in the table of a comparison or an experiment."""
+    """Return the folders of the successful runs of a comparison or an experiment."""
     table = read_parquet(path / results.INDEX)
     with foreign(path / results.INDEX, "is no table of runs"):
         keys = table.filter(pl.col("status") == "ok")["key"].cast(pl.String).unique(maintain_order=True)
@@ -93,9 +93,10 @@ def _stored(path: Path) -> list[Path]:
 
 
 def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
-    """Read the runs in ``folders`` on ``log``; each is named by its estimator, and by seed or folder where that is not unique.
+    """Read the runs on ``log`` in ``folders``.
 
-    Raises InputError if a run is not of this log, or if a file is damaged.
+    The name of a run is its estimator. If such names are not unique, the seed is appended, and also the folder if needed. Raises
+    InputError if a run is not of this log, or if a file is damaged.
     """
     names = [folder.estimator for folder in folders]
     with_seeds = [f"{folder.estimator}-seed{folder.seed}" for folder in folders]
@@ -104,7 +105,7 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
     if len(set(names)) < len(names):
         names = [f"{name}-{folder.path.name}" for name, folder in zip(with_seeds, folders, strict=True)]
     if len(set(names)) < len(names):
-        raise InputError(f"{folders[0].path}: a run is named twice, expected different ones")
+        raise InputError(f"{folders[0].path}: a run is given twice, expected different runs")
     return [_read(folder, name, log) for folder, name in zip(folders, names, strict=True)]
 
 
@@ -132,13 +133,13 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
 
 
 def _check_times(run: StoredRun, log: Log) -> None:
-    """Raise InputError if the times do not overlap: a run of another log of the same name."""
+    """Raise InputError if estimates are outside of the time of the log. The run is then of another log with the same name."""
     first, last = log.span()
     for trajectory in (run.causal, run.final):
         if len(trajectory) and (trajectory.t[0] < first - MARGIN or trajectory.t[-1] > last + MARGIN):
             raise InputError(
                 f"{run.folder.path}: has estimates from {trajectory.t[0]:.1f} s to {trajectory.t[-1]:.1f} s of the log's time, "
-                f"expected some between {first:.1f} s and {last:.1f} s: is it a run of another log {log.name}?"
+                f"expected times from {first:.1f} s to {last:.1f} s: is it a run of another log named {log.name}?"
             )
 
 

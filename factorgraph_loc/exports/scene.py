@@ -1,4 +1,4 @@
-"""Elements of a log that all viewers draw: observed objects, ellipses, paths."""
+"""Computes the elements of a log that all viewers draw: mapped objects, covariance ellipses and paths."""
 
 import itertools
 import math
@@ -13,32 +13,33 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.interfaces import Marks, marks
 from factors.se2 import Array
 
-LIT_FOR = 0.5  # s that a tag or landmark stays highlighted after an observation
-GAP = 1.0  # s between poses, above which the path is interrupted
-SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # standard deviations that contain 95 % of a two-dimensional Gaussian
-Colour = tuple[int, int, int]  # red, green, blue of 255
+LIT_FOR = 0.5  # s for which a tag or landmark is highlighted after an observation
+GAP = 1.0  # s between poses above which the path is interrupted
+SCALE_95 = math.sqrt(-2.0 * math.log(0.05))  # radius in standard deviations that contains 95 % of a planar Gaussian
+Colour = tuple[int, int, int]  # red, green, blue from 0 to 255
 REFERENCE, DARK, DETECTION, SIGHTING = (128, 128, 128), (160, 160, 160), (230, 159, 0), (0, 158, 115)
 
 
 @dataclass(frozen=True)
 class Lights:
-    """The highlighted objects from each time on: ``t`` (N,) seconds, ``names``: N tuples."""
+    """The objects of a map that are highlighted over time. From ``t[i]`` [s] on, they are those with the names ``names[i]``."""
 
     t: Array
     names: tuple[tuple[str, ...], ...]
 
 
 def colours() -> Iterator[Colour]:
-    """The colour of the first, second, ... run, as in the plots."""
-    # without the last, black, which viewers have as background
+    """Yield the colours of the first, the second and further runs, without end. They are the colours of plots."""
+    # without the last colour, black, because the background of viewers is black
     for colour in itertools.cycle(drawing_figures.COLOURS[:-1]):
         red, green, blue = bytes.fromhex(colour[1:])
         yield red, green, blue
 
 
 def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
-    """The map objects of each sensor: their positions (3,) [m], and when each is highlighted, for :data:`LIT_FOR` seconds from
-    an observation.
+    """Return the mapped objects of each sensor, their positions (3,) [m] by name, and when each is highlighted.
+
+    An object is highlighted for :data:`LIT_FOR` seconds after each observation.
     """
     drawn = sorted(marks(log), key=lambda layer: layer.order)
     return [
@@ -48,7 +49,7 @@ def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
 
 
 def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Stamps (K,) and closed outlines (K, L, 2) of the 95 % ellipses of the positions, for poses with a covariance."""
+    """Return the times (K,) [s] of poses with a covariance, and the closed outlines (K, L, 2) [m] of their 95 % ellipses."""
     if trajectory.covariances is None:
         return np.empty(0), np.empty((0, drawing_figures.CORNERS + 1, 2))
     covariances = trajectory.covariances[:, :2, :2]
@@ -57,7 +58,7 @@ def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:
-    """Each name is highlighted from each of its times on, for :data:`LIT_FOR` seconds."""
+    """Return when objects are highlighted. ``t``, ``names``: the time [s] and the object of each observation."""
     switches = sorted(
         s for start, name in zip(t, names, strict=True) for s in ((start, 1, name), (start + LIT_FOR, -1, name))
     )
@@ -77,6 +78,6 @@ def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:
 
 
 def segments(trajectory: Trajectory) -> list[Array]:
-    """The paths (K, 2) of a trajectory between gaps above :data:`GAP`."""
+    """Return the parts of a trajectory between gaps longer than :data:`GAP`, each as positions (K, 2) [m]."""
     breaks = [0, *(np.flatnonzero(np.diff(trajectory.t) > GAP) + 1).tolist(), len(trajectory)]
     return [trajectory.poses[i:j, :2] for i, j in itertools.pairwise(breaks) if j - i > 1]

@@ -34,26 +34,28 @@ from factorgraph_loc.sensors.registry import channels, sensor_of
 from factorgraph_loc.sensors.tables import Intake, checked
 from factorgraph_loc.text import quoted
 
-LAG = 10.0  # s: default window of the smoother
-HISTORY = 60.0  # s
-TIDY_INTERVAL = 5.0  # s between calls of `forget`, in measured time
-ROWS_KEPT = 1000  # of each list of diagnostics
-AHEAD = 3600.0  # s: a timestamp so much newer than all others must come from another clock
+LAG = 10.0  # s: default lag of the smoother
+HISTORY = 60.0  # s: default length of the past that is kept
+TIDY_INTERVAL = 5.0  # s between timestamps after which the estimator forgets its old past
+ROWS_KEPT = 1000  # maximum number of rows in each list of diagnostics
+AHEAD = 3600.0  # s: a timestamp that is newer than all others by more comes from another clock
 
 
 class Localizer:
-    """An estimator for online use; any number of threads may push measurements and pull estimates.
+    """An estimator for online use. Any number of threads may push measurements and pull estimates.
 
-    ``rig`` and ``world``: robot and map. ``estimator``: its name; ``settings``: overrides of its settings. The smoother has a
-    fixed lag of 10 s unless ``settings`` change it; with ``lag = None`` it keeps the whole past, as ``batch`` does.
-    ``sensors``: the channels to use, by default the rig's; measurements of others are counted as ignored. ``history`` [s]:
-    length of the past that :meth:`trajectory` returns, which bounds the memory. ``seed``: of the random generator.
+    ``rig``, ``world``: the robot and the map.
+    ``estimator``: the name of the estimator. ``settings``: overrides of its default settings. The smoother has a fixed lag of 10 s
+    by default. With ``lag = None`` it keeps the whole past.
+    ``sensors``: names of the sensors to use, by default those in the rig. Measurements of other sensors are counted as ignored.
+    ``history``: length of the past that :meth:`trajectory` returns [s], which limits the memory.
+    ``seed``: the seed of the random generator.
 
-    Call :meth:`initialize` first, and again to restart; there is nothing to close. Timestamps are seconds of any clock that all
-    sensors share; the time offsets of the rig are added here. A lock guards the estimator: a push waits while another measurement
-    is processed. The same measurements in the same order give the same results; queries in between change nothing.
+    Call :meth:`initialize` first, and again to restart. Timestamps are seconds of any clock that all sensors share. The time
+    offsets of the rig are added to them. A lock protects the estimator: a push waits while another measurement is processed.
+    The same measurements in the same order give the same results. Queries do not change the results.
 
-    InputError if the settings, sensors or ``history`` are invalid.
+    Raises InputError if an argument is invalid.
     """
 
     def __init__(
@@ -83,15 +85,17 @@ class Localizer:
     def initialize(
         self, pose: ArrayLike | None = None, covariance: ArrayLike | None = None, t: float | None = None
     ) -> None:
-        """Start, or restart, at ``pose`` (3,): x, y [m] and heading [rad] in the world frame. None: at an unknown pose in the
-        map. NaN as heading: unknown heading; the status is not ``localized`` until the measurements determine it.
+        """Start or restart the estimator.
 
-        ``covariance`` (3, 3) of the pose, or (2, 2) of the position if the heading is NaN, by default that of 0.05 m and 0.05
-        rad. ``t`` [s]: time of the pose, by default that of the first measurement. Odometry from before ``t`` is used; its
-        velocity is held. Other measurements from before ``t`` are ignored.
+        ``pose`` (3,): x, y [m] and heading [rad] in the world frame. None starts at an unknown pose in the map. A NaN heading is
+        unknown; the status is then not ``localized`` until measurements determine the heading.
+        ``covariance`` (3, 3) of the pose, or (2, 2) of the position if the heading is NaN. The default has standard deviations of
+        0.05 m and 0.05 rad.
+        ``t``: time of the pose [s], by default the time of the first measurement. The last velocity from before ``t`` applies at
+        ``t``. Measurements of other sensors than odometry from before ``t`` are ignored.
 
-        InputError if an argument is invalid or the estimator does not support an unknown pose; RunFailedError if it cannot start
-        there. The previous state is kept in both cases.
+        Raises InputError if an argument is invalid or if the estimator does not support an unknown pose, and RunFailedError if it
+        cannot start at the pose. The previous state is kept in both cases.
         """
         start = None if pose is None else prior_of(pose, covariance, t)
         setup = model_setup.Setup(self._rig, self._world, self._sensors, np.random.default_rng(self._seed))
@@ -99,9 +103,9 @@ class Localizer:
         with guard:
             new = registry.create(self._name, setup, self._settings)
         if start is None and not getattr(new, "supports_unknown_start", False):
-            raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map, expected a pose")
+            raise InputError(f"{self._name} cannot start from an unknown pose with this rig and map: give a pose")
         if start is not None and not start.has_heading and not finds_heading(new):
-            raise InputError(f"{self._name} cannot find an unknown heading with this rig and map, expected a heading")
+            raise InputError(f"{self._name} cannot estimate an unknown heading with this rig and map: give a heading")
         if start is not None and not math.isnan(start.t):
             with guard.computing("the start", start.t):
                 new.initialize(self._frame.prior(start))
@@ -109,14 +113,16 @@ class Localizer:
             self._begin_anew(new, start, guard)
 
     def push(self, measurement: Measurement) -> None:
-        """Process a measurement, in order of arrival. A late one is inserted at its time if it is late by at most the estimator's
-        ``max_delay``; otherwise it is counted and dropped. Features of an image are detected in the calling thread while other
-        measurements are processed, so that it is late by that time.
+        """Process a measurement. Push measurements in order of arrival.
 
-        InputError if a value is invalid, such as NaN; before :meth:`initialize`; if a timestamp is an hour ahead of all others;
-        if increments of odometry go back in time. The measurement is then dropped and nothing else changes. RunFailedError if the
-        estimator fails: every call except :meth:`diagnostics` then raises this error until :meth:`initialize` is called. Unknown
-        tags, antennas and landmarks are no errors: they are counted, see :meth:`diagnostics`.
+        A late measurement is processed at its own time if it is late by at most the estimator's setting ``max_delay``. Otherwise it
+        is counted and dropped. Features of an image are detected in the calling thread while other measurements are processed.
+
+        Raises InputError, drops the measurement and changes nothing else in these cases:
+        a value is invalid, such as NaN; :meth:`initialize` was not called; a timestamp is an hour ahead of all others; increments
+        of odometry go back in time. Raises RunFailedError if the estimator fails. Every call except :meth:`diagnostics` then raises
+        this error until :meth:`initialize` is called. Unknown tags, antennas and landmarks are not errors. They are counted, see
+        :meth:`diagnostics`.
         """
         own = checked(measurement)
         intake = self._intakes.get(own.sensor) if own.modality in self._modalities else None
@@ -126,17 +132,20 @@ class Localizer:
             self._take(own)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the newest timestamp of all measurements, or predicted by odometry to ``t`` if that is later.
+        """Return the pose at the newest timestamp of all measurements, or predicted by odometry to a later time ``t`` [s].
 
-        This does not change the state: measurements before ``t`` will not be late. Before the first estimate the status is
-        ``unlocalized`` and the pose is NaN. RunFailedError if the estimator has failed, or if its estimate is not finite or its
-        covariance not positive; the latter loses nothing.
+        This does not change the state: later measurements from before ``t`` are not late. Before the start, the status is
+        ``unlocalized`` and the pose is NaN. Raises RunFailedError if the estimator has failed, if the estimate is not finite, or if
+        its covariance is not positive. After the last two errors the localizer can still be used.
         """
         with self._lock:
             return self._estimate(t)
 
     def belief(self) -> Belief:
-        """The belief at the time of :meth:`estimate`: modes, and particles if the estimator uses them. RunFailedError as there."""
+        """Return the belief at the newest timestamp: Gaussian modes, and particles if the estimator uses them.
+
+        Before the start it has no modes. Raises RunFailedError as :meth:`estimate` does.
+        """
         with self._lock:
             self._require_whole()
             if self._estimator is None or not self._is_under_way(self._newest):
@@ -145,7 +154,7 @@ class Localizer:
                 return copy.deepcopy(self._frame.belief(sound_belief(self._estimator.belief(self._newest))))
 
     def trajectory(self) -> Trajectory:
-        """The smoothed past at 10 Hz, at least the last ``history`` seconds before the newest timestamp."""
+        """Return the smoothed trajectory at 10 Hz, of at least the last ``history`` seconds before the newest timestamp."""
         with self._lock:
             self._require_whole()
             if self._estimator is None or self._ticks is None or not self._ticks.count:
@@ -154,7 +163,7 @@ class Localizer:
                 return copy.deepcopy(self._frame.trajectory(sound_trajectory(self._estimator.trajectory())))
 
     def learnt(self) -> Learnt:
-        """Estimates besides the pose: constants of sensors, landmarks, points. Smoothed, like :meth:`trajectory`."""
+        """Return smoothed estimates other than poses: constants of sensors, landmarks and points."""
         with self._lock:
             self._require_whole()
             if self._estimator is None:
@@ -163,19 +172,19 @@ class Localizer:
                 return copy.deepcopy(self._estimator.learnt())
 
     def diagnostics(self) -> Diagnostics:
-        """Counts of ignored, rejected and late measurements since the start, and the latest innovations, residuals and events."""
+        """Return the counts of ignored, rejected and late measurements since the start, and recent innovations and events."""
         with self._lock:
             return Diagnostics() if self._estimator is None else copy.deepcopy(self._estimator.diagnostics)
 
     def _begin_anew(self, estimator: Estimator | None, prior: PosePrior | None, guard: Guard) -> None:
         self._estimator = estimator
         self._guard = guard
-        self._failure: RunFailedError | None = None  # of the estimator, which is unusable since
-        self._prior = prior  # its time is NaN until the first measurement
-        # ticks start at the prior's time, or at the first measurement
+        self._failure: RunFailedError | None = None  # the error after which the estimator is unusable
+        self._prior = prior  # its time is NaN until the first measurement if no time was given
+        # ticks start at the time of the prior, or at the first measurement
         self._ticks = None if prior is None or math.isnan(prior.t) else Ticks(prior.t)
         self._newest = self._tidied = -math.inf
-        self._last: PoseEstimate | None = None  # latest estimate, None after a change
+        self._last: PoseEstimate | None = None  # the latest estimate, None after a new measurement
         known = channels()
         self._intakes: dict[str, Intake] = {
             name: load(known[name].intake)(self._rig, self._world)
@@ -190,7 +199,7 @@ class Localizer:
     def _begun(self, what: str) -> Estimator:
         self._require_whole()
         if self._estimator is None:
-            raise InputError(f"{what} came before initialize(), expected initialize() first")
+            raise InputError(f"{what} came before initialize(): call initialize() first")
         return self._estimator
 
     def _take(self, m: Measurement) -> None:
@@ -224,7 +233,7 @@ class Localizer:
                 self._prior = replace(self._prior, t=m.t)
                 with self._guard.computing("the start", m.t):
                     estimator.initialize(self._frame.prior(self._prior))
-        # as in a run of a log: a tick follows all measurements up to its time
+        # a tick follows all measurements up to its time, as in a run on a log
         for t in self._ticks.advance(m.t):
             self._guard.process(estimator, Tick(t))
         if not m.is_motion and not self._is_under_way(m.t):
@@ -235,14 +244,14 @@ class Localizer:
     def _check_stamp(self, m: Measurement) -> None:
         if m.t > self._newest + AHEAD and math.isfinite(self._newest):
             raise InputError(
-                f"{named(m)}: is {m.t - self._newest:.0f} s ahead of all others, expected the same clock, or initialize() "
-                f"after a pause"
+                f"{named(m)}: is {m.t - self._newest:.0f} s ahead of all other timestamps, expected the same clock; "
+                f"call initialize() after a pause"
             )
         if (intake := self._intakes.get(m.sensor)) is not None:
             intake.require(m)
 
     def _is_under_way(self, t: float) -> bool:
-        """Whether ``t`` is not before the start or the first measurement."""
+        """True if ``t`` [s] is finite and not before the start pose."""
         return math.isfinite(t) and (self._prior is None or t >= self._prior.t)
 
     def _estimate(self, t: float | None) -> PoseEstimate:
@@ -258,12 +267,12 @@ class Localizer:
             )
         with self._guard.computing("the estimate", at):
             estimate = self._frame.estimate(sound(self._estimator.estimate(at)))
-        # copied, because the estimator may reuse its arrays
+        # copied, because an estimator may reuse its arrays
         self._last = _copied(estimate, at)
         return _copied(estimate, at)
 
     def _tidy(self, estimator: Estimator) -> None:
-        """Forget the old past."""
+        """Make the estimator forget the past before the ``history``, and shorten the lists of diagnostics."""
         self._tidied = self._newest
         if isinstance(estimator, ForgettingEstimator) and self._ticks is not None and self._ticks.count:
             estimator.forget(self._newest - self._history)
@@ -271,17 +280,17 @@ class Localizer:
 
 
 def _copied(e: PoseEstimate, t: float) -> PoseEstimate:
-    """The estimate with the time ``t``, and arrays of its own."""
+    """Return a copy of the estimate ``e`` with copied arrays and the time ``t`` [s]."""
     return replace(e, t=t, pose=np.array(e.pose), covariance=np.array(e.covariance))
 
 
-# bounds of standard deviations in m and rad: a wider one means an unknown pose, a narrower one is implausible
+# bounds of the standard deviations of a start pose [m, m, rad]; a pose with larger ones is unknown
 NARROWEST, WIDEST, WIDEST_TURN = 1e-6, 1e4, 100.0
-RATIO = 1e14  # largest ratio of eigenvalues of a covariance; a double has 16 digits
+RATIO = 1e14  # largest ratio of eigenvalues of a covariance, because a double has 16 digits
 
 
 def require_options(rig: object, world: object, settings: object, history: object, seed: object) -> None:
-    """InputError if an argument is invalid."""
+    """Raise InputError if an argument of :class:`Localizer` is invalid."""
     for name, value, kind in (
         ("rig", rig, Rig),
         ("world", world, World | None),
@@ -298,7 +307,10 @@ def require_options(rig: object, world: object, settings: object, history: objec
 
 
 def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
-    """The usable sensors: without those whose section the rig lacks. InputError if one is unknown."""
+    """Return the names of the sensors among ``asked`` that the rig describes. ``asked`` is by default the sensors of the rig.
+
+    Raises InputError if a sensor is unknown.
+    """
     if asked is None:
         asked = rig.sensors
     if isinstance(asked, str) or not isinstance(asked, Sequence):
@@ -309,7 +321,10 @@ def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def prior_of(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:
-    """The Gaussian prior of the start; its time is NaN if ``t`` is None. InputError if an argument is invalid."""
+    """Return the Gaussian prior of the start from the arguments of :meth:`Localizer.initialize`.
+
+    Its time is NaN if ``t`` is None. Raises InputError if an argument is invalid.
+    """
     mean = numbers("initialize()", "pose", pose)
     known = mean[: 2 if mean.shape == (3,) and np.isnan(mean[2]) else 3] if mean.shape == (3,) else mean
     if mean.shape != (3,) or any(POSES[n].outside(v) for n, v in zip(("x", "y", "heading"), known, strict=False)):

@@ -1,4 +1,4 @@
-"""Walls and lines of sight; drivable space: free cells of a grid, distances to walls, and shortest paths."""
+"""Lines of sight between walls, and the free space of a map: free cells of a grid, distances to walls, and shortest paths."""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from factorgraph_loc.errors import InputError
 from factors.compiled import compiled
 from factors.se2 import Array
 
-CELL = 0.2  # m
-SPACING = 0.05  # m, between points of a path
+CELL = 0.2  # m: side of a cell of the grid
+SPACING = 0.05  # m between points of a path
 
 
 class Walled(Protocol):
-    """Anything with walls, such as a world: its ``name``, and segments (x1, y1, x2, y2) [m]."""
+    """An object with ``walls``, such as a map: segments (x1, y1, x2, y2) [m]. ``name``: its name in errors."""
 
     @property
     def name(self) -> str: ...
@@ -29,7 +29,7 @@ class Walled(Protocol):
 
 
 def crosses(world: Walled, a: Array, b: Array) -> NDArray[np.bool_]:
-    """Whether the segments from ``a`` (N, 2) to ``b`` (N, 2) cross a wall of the world."""
+    """Return a mask (N,) that is True where the segment from ``a`` (N, 2) to ``b`` (N, 2) crosses a wall."""
     out = np.zeros(len(a), dtype=bool)
     d = b - a
     for x1, y1, x2, y2 in world.walls:
@@ -47,11 +47,12 @@ def _cross(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The largest connected set of K free cells of size :data:`CELL`.
+    """The free space of a map: the largest connected set of K free cells in a grid of NX times NY cells of size :data:`CELL`.
 
-    ``centres`` (K, 2) [m]; ``graph`` (K, K): distances between neighbours [m]; ``index`` (NX, NY): number of each cell, -1
-    where it is not free; ``origin`` (2,) [m]: corner of the first cell; ``distance`` (NX, NY) [m]: from the centre of each cell
-    to the nearest wall; ``clearance`` [m]: the least distance of free cells from walls.
+    ``centres`` (K, 2): centres of the free cells [m]. ``graph`` (K, K): distances between neighbouring free cells [m].
+    ``index`` (NX, NY): number of each free cell, -1 for other cells. ``origin`` (2,): corner of the first cell [m].
+    ``distance`` (NX, NY): distance from the centre of each cell to the nearest wall [m]. ``clearance``: minimum distance of free
+    cells from walls [m].
     """
 
     centres: Array
@@ -67,7 +68,7 @@ class FreeSpace:
         return len(self.centres) * CELL**2
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Random poses (N, 3), evenly over the free cells and all headings."""
+        """Return ``count`` random poses (count, 3), spread evenly over the free cells and all headings."""
         cells = np.floor((np.arange(count) + rng.random()) * len(self.centres) / count)
         places = self.centres[cells.astype(np.int64)] + CELL * (rng.random((count, 2)) - 0.5)
         # a low-discrepancy sequence (golden ratio), so that neighbouring cells get different headings
@@ -75,25 +76,25 @@ class FreeSpace:
         return np.column_stack((places, math.pi * (2.0 * shares - 1.0)))
 
     def cells(self, points: Array) -> NDArray[np.int64]:
-        """Return the numbers (N,) of the free cells that contain points (N, 2), -1 where a point is not in one."""
+        """Return the number of the free cell that contains each of the ``points`` (N, 2), -1 for a point outside of free cells."""
         places = np.floor((points - self.origin) / CELL).astype(np.int64)
         inside = np.all((places >= 0) & (places < self.index.shape), axis=-1)
         i, j = np.where(inside[:, None], places, 0).T
         return np.where(inside, self.index[i, j], -1)
 
     def is_clear(self, a: Array, b: Array) -> bool:
-        """Whether the straight line between two points crosses free cells only."""
+        """True if the straight line between two points ``a`` (2,) and ``b`` (2,) crosses only free cells."""
         return bool(_is_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
 
 
 def free_space(world: Walled, clearance: float) -> FreeSpace:
-    """Return the largest connected space with ``clearance`` [m] from all walls.
+    """Return the largest connected set of cells whose centres are more than ``clearance`` [m] from all walls.
 
-    Raises InputError if the world has no walls, or no cell has that clearance.
+    Raises InputError if the map has no walls, or if no cell has that clearance.
     """
     walls = np.array(world.walls).reshape(-1, 2, 2)
     if not len(walls):
-        raise InputError(f"world {world.name}: has no walls, expected some around the space to drive in")
+        raise InputError(f"world {world.name}: has no walls, expected walls around the free space")
     origin = walls.min(axis=(0, 1))
     shape = np.maximum(np.ceil((walls.max(axis=(0, 1)) - origin) / CELL).astype(int), 1)
     i, j = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
@@ -111,7 +112,7 @@ def free_space(world: Walled, clearance: float) -> FreeSpace:
 
 
 def distance_to_walls(world: Walled, points: Array) -> Array:
-    """Distance [m] (N,) from points (N, 2) to the nearest wall."""
+    """Return the distances (N,) [m] from ``points`` (N, 2) to the nearest wall."""
     out = np.full(len(points), np.inf)
     for x1, y1, x2, y2 in world.walls:
         start, along = np.array((x1, y1)), np.array((x2 - x1, y2 - y1))
@@ -121,14 +122,18 @@ def distance_to_walls(world: Walled, points: Array) -> Array:
 
 
 def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
-    """Return the corners (N, 2) of a short path between two cells: the shortest one on the grid, straightened where possible."""
+    """Return the corners (N, 2) of a path between the cells ``start`` and ``end``.
+
+    It is the shortest path on the grid, straightened where the line of sight crosses only free cells.
+    """
     _, predecessors = csgraph.dijkstra(space.graph, directed=False, indices=end, return_predecessors=True)
     return straightened(space, space.centres[chain(predecessors, start)])
 
 
 def chain(predecessors: NDArray[np.int32], start: int) -> list[int]:
-    """Return the cells from ``start`` to the root of a tree of shortest paths, given the predecessor ``predecessors`` (K,) of each
-    cell.
+    """Return the cells from ``start`` to the root of a tree of shortest paths.
+
+    ``predecessors`` (K,): the next cell towards the root, from each cell. It is negative at the root.
     """
     cells = [start]
     while predecessors[cells[-1]] >= 0:
@@ -137,10 +142,10 @@ def chain(predecessors: NDArray[np.int32], start: int) -> list[int]:
 
 
 def straightened(space: FreeSpace, points: Array) -> Array:
-    """Return the corners of a path (N, 2) after replacing visible stretches by straight lines."""
+    """Return the corners of the path ``points`` (N, 2) after parts with a free line of sight are replaced by straight lines."""
     corners, i = [0], 0
     while i < len(points) - 1:
-        # bisection for the farthest visible point: nearer ones are visible where farther ones are, nearly always
+        # bisection for the farthest point in line of sight: points before it are nearly always in line of sight, too
         low, high = i + 1, len(points) - 1
         while low < high:
             middle = (low + high + 1) // 2
@@ -151,14 +156,17 @@ def straightened(space: FreeSpace, points: Array) -> Array:
 
 
 def dense(corners: Array, spacing: float = SPACING) -> Array:
-    """Return points at intervals of ``spacing`` [m] along the path through ``corners`` (N, 2), without the first."""
+    """Return points (M, 2) about every ``spacing`` [m] along the path through ``corners`` (N, 2), without the first corner."""
     along = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
     s = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))[1:]
     return np.column_stack((np.interp(s, along, corners[:, 0]), np.interp(s, along, corners[:, 1])))
 
 
 def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
-    """Return edges to the eight neighbours; diagonal ones only where both adjacent cells are free."""
+    """Return the distances (K, K) [m] between neighbouring free cells, as a sparse matrix.
+
+    A cell has up to eight neighbours. A diagonal neighbour counts only if both cells beside the diagonal are free.
+    """
     rows, columns, weights = [], [], []
     for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
         nx, ny = index.shape

@@ -1,4 +1,4 @@
-"""Fiducial markers of a map: squares whose four corners a camera observes as named points."""
+"""Fiducial markers of a map, such as AprilTags: squares whose four corners a camera observes as named points."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from factorgraph_loc.files.models import Coordinate, FileModel, InUnit
 from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
-# AprilTags as tagBITShDISTANCE, others by the side of their grid of bits and their number
+# families of AprilTags are named tagBITShDISTANCE, other families by the size of their grid of bits and their number of markers
 MarkerFamily = Literal[
     "tag16h5",
     "tag25h9",
@@ -39,16 +39,17 @@ MarkerFamily = Literal[
 ]
 
 Turn = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")]
-# right and up seen from the front, in the corner order of ArUco detectors
+# corners of a marker of size 1 with its normal along x, y to the right seen from the front, and z up; order of ArUco detectors
 CORNERS = np.array(((0.0, -0.5, 0.5), (0.0, 0.5, 0.5), (0.0, 0.5, -0.5), (0.0, -0.5, -0.5)))
 CORNER_NUMBERS = tuple(str(i) for i in range(len(CORNERS)))
 
 
 class Marker(FileModel):
-    """A square marker: ``position`` of its centre [m] in the world, ``size`` [m] of the black square, and orientation.
+    """A square marker in the map.
 
-    ``facing``: heading of its normal, as of a tag; ``pitch``: upward tilt of the normal, -pi/2 on a ceiling; ``roll``:
-    counter-clockwise rotation seen from the front. ``sigma`` [m]: standard deviation of each coordinate of its position.
+    ``x``, ``y``, ``z``: position of its centre in the world [m]. ``size``: side of the black square [m].
+    ``facing``: heading of its normal [rad]. ``pitch``: upward tilt of its normal [rad], -pi/2 on a ceiling.
+    ``roll``: counter-clockwise rotation seen from the front [rad]. ``sigma``: standard deviation of each coordinate [m].
     """
 
     x: Coordinate
@@ -67,7 +68,7 @@ class Marker(FileModel):
 
 
 class MarkerSettings(FileModel):
-    """Which markers to detect in a log's images."""
+    """The ``family`` of the markers to detect in the images of a log."""
 
     family: MarkerFamily
 
@@ -78,14 +79,14 @@ def corner_names(marker: str) -> list[str]:
 
 
 def marker_of(point: str) -> str | None:
-    """Return the marker that a point of a map is a corner of, by its name; None if it is none."""
+    """Return the name of the marker whose corner is the ``point`` of a map. Returns None if the point is no corner of a marker."""
     marker, _, corner = point.rpartition("/")
     is_corner = corner in CORNER_NUMBERS and marker.rpartition("-")[0] in get_args(MarkerFamily)
     return marker if is_corner else None
 
 
 def corner_points(markers: Mapping[str, Marker]) -> PointMap:
-    """Return the corners of all markers as a map of named points."""
+    """Return the corners of all ``markers`` as a map of named points. ``markers``: each marker by its name."""
     names = [name for marker in markers for name in corner_names(marker)]
     positions = np.array([marker.corners() for marker in markers.values()]).reshape(-1, 3)
     covariances = np.array([marker.sigma**2 * np.eye(3) for marker in markers.values() for _ in CORNERS]).reshape(

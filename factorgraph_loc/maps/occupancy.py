@@ -1,4 +1,4 @@
-"""Walls from occupancy maps of ROS's map_server: an image of cells and a YAML file that defines its grey levels."""
+"""Reads walls from an occupancy map of ROS's map_server: an image of cells, and a YAML file that defines its grey levels."""
 
 import math
 from pathlib import Path
@@ -19,9 +19,11 @@ from factors.se2 import Array
 Wall = tuple[float, float, float, float]
 Yaw = Annotated[float, Field(ge=-7.0, le=7.0), InUnit("rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-TOLERANCE = 0.75  # cells between a wall and the cell centres: half a cell for an oblique line
-STRIP = 256  # rows of cells in a strip
-MIN_EXTENT = 2.0  # cells; smaller groups are noise of the mapping sensor
+TOLERANCE = (
+    0.75  # cells: maximum distance of a wall from the centres of its cells, which is half a cell at an oblique line
+)
+STRIP = 256  # rows of the image that are processed together, to limit memory
+MIN_EXTENT = 2.0  # cells: smaller groups of occupied cells are noise of the mapping sensor
 
 
 class MapFile(FileModel):
@@ -38,10 +40,10 @@ class MapFile(FileModel):
 
 
 def read_walls(path: Path) -> tuple[Wall, ...]:
-    """Read the outlines of the occupied cells of a map ``NAME.yaml`` as segments x1, y1, x2, y2 [m] in the map's frame.
+    """Read the outlines of the occupied cells of a map ``NAME.yaml`` as segments (x1, y1, x2, y2) [m] in the map's frame.
 
-    Segments run through the centres of the outermost occupied cells, within :data:`TOLERANCE`; groups smaller than
-    :data:`MIN_EXTENT` are omitted. Raises InputError with the file and what is wrong.
+    Segments run through the centres of the outermost occupied cells, within :data:`TOLERANCE`. Groups of cells smaller than
+    :data:`MIN_EXTENT` are omitted. Raises InputError with the file and the problem.
     """
     stated = parse_model(MapFile, read_yaml(path), path)
     if stated.free_thresh >= stated.occupied_thresh:
@@ -53,11 +55,11 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
     occupied = _occupied(image, stated)
     if not occupied.any():
         raise InputError(
-            f"{image}: has no occupied cells, expected some above occupied_thresh {stated.occupied_thresh:g}"
+            f"{image}: has no occupied cells, expected cells above occupied_thresh {stated.occupied_thresh:g}"
         )
     lines = _outlines(occupied)
     if not len(lines):
-        raise InputError(f"{image}: has only single occupied cells, expected walls of several")
+        raise InputError(f"{image}: has only single occupied cells, expected walls of several cells")
     height = occupied.shape[0]
     columns, rows = lines[:, 0::2] + 0.5, height - (lines[:, 1::2] + 0.5)
     ends = np.stack((columns, rows), axis=-1).reshape(-1, 2) * stated.resolution
@@ -66,19 +68,19 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
 
 
 def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
-    """Return which cells (rows, columns) are occupied; a transparent cell is unknown."""
+    """Return a mask (rows, columns) of the occupied cells of the image ``path``. A transparent cell counts as not occupied."""
     with opened(path, IMAGE) as file, pillow_image(file, path) as image:
-        # a colour counts by the mean of its channels, as in map_server
+        # the grey level of a colour is the mean of its channels, as in map_server
         mode = "RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB"
         out = np.empty((image.height, image.width), dtype=bool)
-        for top in range(0, image.height, STRIP):  # numbers of all cells need much memory
+        for top in range(0, image.height, STRIP):  # converting the whole image at once needs much memory
             strip = image.crop((0, top, image.width, min(top + STRIP, image.height))).convert(mode)
             out[top : top + STRIP] = _are_occupied(np.asarray(strip, dtype=np.uint8), stated)
     return out
 
 
 def _are_occupied(values: NDArray[np.uint8], stated: MapFile) -> NDArray[np.bool_]:
-    """Which cells (R, C) of these channels (R, C, 3 or 4) are occupied."""
+    """Return a mask (R, C) of the occupied cells. ``values`` (R, C, 3 or 4): red, green, blue and opacity of each cell."""
     grey = values[:, :, :3].mean(axis=2)
     if stated.mode == "raw":  # occupancy in percent, 255 where unknown
         return np.asarray((grey <= 100.0) & (grey >= 100.0 * stated.occupied_thresh))
@@ -88,7 +90,7 @@ def _are_occupied(values: NDArray[np.uint8], stated: MapFile) -> NDArray[np.bool
 
 
 def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return segments (W, 4) as column, row, column, row."""
+    """Return the outlines of groups of occupied cells as segments (W, 4): column and row of both ends."""
     import cv2  # noqa: PLC0415 - worlds without such a map need no OpenCV
 
     contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -98,6 +100,6 @@ def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
             continue
         corners = cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0].tolist()
         for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
-            if start != end:  # a wall one cell wide is traced in both directions
+            if start != end:  # sorted ends, because a wall that is one cell wide is traced in both directions
                 segments[(*min(start, end), *max(start, end))] = None
     return np.array(list(segments), dtype=np.int64).reshape(-1, 4)

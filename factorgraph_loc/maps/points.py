@@ -26,7 +26,7 @@ COLUMNS = ("point", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz")
 VIEW = ("from_x", "from_y", "from_z")
 Feature = Literal["colour", "sift", "orb"]
 KINDS: tuple[str, ...] = get_args(Feature)
-LARGEST_VALUE = 1e6  # largest absolute value of a descriptor
+LARGEST_VALUE = 1e6  # largest absolute value of an element of a descriptor
 PLY = """ply
 format ascii 1.0
 comment points of a map in metres; sigma: standard deviation in the worst direction; views: stored views of a point
@@ -39,19 +39,19 @@ property int views
 end_header
 """
 ROUNDING = 1e-9  # rounding error of an eigenvalue, relative to the largest
-ARM = 1.0  # m: distance that is equivalent to a turn of 1 rad, to choose the nearest place
-LEAST = 0.01  # m: least standard deviation of a point without the common error
+ARM = 1.0  # m: distance that counts as much as a turn of 1 rad in the choice of the nearest place
+LEAST = 0.01  # m: minimum standard deviation of a point after the common error is removed
 
 
 @dataclass(frozen=True, eq=False)
 class PointMap:
-    """P points and V views of them.
+    """A map of P points in space, and V views of them in images.
 
-    ``names``: P, unique; ``positions`` (P, 3) [m] in the world frame; ``covariances`` (P, 3, 3) [m^2]. ``feature``: the kind of
-    the views' ``descriptors`` (V, D), empty where points are identified by name only (V = 0). ``owners`` (V,): the point of
-    each view; ``seen_from`` (V, 3) [m]: the camera's position. ``common`` (V, 3, 3): for a map that was made without a reference,
-    the covariance of (x, y, heading) of the local frame, about the camera. This is the common error of all points in a view; see
-    :class:`CommonError`.
+    ``names``: P unique names. ``positions`` (P, 3): in the world frame [m]. ``covariances`` (P, 3, 3) [m^2].
+    ``feature``: the kind of ``descriptors`` (V, D), "" if points are identified only by name (V = 0).
+    ``owners`` (V,): index of the point of each view. ``seen_from`` (V, 3): position of the camera at each view [m].
+    ``common`` (V, 3, 3): the error that all points in a view share, as a covariance of (x, y, heading) about the camera, see
+    :class:`CommonError`. None if the map was made with a reference.
     """
 
     names: tuple[str, ...]
@@ -76,12 +76,12 @@ class PointMap:
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """The index of each name."""
+        """The index of each point by its name."""
         return {name: i for i, name in enumerate(self.names)}
 
     @classmethod
     def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
-        """Return a map of points that are identified by name only; exact if no covariances are given."""
+        """Return a map of points that are identified only by name. Without ``covariances``, positions are exact."""
         spatial = np.zeros((len(names), 3, 3)) if covariances is None else covariances
         return cls(
             tuple(names),
@@ -94,7 +94,7 @@ class PointMap:
         )
 
     def chosen(self, which: Integers) -> PointMap:
-        """The points with indices ``which``, with their views."""
+        """Return a map of the points with the indices ``which``, and their views."""
         place = np.full(len(self), -1, dtype=np.int64)
         place[which] = np.arange(len(which))
         views = np.flatnonzero(place[self.owners] >= 0)
@@ -110,7 +110,7 @@ class PointMap:
         )
 
     def with_points(self, added: PointMap, source: object) -> PointMap:
-        """Return this map with the named points ``added``. Raises InputError if a name exists already."""
+        """Return this map with the points ``added``. Raises InputError, naming the file ``source``, if a name exists already."""
         if double := [name for name in added.names if name in self.index]:
             raise InputError(f"{source}: the point {double[0]} occurs twice, expected unique names")
         return replace(
@@ -122,7 +122,7 @@ class PointMap:
 
 
 def write_points(points: PointMap, path: Path) -> None:
-    """Write ``NAME.points.parquet``: one row per view, and one row without a descriptor for a point without views."""
+    """Write ``NAME.points.parquet``. It has one row per view, and one row without a descriptor for a point without views."""
     viewed = np.zeros(len(points), dtype=bool)
     viewed[points.owners] = True
     unseen = np.flatnonzero(~viewed)
@@ -145,7 +145,7 @@ def write_points(points: PointMap, path: Path) -> None:
 
 
 def read_points(path: Path) -> PointMap:
-    """Read ``NAME.points.parquet``. Raises InputError with the file, row (from 1) and column of what is wrong.
+    """Read ``NAME.points.parquet``. Raises InputError with file, row (counted from 1) and column of an invalid value.
 
     All rows of a point must have the same position. Covariances must be positive semi-definite.
     """
@@ -196,7 +196,7 @@ def read_points(path: Path) -> PointMap:
 
 
 def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
-    """Return the numbers (R,) of a column in ``rows`` (R,), checked against its bounds."""
+    """Return the numbers (R,) of the column ``name`` in ``rows`` (R,). Raises InputError if one is out of bounds."""
     if name not in table.columns or not table[name].dtype.is_numeric():
         raise InputError(f"{path}: has no column {name} of numbers")
     values = np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)[rows]
@@ -207,7 +207,10 @@ def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path
 def _check_covariances(
     covariances: Array, columns: Sequence[str], names: Sequence[str], rows: NDArray[np.int64], path: Path
 ) -> None:
-    """InputError for the first of ``covariances`` (N, 3, 3), of points ``names`` (N) in ``rows`` (N,), that is none."""
+    """Raise InputError at the first of ``covariances`` (N, 3, 3) that is not positive semi-definite.
+
+    ``columns``: the names of the columns with their elements. ``names`` (N), ``rows`` (N,): the points and rows, for the error.
+    """
     least, _, most = np.linalg.eigvalsh(covariances).T
     if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(most))):
         i = int(bad[0])
@@ -228,18 +231,26 @@ def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, pat
     content = table["descriptor"].to_list()
     chosen = [content[i] or b"" for i in rows.tolist()]
     if len({len(row) for row in chosen}) != 1 or not chosen[0] or len(chosen[0]) % np.dtype(kind).itemsize:
-        raise InputError(f"{path}: descriptors differ in their length, expected one length for feature {feature}")
+        raise InputError(
+            f"{path}: descriptors are empty or differ in length, expected one length for feature {feature}"
+        )
     values = np.frombuffer(b"".join(chosen), dtype=kind).reshape(len(chosen), -1).copy()
     if len(bad := np.flatnonzero(~(np.abs(values) <= LARGEST_VALUE).all(axis=1))):
-        raise bad_field(path, "descriptor", "values that are none", "finite numbers", row=int(rows[bad[0]]) + 1)
+        raise bad_field(
+            path,
+            "descriptor",
+            "values out of bounds",
+            f"finite numbers up to {LARGEST_VALUE:g}",
+            row=int(rows[bad[0]]) + 1,
+        )
     return values
 
 
 def write_ply(points: PointMap, path: Path) -> None:
-    """Write a PLY file for viewers of point clouds: positions, the standard deviation in the worst direction [m] and the number
-    of views.
+    """Write a PLY file for viewers of point clouds.
 
-    Format: G. Turk, "The PLY polygon file format", 1994.
+    A point has its position, its standard deviation in the worst direction [m] and its number of views. Format: G. Turk, "The PLY
+    polygon file format", 1994.
     """
     sigma = worst_sigma(points.covariances)
     views = np.bincount(points.owners, minlength=len(points))
@@ -251,13 +262,14 @@ def write_ply(points: PointMap, path: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class CommonError:
-    """The common error of all points near a place, if the map was made without a reference: ``covariances`` (K, 3, 3) of (x, y,
-    heading) about ``places`` (K, 2) [m] of the camera. ``directions`` (K, 2): unit vectors from the camera to the points.
+    """The error that all points near a place of a map share, if the map was made without a reference.
 
-    Such a map is bent as the drive's trajectory was. A robot that is localized in it has the same error, with any number of points:
-    it does not average out, unlike the points' own errors. It is therefore not part of an image's noise, but is added to the
-    covariance in the frame of the map. It is the error of the drive's pose at the observation of the points, moved to the robot as
-    a rigid body.
+    ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): unit vectors from the camera to
+    the points. ``covariances`` (K, 3, 3): the shared error of (x, y, heading) about each place.
+
+    Such a map is distorted like the estimated trajectory from which it was made. A robot that localizes in it has the same error.
+    More points do not reduce this error. It is therefore not part of an image's noise, but is added to the covariance of the pose.
+    It is the error of the mapping robot's pose when it observed the points, moved to the localized robot as a rigid body.
     """
 
     places: Array
@@ -266,7 +278,7 @@ class CommonError:
 
     @classmethod
     def of(cls, points: PointMap) -> CommonError | None:
-        """That of a map; None if it was made with a reference."""
+        """Return the shared error of a map. Returns None if the map was made with a reference."""
         if points.common is None or not len(points.owners):
             return None
         places, first, of = np.unique(points.seen_from[:, :2], axis=0, return_index=True, return_inverse=True)
@@ -276,9 +288,9 @@ class CommonError:
         return cls(places, _unit(directions), points.common[first])
 
     def at(self, poses: Array, looking: float = 0.0) -> Array:
-        """The covariances (N, 3, 3) at ``poses`` (N, 3) of a robot: those of the nearest places with a similar view.
+        """Return the covariances (N, 3, 3) of the shared error at the ``poses`` (N, 3) of a robot.
 
-        ``looking`` [rad]: direction of the camera in the robot frame.
+        Each is that of the nearest place with a similar view. ``looking``: direction of the camera in the robot frame [rad].
         """
         ahead = poses[:, 2] + looking
         cosine = np.column_stack((np.cos(ahead), np.sin(ahead))) @ self.directions.T
@@ -288,20 +300,25 @@ class CommonError:
 
 
 def carried(covariances: Array, arms: Array) -> Array:
-    """``covariances`` (N, 3, 3) of a rigid body's (x, y, heading), moved to points at ``arms`` (N, 2) [m] from the old ones."""
+    """Return ``covariances`` (N, 3, 3) of (x, y, heading) of a rigid body, moved to other points of the body.
+
+    ``arms`` (N, 2): the vectors from the old points to the new ones [m].
+    """
     lever = np.repeat(np.eye(3)[None], len(arms), axis=0)
     lever[:, 0, 2], lever[:, 1, 2] = -arms[:, 1], arms[:, 0]
     return np.asarray(lever @ covariances @ lever.transpose(0, 2, 1))
 
 
 def without_common(points: PointMap) -> PointMap:
-    """The map with covariances of its points without their common error."""
+    """Return the map after the error that points of a view share is subtracted from the covariances of the points."""
     if points.common is None:
         return points
     moved = carried(points.common, points.positions[points.owners, :2] - points.seen_from[:, :2])[:, :2, :2]
     order = np.argsort(-np.trace(moved, axis1=1, axis2=2), kind="stable")
     shared = np.zeros_like(points.covariances)
-    shared[points.owners[order], :2, :2] = moved[order]  # of the view that has least in common with others
+    shared[points.owners[order], :2, :2] = moved[
+        order
+    ]  # of several views of a point, the last has the smallest shared error
     values, axes = np.linalg.eigh(points.covariances - shared)
     own = (axes * np.maximum(values, LEAST**2)[:, None, :]) @ axes.transpose(0, 2, 1)
     return replace(points, covariances=own)

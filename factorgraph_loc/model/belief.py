@@ -1,4 +1,4 @@
-"""Priors of the start pose, pose estimates, beliefs, and other estimates: constants of sensors, landmarks, points."""
+"""Priors of the start pose, estimated poses, beliefs, and estimated constants of sensors, landmarks and points."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
-# of a start given as a pose only
+# standard deviations of a start pose that is given without a covariance
 POSITION_SIGMA = 0.05  # m
 HEADING_SIGMA = 0.05  # rad
-EXACT_SIGMA = 1e-3  # m and rad: of a start that defines the frame
+EXACT_SIGMA = 1e-3  # m and rad: standard deviations of a start pose that defines the world frame
 
 Status = Literal["unlocalized", "ambiguous", "localized"]
 
@@ -24,8 +24,8 @@ Status = Literal["unlocalized", "ambiguous", "localized"]
 class PosePrior:
     """Gaussian prior of the start pose.
 
-    ``pose`` (3,) is (x, y, heading) at ``t`` with ``covariance`` (3, 3), in the world frame. ``has_heading`` is False if the
-    heading is unknown: it is 0 then, with the variance of a uniform distribution.
+    ``pose`` (3,) is (x, y, heading) at time ``t`` [s] with ``covariance`` (3, 3), in the world frame. ``has_heading`` is False if
+    the heading is unknown. The heading of ``pose`` is then 0, with the variance of a uniform distribution.
     """
 
     t: float
@@ -35,7 +35,7 @@ class PosePrior:
 
     @staticmethod
     def at_position(t: float, position: Array, covariance: Array) -> PosePrior:
-        """Prior of a ``position`` (2,) with ``covariance`` (2, 2) and unknown heading."""
+        """Return the prior of a ``position`` (2,) [m] with ``covariance`` (2, 2) [m^2] and unknown heading, at time ``t`` [s]."""
         whole = np.diag((0.0, 0.0, math.pi**2 / 3.0))
         whole[:2, :2] = covariance
         return PosePrior(t, np.append(position, 0.0), whole, has_heading=False)
@@ -43,10 +43,11 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A causal estimate: ``pose`` (3,) at ``t`` with ``covariance`` (3, 3) of (x, y, heading) in the world frame.
+    """The pose at a time, estimated from the measurements up to that time.
 
-    ``status``: of the pose. ``doubts_model``: whether measurements contradict the model of their sensor; the covariance may be
-    too small then.
+    ``t``: time [s]. ``pose`` (3,): x, y [m] and heading [rad] in the world frame. ``covariance`` (3, 3) of (x, y, heading).
+    ``status``: whether the pose is known, ambiguous or unknown. ``doubts_model``: True if measurements contradict the model of
+    their sensor, so that the covariance may be too small.
     """
 
     t: float
@@ -58,7 +59,7 @@ class PoseEstimate:
 
 @dataclass(frozen=True)
 class Mode:
-    """One Gaussian mode of a belief, in the world frame."""
+    """One Gaussian mode of a belief: ``weight`` from 0 to 1, ``pose`` (3,) in the world frame, and its ``covariance`` (3, 3)."""
 
     weight: float
     pose: Array
@@ -67,7 +68,11 @@ class Mode:
 
 @dataclass(frozen=True)
 class Belief:
-    """The current belief: weighted Gaussian modes, and particles (N, 3) with weights (N,) if the estimator uses particles."""
+    """The belief of an estimator about the current pose.
+
+    ``modes``: weighted Gaussians. ``particles`` (N, 3): poses in the world frame, with ``weights`` (N,). Both are None if the
+    estimator uses no particles.
+    """
 
     modes: tuple[Mode, ...]
     particles: Array | None = None
@@ -75,7 +80,7 @@ class Belief:
 
 
 def gaussian_belief(estimate: PoseEstimate) -> Belief:
-    """The belief of a Gaussian estimator; it has no modes if the estimate is not finite."""
+    """Return the belief with a Gaussian ``estimate`` as its only mode. It has no modes if the estimate is not finite."""
     if not np.isfinite(estimate.pose).all():
         return Belief(())
     return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))
@@ -91,11 +96,12 @@ class LearntPoint:
 
 @dataclass(frozen=True)
 class Learnt:
-    """Estimates besides the poses.
+    """Estimates of an estimator other than poses.
 
-    ``values``: constants by name, each (value, standard deviation) in SI units. Constants of odometry have plain names
-    (``scale_distance``), those of other sensors a prefix (``bearing_range.x``). ``landmarks``: by name. ``points``: points in
-    space that are not in the map, or None.
+    ``values``: constants of sensors by name, each as (value, standard deviation) in SI units. Constants of odometry have plain
+    names (``scale_distance``), those of other sensors have the sensor as a prefix (``bearing_range.x``).
+    ``landmarks``: estimated landmarks by name.
+    ``points``: estimated points in space that the map lacks, or None.
     """
 
     values: Mapping[str, tuple[float, float]] = field(default_factory=dict)

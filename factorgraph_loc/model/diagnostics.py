@@ -1,4 +1,4 @@
-"""Counts and consistency figures of a run."""
+"""Counts and consistency figures of a run, which an estimator records while it processes measurements."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 from factorgraph_loc.text import Notice
 
-# an addition: the list or count, its name, and the added rows or number
+# one addition to the diagnostics: the dictionary, the key in it, and the rows or the number that was added
 Addition = tuple[dict[str, Any], str, Any]
 
 
 @dataclass(frozen=True)
 class Event(Notice):
-    """A notice about what happened at ``t`` [s]."""
+    """A notice about an event at time ``t`` [s]."""
 
     t: float
 
@@ -23,10 +23,11 @@ class Event(Notice):
 class Diagnostics:
     """Counts and consistency figures of a run.
 
-    ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the update. ``nis``:
-    by sensor, rows of (t, normalised innovation squared, degrees of freedom). ``ignored``, ``rejected``, ``late``: counts by
-    reason. ``events``: for example a rebuilt graph. ``doubted``: by kind of doubt (``moved_tags``), elements of the map that are
-    probably not as the map has them, with that probability.
+    ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the update.
+    ``nis``: by sensor, rows of (t [s], normalised innovation squared, degrees of freedom).
+    ``ignored``, ``rejected``: counts of detections by reason. ``late``: counts of late measurements by sensor.
+    ``events``: events of the estimator, for example a rebuilt graph.
+    ``doubted``: by kind of doubt (``moved_tags``), names of map elements, each with the probability that the map is wrong about it.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -36,11 +37,14 @@ class Diagnostics:
     late: dict[str, int] = field(default_factory=dict)
     events: list[Event] = field(default_factory=list)
     doubted: dict[str, dict[str, float]] = field(default_factory=dict)
-    # all additions since :meth:`record` was called; None if it was not
+    # all additions since the call of :meth:`record`; None if it was not called
     added: list[Addition] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __str__(self) -> str:
-        """A summary: the updates of each sensor with their mean NIS, ideally 1 per degree of freedom, counts, and events."""
+        """A summary: updates of each sensor, with their mean normalised innovation squared (NIS), counts, and events.
+
+        The mean NIS is ideally 1 per degree of freedom.
+        """
         lines = [
             f"{sensor}: {len(rows)} updates, NIS {sum(nis for _, nis, _ in rows) / max(1, sum(n for *_, n in rows)):.2f} per "
             "degree of freedom"
@@ -52,7 +56,7 @@ class Diagnostics:
         return "\n".join([*lines, *(f"{kind}: {', '.join(names)}" for kind, names in self.doubted.items())])
 
     def ignore(self, reason: str, count: int = 1) -> None:
-        """Count ignored detections; a negative ``count`` is of those that are used after all."""
+        """Count detections as ignored for a ``reason``. A negative ``count`` is for detections that are used after all."""
         self.ignored[reason] = self.ignored.get(reason, 0) + count
         if not self.ignored[reason]:
             del self.ignored[reason]
@@ -80,13 +84,16 @@ class Diagnostics:
             self.added.append((self.residuals, name, rows))
 
     def event(self, t: float, kind: str, sentence: str, **fields: Any) -> None:
-        """Record an event; an event that is repeated after going back in time is recorded once."""
+        """Record an event at time ``t`` [s]. If measurements are processed again, a repeated event is recorded once.
+
+        ``kind``: the type of the event. ``sentence``: its text, with names of ``fields`` in braces.
+        """
         event = Event(kind, sentence, fields, t)
         if event not in self.events:
             self.events.append(event)
 
     def keep_last(self, rows: int) -> None:
-        """Keep the last ``rows`` rows of each list only."""
+        """Keep only the last ``rows`` innovations of each sensor, residuals of each quantity, and events."""
         for innovations in self.nis.values():
             del innovations[:-rows]
         for residuals in self.residuals.values():
@@ -106,14 +113,18 @@ class Diagnostics:
         )
 
     def record(self) -> list[Addition]:
-        """A list of all that is added from now on, until ``added`` is None again, for :meth:`take_back`. Late measurements and
-        events are not part of it."""
+        """Start to record additions, and return the list to which they are appended, for :meth:`take_back`.
+
+        Recording ends when ``added`` is set to None. Late measurements and events are not recorded.
+        """
         self.added = []
         return self.added
 
     def take_back(self, added: Sequence[Addition]) -> None:
-        """Remove what was added, before the same measurements are processed again. Rows that :meth:`keep_last` removed are
-        skipped."""
+        """Remove recorded additions, before the same measurements are processed again.
+
+        ``added``: the list from :meth:`record`. Rows that :meth:`keep_last` has removed are skipped.
+        """
         for totals, name, rows in reversed(added):
             if isinstance(rows, int):
                 totals[name] = totals.get(name, 0) - rows
@@ -124,7 +135,7 @@ class Diagnostics:
 
 
 def _remove(rows: list[Any], taken: Sequence[Any]) -> None:
-    """Remove the last occurrence of each row."""
+    """Remove the last occurrence in ``rows`` of each of the rows ``taken``."""
     for row in reversed(taken):
         index = next((i for i in reversed(range(len(rows))) if rows[i] is row or rows[i] == row), None)
         if index is not None:

@@ -18,15 +18,13 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.text import Notice, well_formed
 from factors.se2 import Array, Integers
 
-NOT_READ, RIG_NOTES = (
-    "not read",
-    "robot",
-)  # keys of the metadata: what the reader leaves out; on the rig that it makes itself
+NOT_READ = "not read"  # key of the metadata: columns, files or topics that the reader leaves out
+RIG_NOTES = "robot"  # key of the metadata: notes on the rig that the reader makes itself
 
 
 @dataclass(frozen=True)
 class StartPose:
-    """A known start pose: ``t`` [s], ``pose`` (3,) and standard deviations (3,) of x, y, heading."""
+    """A known start: ``pose`` (3,) in the world at time ``t`` [s], and standard deviations ``sigmas`` (3,) of x, y, heading."""
 
     t: float
     pose: Array
@@ -35,10 +33,12 @@ class StartPose:
 
 @dataclass(frozen=True)
 class Log:
-    """A log. ``streams`` by channel; ``t0_ns``: absolute time of t = 0 in nanoseconds.
+    """A recorded or simulated run of a robot.
 
-    ``warnings``: one line for each problem that the reader corrected or skipped. ``metadata``: licence, origin and so on, and
-    what :data:`NOT_READ` and :data:`RIG_NOTES` say.
+    ``rig``: the robot and its sensors. ``world``: the map. ``streams``: the measurements, by the name of the sensor.
+    ``reference``: the reference trajectory. ``start``: the known start. ``t0_ns``: absolute time of t = 0 [ns].
+    ``warnings``: problems that the reader corrected or skipped. ``metadata``: licence, origin and other texts by key, see
+    :data:`NOT_READ` and :data:`RIG_NOTES`.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Log:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", well_formed(self.name))  # it may come from a file name
+        object.__setattr__(self, "name", well_formed(self.name))  # a file name may contain invalid characters
 
     def __repr__(self) -> str:
         first, last = self.span()
@@ -60,7 +60,10 @@ class Log:
         return f"Log({self.name!r}, {last - first:.1f} s: {streams or 'no streams'})"
 
     def span(self) -> tuple[float, float]:
-        """First and last timestamp of all streams [s], or of the reference of a log without any."""
+        """Return the first and the last timestamp [s] of all streams. Without streams, they are those of the reference.
+
+        Returns (0, 0) if there are no timestamps.
+        """
         stamps = [(s.t.min(), s.t.max()) for s in self.streams.values() if len(s.t)]
         if not self.streams and self.reference:
             stamps = [(self.reference.t[0], self.reference.t[-1])]
@@ -69,17 +72,19 @@ class Log:
         return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))
 
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """The measurements of ``sensors`` in order of arrival, with the time offsets of the rig applied.
+        """Return the measurements of ``sensors`` in order of arrival, with the time offsets of the rig added to their timestamps.
 
-        A late measurement keeps its timestamp and follows those that arrived before it. Equal times are ordered by stream rank.
+        A late measurement keeps its timestamp and follows the measurements that arrived before it. Measurements with equal times
+        are ordered by the rank of their streams.
         """
 
         return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))
 
     def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """The same, but successive rows of a stream with ``joins`` are one measurement
-        (:class:`~factorgraph_loc.model.measurement.Rows`) if they arrive without others between and each is newer than the
-        previous one.
+        """Return the measurements as :meth:`measurements` does, but with rows of one stream joined, which is faster to process.
+
+        Successive rows of a stream with ``joins`` are one :class:`~factorgraph_loc.model.measurement.Rows` if no other measurement
+        arrives between them, and if each row is newer than the previous one.
         """
         order = self._in_order(sensors)
         joined = next((rank for rank, name in enumerate(order) if self.streams[name].joins), None)
@@ -98,20 +103,26 @@ class Log:
         yield from _pieces(rows, late, first, len(arrived))
 
     def alone(self, sensor: str) -> Log:
-        """The log with one of several sensors as the only one of its kind; unchanged for a name without a dot."""
+        """Return the log without the other sensors of the same kind as ``sensor``, which gets the name of the kind.
+
+        Example: ``bearing_range.front`` becomes ``bearing_range``. A name without a dot returns the log unchanged.
+        """
         if kind_of(sensor) == sensor:
             return self
         streams = {name: self.streams[old] for name, old in as_only(self.streams, sensor).items()}
         return replace(self, rig=self.rig.alone(sensor), streams=streams)
 
     def _in_order(self, sensors: Sequence[str]) -> list[str]:
-        """The streams of ``sensors``, in the order of their measurements at equal times."""
+        """Return the names of the streams of ``sensors``, in the order in which measurements with equal times are processed."""
         return sorted((s for s in self.streams if s in sensors), key=lambda s: (self.streams[s].rank, s))
 
     def _arrivals(
         self, order: Sequence[str], without: int | None = None
     ) -> list[Iterator[tuple[float, int, int, Measurement]]]:
-        """Of each stream, but for one, its measurements, each with when it arrived and its place among those of that time."""
+        """Return the measurements of each stream in ``order``, except the one with index ``without``, as sortable tuples.
+
+        A tuple has the time of arrival [s], the index of the stream, the index of the row, and the measurement.
+        """
 
         def arrivals(rank: int, name: str) -> Iterator[tuple[float, int, int, Measurement]]:
             latest = -np.inf
@@ -123,7 +134,7 @@ class Log:
 
 
 def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]:
-    """The rows from ``first`` to before ``last``, cut before and after those that are ``late`` (L,)."""
+    """Yield the rows from index ``first`` to before ``last`` in pieces. Each row with an index in ``late`` (L,) is a piece."""
     for i in late[late.searchsorted(first) : late.searchsorted(last)].tolist() if len(late) else ():
         if first < i:
             yield rows.part(first, i)
@@ -134,10 +145,11 @@ def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]
 
 
 def cut(log: Log, start: float, end: float) -> Log:
-    """The part of a log with timestamps in [start, end) seconds by each sensor's own clock, including the reference.
+    """Return the part of a log, and of its reference, with timestamps from ``start`` to before ``end`` [s].
 
-    Timestamps and name do not change; a known start is dropped. A velocity from before ``start`` does not apply in the part. The
-    first increment of odometry remains the motion since the previous row of the log. InputError if no measurement is left.
+    Timestamps are those of each sensor's own clock, and do not change. A known start is dropped. A velocity from before ``start``
+    does not apply in the part. The first increment of odometry is still the motion since the previous row of the whole log. Raises
+    InputError if no measurement is left.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:
@@ -158,11 +170,11 @@ def cut(log: Log, start: float, end: float) -> Log:
 
 
 def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
-    """A kidnapped robot: ``second`` starts ``gap`` seconds after the end of ``first``, wherever the robot is then.
+    """Join two logs to the log of a kidnapped robot: ``second`` follows ``gap`` seconds after the end of ``first``.
 
-    The timestamps of ``second`` are shifted. A gap between the references is not scored. The last velocity of ``first`` is held
-    until the first row of ``second``, whose first increment becomes zero. Start, metadata and absolute time are those of
-    ``first``. InputError if rig, map or kind of odometry differ, or if ``gap`` is not positive.
+    The timestamps of ``second`` are shifted; its poses are not changed. The time between the references is not scored. The last
+    velocity of ``first`` applies until the first row of ``second``. The first increment of ``second`` becomes zero. Start, metadata
+    and absolute time are those of ``first``. Raises InputError if rig, map or kind of odometry differ, or if ``gap`` <= 0.
     """
     if gap <= 0.0:
         raise InputError(f"the gap between {first.name} and {second.name} is {gap:g} s, expected more than 0")
@@ -184,7 +196,10 @@ def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
 
 
 def _joined_references(first: Trajectory | None, second: Trajectory | None, shift: float) -> Trajectory | None:
-    """Joined references; covariances and heading are kept only if both parts have them."""
+    """Join two references, the second shifted in time by ``shift`` [s]. Returns None if both are None.
+
+    Covariances and headings are kept only if both references have them.
+    """
     later = None if second is None else replace(second, t=second.t + shift)
     if first is None or later is None:
         return first or later
@@ -200,7 +215,7 @@ def _joined_references(first: Trajectory | None, second: Trajectory | None, shif
 
 
 def _extent(log: Log) -> tuple[float, float]:
-    """First and last timestamp of streams and reference [s]."""
+    """Return the first and the last timestamp [s] of the streams and the reference of a log."""
     first, last = log.span()
     if log.reference is None or not len(log.reference):
         return first, last

@@ -1,6 +1,6 @@
-"""The interface of measurements, and the rows of one sensor of a log.
+"""The interface of measurements, and streams: all measurements of one sensor in a log.
 
-Measurements are frozen values in SI units, with timestamps in seconds from the start of the log.
+Measurements are immutable values in SI units, with timestamps in seconds from the start of the log.
 """
 
 from __future__ import annotations
@@ -18,16 +18,19 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.sections import kind_of
 from factors.se2 import Array
 
-GOING_BACK = 5.0  # s that an estimator goes back in time, at most, to process a late measurement
+GOING_BACK = 5.0  # s: maximum delay of a late measurement that an estimator still processes
 FLOOR, TURN, EXTEROCEPTIVE = 0, 1, 2  # ranks of streams: motion on the floor, rotation only, exteroceptive measurements
 
 
 class Measurement(Protocol):
-    """A measurement at ``t`` [s], the time of the event with the clock offset applied.
+    """A measurement of a sensor.
 
-    ``sensor``: its channel, as in a log and in ``--sensors``. ``modality``: the kind of sensor; estimators
-    declare the modalities that they use. ``source``: the name of the sensor, by default its modality. ``count``: number of
-    detections. ``is_motion``: whether it measures the robot's motion.
+    ``t``: time of the event [s], with the time offset of the sensor added.
+    ``sensor``: the name of its stream in a log and in the option ``--sensors``.
+    ``modality``: the kind of sensor; an estimator declares the modalities that it uses.
+    ``source``: the name of the sensor if there are several of a kind, by default the modality.
+    ``count``: number of detections in the measurement.
+    ``is_motion``: True if it measures the robot's motion.
     """
 
     @property
@@ -45,18 +48,18 @@ class Measurement(Protocol):
 
 
 def channel_of(m: Measurement) -> str:
-    """The channel of a measurement in a log: its source if it comes from one of several sensors of a kind."""
+    """Return the name of the stream of a measurement in a log. If there are several sensors of a kind, it is the sensor's name."""
     return m.source if kind_of(m.source) == m.sensor else m.sensor
 
 
 def named(m: Measurement) -> str:
-    """The measurement in an error: ``BearingRange at 1.500 s``."""
+    """Return the text that names a measurement in an error, such as ``BearingRange at 1.500 s``."""
     return f"{type(m).__name__} at {m.t:.3f} s"
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A time at which the causal trajectory is evaluated."""
+    """A time ``t`` [s] at which a run records the causal estimate. Estimators process it like a measurement."""
 
     sensor: ClassVar[str] = "tick"
     modality: ClassVar[str] = "tick"
@@ -68,9 +71,9 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Successive measurements of one ``kind`` as one, with the time of the last.
+    """N successive measurements of one stream, joined to one measurement with the time of the last.
 
-    ``times`` (N,) [s]; ``values``: an array (N,) of each field.
+    ``kind``: the class of the measurements. ``times`` (N,): their times [s]. ``values``: for each field, its values (N,).
     """
 
     kind: type[Any]
@@ -102,18 +105,20 @@ class Rows:
         return bool(self.kind.is_motion)
 
     def part(self, first: int, last: int) -> Rows:
-        """Those from ``first`` to before ``last``."""
+        """Return the measurements from index ``first`` to before ``last``."""
         return Rows(self.kind, self.times[first:last], tuple([values[first:last] for values in self.values]))
 
 
 @dataclass(frozen=True)
 class Stream:
-    """The rows of one channel as columns; ``t`` (N,) in seconds from the start of the log, by the sensor's clock.
+    """All measurements of one sensor in a log, stored as columns of N rows. Subclasses add the columns of a sensor.
 
-    Rows are in order of arrival; a late row has an older timestamp than the one before. ``rank`` orders rows with equal
-    timestamps. ``kind``: class of the measurements, constructed from a timestamp and the columns. ``source``: the name of the
-    sensor, "" for its modality. ``joins``: whether consecutive rows, of numbers, can be one measurement
-    (:class:`~factorgraph_loc.model.measurement.Rows`).
+    Rows are in order of arrival. A late row has an older timestamp than the row before.
+    ``t`` (N,): times from the start of the log by the clock of the sensor [s].
+    ``source``: the name of the sensor if there are several of its kind, else "".
+    ``rank``: orders measurements of several streams with equal timestamps.
+    ``joins``: True if consecutive rows may be joined to one :class:`~factorgraph_loc.model.measurement.Rows`.
+    ``kind``: the class of a measurement, which is constructed from a timestamp and the columns.
     """
 
     rank: ClassVar[int] = EXTEROCEPTIVE
@@ -123,16 +128,16 @@ class Stream:
     source: str = field(default="", kw_only=True)
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        """One measurement per row; ``offset`` [s] is added to the timestamps."""
+        """Return one measurement per row. ``offset`` [s] is added to the timestamps."""
         return map(self._made, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
 
     def rows(self, offset: float) -> Rows:
-        """All rows as one measurement, if the stream ``joins``."""
+        """Return all rows joined to one measurement, for a stream with ``joins``. ``offset`` [s] is added to the timestamps."""
         return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
 
     @property
     def _made(self) -> Callable[..., Measurement]:
-        """Makes a measurement of a timestamp and the columns."""
+        """The function that makes a measurement from a timestamp and the values of a row."""
         make: Callable[..., Measurement] = self.kind
         return partial(make, source=self.source) if self.source else make
 
@@ -140,20 +145,20 @@ class Stream:
         return (column for name, column in columns_of(self).items() if name != "t")
 
     def begun_anew(self) -> Self:
-        """The stream of a robot that was placed at its first row, without any motion before it."""
+        """Return the stream without motion before its first row, for a robot that was carried to the place of that row."""
         return self
 
     def scans(self) -> Iterator[tuple[int, int]]:
-        """First and end row of each run of equal timestamps."""
+        """Yield the first row, and the row after the last, of each sequence of rows with equal timestamps."""
         return pairwise([*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)])
 
 
 @dataclass(frozen=True)
 class ScanStream(Stream):
-    """A stream whose rows with one timestamp form one measurement of names (K,) and arrays (K,)."""
+    """A stream in which K successive rows with equal timestamps form one measurement. Its fields have K values each."""
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        """One measurement per timestamp; ``offset`` [s] is added to the timestamps."""
+        """Yield one measurement per timestamp. ``offset`` [s] is added to the timestamps."""
         for i, j in self.scans():
             parts = (column[i:j] for column in self._columns())
             values = (part if isinstance(part, np.ndarray) else tuple(part) for part in parts)
@@ -161,12 +166,12 @@ class ScanStream(Stream):
 
 
 def of_sensor(stream: Stream, name: str) -> Stream:
-    """The stream of a channel; the ``name`` of one of several sensors of a kind is its source."""
+    """Return the stream with the ``name`` of the sensor as its source, if the name is that of one of several sensors of a kind."""
     return stream if kind_of(name) == name else replace(stream, source=name)
 
 
 def columns_of(stream: Stream) -> dict[str, Any]:
-    """The columns of a stream by name, the timestamps first."""
+    """Return the columns of a stream by name. The timestamps ``t`` are first."""
     return {f.name: getattr(stream, f.name) for f in fields(stream) if f.name != "source"}
 
 
@@ -178,7 +183,7 @@ def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
 
 
 def are_alike(first: Stream, second: Stream) -> bool:
-    """Whether two streams are of one kind."""
+    """True if two streams have the same class."""
     return type(first) is type(second)
 
 

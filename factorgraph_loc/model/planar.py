@@ -1,4 +1,4 @@
-"""Projection of three-dimensional poses onto the floor, and conventions for the axes of files and sensors."""
+"""Projects three-dimensional poses onto the floor, and defines settings for the axes of files and sensors."""
 
 import math
 from pathlib import Path
@@ -13,16 +13,16 @@ from factorgraph_loc.text import Notice
 from factors.se2 import Array, Integers
 
 RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a warning and for an error
-TILT = math.radians(10.0)  # of the robot's z axis against the world's: limit for a warning
-NEGLIGIBLE = 1e-9  # of an axis
+TILT = math.radians(10.0)  # angle between the z axes of the robot and the world: limit for a warning
+NEGLIGIBLE = 1e-9  # component of a unit vector below which an axis does not contribute
 UNIT = 0.01  # tolerance of the norm of a quaternion
-NAMED = {"body": "x y z", "optical": "z -x -y"}
+NAMED = {"body": "x y z", "optical": "z -x -y"}  # axes that point forward, left and up, by name
 
 Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")]
 
 
 def _matrix(text: str) -> Array:
-    """The matrix (3, 3) of the axes that ``text`` names, one per row."""
+    """Return the matrix whose rows are the axes in ``text``, such as "z -x -y". It is (3, 3) if the text has three axes."""
     signs = NAMED.get(text, text).split()
     return np.array(
         [[(1.0 - 2.0 * s.startswith("-")) * (s.removeprefix("-") == axis) for axis in "xyz"] for s in signs]
@@ -64,7 +64,7 @@ class Mounting(FileModel):
 
 
 class Turned(FileModel):
-    """Axes and mounting of a source."""
+    """The orientation of recorded poses or measurements: their axes, and the mounting of their frame on the robot."""
 
     axes: Axes | None = None
     """recorded axes that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
@@ -72,15 +72,15 @@ class Turned(FileModel):
     """orientation of the measured frame on the robot"""
 
     def is_given(self) -> bool:
-        """Whether axes or mounting are set."""
+        """True if axes or mounting are set."""
         return self.axes is not None or self.mounting != Mounting()
 
     def standing(self) -> Array:
-        """The rotation (3, 3) from the source's axes to forward, left and up."""
+        """Return the rotation (3, 3) from the recorded axes to axes that point forward, left and up."""
         return _matrix(self.axes or "body")
 
     def turned(self) -> Array:
-        """The rotation (3, 3) from the source's axes to the robot frame."""
+        """Return the rotation (3, 3) from the recorded axes to the robot frame."""
         return self.mounting.rotation() @ self.standing()
 
 
@@ -88,13 +88,16 @@ AS_IT_IS = Turned()
 
 
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
-    """Rotations (N, 3, 3) of quaternions (N, 4), (x, y, z, w); InputError if one is not a unit quaternion."""
+    """Return the rotation matrices (N, 3, 3) of ``quaternions`` (N, 4), in the order x, y, z, w.
+
+    ``source``, ``rows`` (N,): the file and the row numbers for errors. Raises InputError if a quaternion has not length 1.
+    """
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     valid = np.abs(length - 1.0) <= UNIT
     require(valid, source, rows, "length of the quaternion", length, "1, a unit quaternion")
     x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
-    matrix = [  # without scipy, which most logs do not need
+    matrix = [  # computed here, because importing scipy is slow
         [w * w + x * x - y * y - z * z, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
         [2.0 * (x * y + z * w), w * w - x * x + y * y - z * z, 2.0 * (y * z - x * w)],
         [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), w * w - x * x - y * y + z * z],
@@ -105,10 +108,11 @@ def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Arra
 def on_floor(
     source: object, positions: Array, rotations: Array | None, warnings: list[Notice], turned: Turned = AS_IT_IS
 ) -> Array:
-    """Planar poses (N, 3) of positions (N, 3) and optional rotations (N, 3, 3): x, y and the direction of the robot's x axis.
+    """Return planar poses (N, 3) of ``positions`` (N, 3) and ``rotations`` (N, 3, 3): x, y and the direction of the x axis.
 
-    A line is added to ``warnings`` if heights differ by more than :data:`RISE` or the robot tilts by more than :data:`TILT`.
-    InputError if heights differ by more than :data:`MOST` and no ``axes`` are given, as y and z may be swapped then.
+    ``turned``: the orientation of the recorded axes and of the measured frame on the robot. Without ``rotations``, headings are 0.
+    Adds a warning if heights differ by more than :data:`RISE`, or if the robot tilts by more than :data:`TILT`. Raises InputError
+    if heights differ by more than :data:`MOST` and no axes are set, because y and z may be swapped.
     """
     places = positions @ turned.standing().T
     poses = np.column_stack((places[:, :2], np.zeros(len(places))))
@@ -135,9 +139,10 @@ def on_floor(
 
 
 def about_z(source: object, rows: Integers, rates: Array, turned: Array) -> Array:
-    """Turn rates (N,) about the robot's z axis from rates (N, 3) about the axes of a sensor with rotation ``turned`` (3, 3).
+    """Return the turn rates (N,) about the robot's z axis from the ``rates`` (N, 3) about the axes of a sensor, in the same unit.
 
-    InputError if a rate that is needed is not finite.
+    ``turned`` (3, 3): the rotation from the sensor frame to the robot frame. ``source``, ``rows`` (N,): the file and the row
+    numbers for errors. Raises InputError if a rate that contributes is not finite.
     """
     needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
     for i in needed.tolist():

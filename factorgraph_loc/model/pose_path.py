@@ -1,4 +1,4 @@
-"""Poses with absolute times, as in files, bags and messages; exchange of trajectories as arrays and tables."""
+"""Sequences of three-dimensional poses with absolute times, and conversion of trajectories to and from arrays and tables."""
 
 from __future__ import annotations
 
@@ -19,15 +19,18 @@ from factors.se2 import Array, Integers
 if TYPE_CHECKING:
     import polars as pl
 
-_FLAT = 1e-9  # m and sines within which poses are planar
+_FLAT = 1e-9  # differences of heights [m] and sines of tilts up to which poses are planar
 
 
 class Exchange:
-    """The common base of trajectories that are made from arrays and tables, with times in seconds."""
+    """The base class of trajectories: conversion to and from arrays and tables, with times in seconds."""
 
     @classmethod
     def from_numpy(cls, table: Array) -> Self:
-        """A trajectory from an array with a row for each pose, as :meth:`to_numpy` returns it. InputError if it is none."""
+        """Return a trajectory from an array with the columns of :meth:`to_numpy`, one row per pose.
+
+        Raises InputError if the shape is wrong, or if the times do not increase.
+        """
         rows = np.asarray(table, dtype=float)
         columns = cls._columns()
         if rows.ndim != 2 or rows.shape[1] != len(columns):
@@ -38,20 +41,24 @@ class Exchange:
 
     @abstractmethod
     def to_numpy(self) -> Array:
-        """The poses as an array (N, 4) or (N, 8), one row per pose: the time t [s] first, then the pose. The columns are those of
-        the subclass."""
+        """Return the poses as an array, one row per pose: the time t [s] first, then the pose.
+
+        The shape is (N, 4) for planar poses and (N, 8) for poses with quaternions.
+        """
 
     @classmethod
     def from_polars(cls, table: pl.DataFrame) -> Self:
-        """A trajectory from the columns that :meth:`to_polars` gives; others are ignored. InputError if one is missing, or has
-        values that are no numbers."""
+        """Return a trajectory from a table with the columns of :meth:`to_polars`. Other columns are ignored.
+
+        Raises InputError if a column is missing, or if it has values that are not numbers.
+        """
         if missing := [name for name in cls._columns() if name not in table.columns]:
             raise InputError(f"the table has no column {missing[0]}, expected {', '.join(cls._columns())}")
         return cls.from_numpy(numbers(table, cls._columns()))
 
     def to_polars(self) -> pl.DataFrame:
-        """The poses as a table with the columns of :meth:`to_numpy`, one row per pose."""
-        import polars as pl  # noqa: PLC0415 - most users of trajectories need none
+        """Return the poses as a table with the columns of :meth:`to_numpy`, one row per pose."""
+        import polars as pl  # noqa: PLC0415 - most users of trajectories do not need polars
 
         return pl.DataFrame(self.to_numpy(), schema=list(self._columns()))
 
@@ -63,28 +70,31 @@ class Exchange:
     @classmethod
     @abstractmethod
     def _of_rows(cls, rows: Array) -> Self:
-        """The trajectory with these rows, as of :meth:`to_numpy`."""
+        """Return the trajectory with these ``rows``, whose columns are those of :meth:`to_numpy`."""
 
     @abstractmethod
     def _tum(self) -> Iterator[str]:
-        """The poses as rows of a TUM file without times."""
+        """Yield the text of each pose in a TUM file, without its time."""
 
 
 def numbers(table: pl.DataFrame, names: Iterable[str]) -> Array:
-    """Columns of a table as an array (N, K). InputError for one with values that are no numbers."""
+    """Return the K columns ``names`` of a table as an array (N, K). Raises InputError if a value is not a number."""
     import polars as pl  # noqa: PLC0415
 
     columns = []
     for name in names:
         column = table[name]
         if not column.dtype.is_numeric() or column.null_count():
-            raise InputError(f"column {name} has values that are no numbers, expected numbers alone")
+            raise InputError(f"column {name} has values that are not numbers, expected only numbers")
         columns.append(column.cast(pl.Float64).to_numpy())
     return np.column_stack(columns)
 
 
 def require_times(name: str, t: Array | Integers) -> None:
-    """InputError for the first pose whose time, in seconds or nanoseconds, is not after that of the pose before."""
+    """Raise InputError at the first pose whose time is not after the time of the pose before.
+
+    ``t`` (N,): times in seconds, or integers in nanoseconds. ``name``: named in the error.
+    """
     if len(stuck := np.flatnonzero(~(np.diff(t) > 0))):
         i = int(stuck[0]) + 1
         unit = "ns" if np.issubdtype(t.dtype, np.integer) else "s"
@@ -93,10 +103,11 @@ def require_times(name: str, t: Array | Integers) -> None:
 
 @dataclass(frozen=True)
 class PosePath(Exchange):
-    """A sequence of poses: ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3) in a world frame.
+    """A sequence of three-dimensional poses in a world frame.
 
-    ``t_ns`` (N,): absolute times [ns], strictly increasing, or None if only the order of the poses is known. ``has_rotations`` is
-    False if the rotations are meaningless. ``warnings``: one line for each problem that a reader corrected.
+    ``name``: the name in errors. ``positions`` (N, 3) [m]. ``rotations`` (N, 3, 3). ``t_ns`` (N,): absolute times [ns], strictly
+    increasing, or None if only the order of the poses is known. ``has_rotations``: False if the rotations are meaningless.
+    ``warnings``: problems that a reader corrected.
     """
 
     name: str
@@ -111,28 +122,30 @@ class PosePath(Exchange):
 
     @property
     def is_planar(self) -> bool:
-        """Whether all poses have one height and stand upright."""
+        """True if all poses have the same height and are not tilted."""
         return bool(np.ptp(self.positions[:, 2]) <= _FLAT and np.all(np.abs(self.rotations[:, 2, :2]) <= _FLAT))
 
     def stamps(self) -> Integers:
-        """The times (N,) [ns]; InputError if they are unknown, as in KITTI files, or do not increase."""
+        """Return the times (N,) [ns]. Raises InputError if they are unknown, as in KITTI files, or if they do not increase."""
         if self.t_ns is None:
             raise InputError(f"{self.name}: has poses without times, expected poses with times")
         require_times(self.name, self.t_ns)
         return self.t_ns
 
     def seconds(self) -> Array:
-        """The times (N,) in seconds since 1970, each the float nearest to it. InputError as in :meth:`stamps`."""
+        """Return the times (N,) in seconds since 1970, rounded to the nearest float. Raises InputError as :meth:`stamps` does."""
         return np.array([t / 10**9 for t in self.stamps().tolist()])
 
     def rows(self, which: Integers) -> PosePath:
-        """The poses with indices ``which``."""
+        """Return the poses with the indices ``which``."""
         t_ns = None if self.t_ns is None else self.t_ns[which]
         return replace(self, positions=self.positions[which], rotations=self.rotations[which], t_ns=t_ns)
 
     def at(self, t_ns: Integers) -> PosePath:
-        """The poses at times ``t_ns`` (M,), which must lie between the first and the last. Positions are interpolated linearly,
-        rotations by slerp."""
+        """Return the poses at times ``t_ns`` (M,) [ns], which must lie between the first and the last time.
+
+        Positions are interpolated linearly, rotations by spherical linear interpolation.
+        """
         if len(self) == 1:
             return replace(self.rows(np.zeros(len(t_ns), dtype=np.int64)), t_ns=t_ns)
         own, t = (checks.seconds(stamps, int(self.stamps()[0])) for stamps in (self.stamps(), t_ns))
@@ -142,25 +155,25 @@ class PosePath(Exchange):
         return replace(self, positions=positions, rotations=rotations, t_ns=t_ns)
 
     def on_floor(self, warnings: list[Notice], turned: Turned = AS_IT_IS) -> Array:
-        """Planar poses (N, 3): see :func:`~factorgraph_loc.model.planar.on_floor`."""
+        """Return planar poses (N, 3), see :func:`~factorgraph_loc.model.planar.on_floor`."""
         return on_floor(self.name, self.positions, self.rotations if self.has_rotations else None, warnings, turned)
 
     def headings(self) -> Array:
-        """The directions (N,) of the x axis, from above."""
+        """Return the headings (N,) [rad], the directions of the x axis in the horizontal plane."""
         return np.arctan2(self.rotations[:, 1, 0], self.rotations[:, 0, 0])
 
     def seen_from_above(self) -> PosePath:
-        """The same poses at height 0, turned about the vertical axis only."""
+        """Return the poses at height 0, with rotations about the vertical axis only."""
         return replace(self, positions=self.positions * (1.0, 1.0, 0.0), rotations=upright(self.headings()))
 
     def quaternions(self) -> Array:
-        """The rotations as quaternions (N, 4): x, y, z, w, with w at least 0."""
+        """Return the rotations as quaternions (N, 4) in the order x, y, z, w, with w >= 0."""
         if not len(self):
             return np.empty((0, 4))
         return np.asarray(scipy.spatial.transform.Rotation.from_matrix(self.rotations).as_quat(canonical=True))
 
     def to_numpy(self) -> Array:
-        """The poses as an array (N, 8): t [s since 1970], x, y, z [m], and the quaternion x, y, z, w."""
+        """Return the poses as an array (N, 8): t [s since 1970], x, y, z [m], and the quaternion x, y, z, w."""
         return np.column_stack((self.seconds(), self.positions, self.quaternions()))
 
     @classmethod
@@ -179,7 +192,7 @@ class PosePath(Exchange):
 
 
 def require_poses(path: PosePath) -> None:
-    """InputError if there are no poses, or one is not finite."""
+    """Raise InputError if a path has no poses, or if a pose is not finite."""
     if not len(path):
         raise InputError(f"{path.name}: contains no poses, expected at least one")
     known = np.isfinite(path.positions).all(axis=1) & np.isfinite(path.rotations).all(axis=(1, 2))
@@ -188,7 +201,7 @@ def require_poses(path: PosePath) -> None:
 
 
 def upright(headings: Array) -> Array:
-    """Rotations (N, 3, 3) by ``headings`` (N,) about the vertical axis."""
+    """Return the rotations (N, 3, 3) about the vertical axis by ``headings`` (N,) [rad]."""
     out = np.zeros((len(headings), 3, 3))
     out[:, 0, 0] = out[:, 1, 1] = np.cos(headings)
     out[:, 1, 0] = np.sin(headings)

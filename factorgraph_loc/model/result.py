@@ -16,11 +16,13 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Detections of one sensor that were observed and predicted, in G groups of measurements.
+    """A comparison of observed and predicted detections of one sensor, to judge its model. Measurements are in G groups.
 
-    ``what``: plural of the detections; ``groups`` (G,): their names; ``observed``, ``predicted`` and ``sigma`` (G,): counts, and
-    the standard deviation of the observed one for a correct model, with the correlation of successive measurements.
-    ``overdispersion``: number of measurements that contain the information of one independent one.
+    ``what``: the plural name of the detections. ``groups`` (G,): names of the groups.
+    ``observed``, ``predicted`` (G,): counts of detections.
+    ``sigma`` (G,): standard deviation of the observed count if the model is correct. It accounts for the correlation of successive
+    measurements.
+    ``overdispersion``: number of correlated measurements that have the information of one independent measurement.
     """
 
     what: str
@@ -33,13 +35,16 @@ class Reliability:
 
 @dataclass(frozen=True)
 class Timings:
-    """Wall-clock times.
+    """Computing times and memory of a run.
 
-    ``update_t`` (M,) [s from the log's start]: timestamps with an exteroceptive measurement; ``update_ms`` (M,): time of each
-    update, including the following ``estimate()``. ``causal_seconds``: the whole causal loop, including odometry and ticks;
-    ``real_time_factor``: the log's duration divided by that. ``final_seconds``: time to compute the final trajectory.
-    ``peak_memory_mb``: peak resident memory of the process so far, in 10^6 bytes. ``frontend_seconds``: time to detect the
-    features of ``images``, or to load them from the cache, before the loop.
+    ``update_t`` (M,): timestamps with an exteroceptive measurement [s from the start of the log].
+    ``update_ms`` (M,): computing time of each of these updates and of the estimate that follows [ms].
+    ``causal_seconds``: computing time of all measurements and causal estimates [s].
+    ``real_time_factor``: the duration of the log divided by ``causal_seconds``.
+    ``final_seconds``: computing time of the final trajectory [s].
+    ``peak_memory_mb``: peak resident memory of the process so far [10^6 bytes].
+    ``images``: number of images. ``frontend_seconds``: time to detect their features before the run, or to load them from the cache
+    [s].
     """
 
     update_t: Array
@@ -56,10 +61,11 @@ class Timings:
 class RunResult:
     """The result of one estimator on one log.
 
-    ``config``: the effective configuration, enough to repeat the run. ``t`` (N,), ``poses`` (N, 3), ``covariances`` (N, 3, 3) in
-    the world frame, ``status`` (N): the causal estimates at the ticks. ``doubts_model`` (N): whether measurements contradicted
-    the model of their sensor. ``final``: the estimate from the whole log. ``reliability``: of the sensors' models on this log, by
-    sensor.
+    ``log``: the name of the log. ``config``: the effective configuration, enough to repeat the run.
+    ``t`` (N,) [s], ``poses`` (N, 3), ``covariances`` (N, 3, 3), ``status`` (N): the causal estimates, in the world frame.
+    ``final``: the trajectory that is estimated from the whole log. ``learnt``: estimates other than poses.
+    ``reliability``: by sensor, a comparison of observed and predicted detections.
+    ``doubts_model`` (N): True where measurements contradicted the model of their sensor.
     """
 
     log: str
@@ -82,16 +88,16 @@ class RunResult:
 
     @property
     def max_gap(self) -> float:
-        """The longest time [s] between estimates across which scoring interpolates."""
+        """The longest time [s] between two estimates between which scoring interpolates."""
         return float(self.config.get("max_gap", MAX_GAP))
 
     def first_localized(self) -> int | None:
-        """Index of the first causal estimate that is localized, or None if none is."""
+        """Return the index of the first causal estimate with status ``localized``. Returns None if there is none."""
         localized = np.flatnonzero(np.array(self.status) == "localized")
         return int(localized[0]) if len(localized) else None
 
     def causal(self) -> Trajectory | None:
-        """The causal estimates from the first localized one, or None if there is none."""
+        """Return the causal estimates from the first localized one on. Returns None if no estimate is localized."""
         first = self.first_localized()
         if first is None:
             return None

@@ -1,7 +1,6 @@
-"""The robot's sensors with their mounting and noise, read from and written to ``NAME.rig.toml``.
+"""The rig: a robot's sensors with their mounting and noise, as in a file ``NAME.rig.toml``.
 
-Each sensor has its own section, registered by its package. Descriptions state units; bounds reject wrong units (degrees for
-radians, mm for m).
+Each sensor has its own section, which its package registers. Bounds of values reject wrong units (degrees for radians, mm for m).
 """
 
 from __future__ import annotations
@@ -23,9 +22,11 @@ S = TypeVar("S", bound=FileModel)
 
 
 class Rig(FileModel):
-    """A robot: the sensors that estimators use by default, and the settings of each as an attribute with the section's name, None
-    if the robot lacks the sensor. Several sensors of a kind are a table of settings by name; ``bearing_range.front`` is the name of
-    one of them. Among ``sensors``, the name of a kind stands for all of it."""
+    """A robot and its sensors. The settings of a sensor are an attribute with the name of its section, None if the robot lacks it.
+
+    Several sensors of a kind are a table of settings by name. ``bearing_range.front`` is then the name of one of them. In
+    ``sensors``, the name of a kind stands for all sensors of that kind.
+    """
 
     name: str = "rig"
     """name of the robot"""
@@ -43,7 +44,7 @@ class Rig(FileModel):
         return self
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with updated values; a name with a dot is that of one of several sensors."""
+        """Return a copy with updated values. A name with a dot, ``bearing_range.front``, updates one of several sensors."""
         changed = dict(update or {})
         for name in [name for name in changed if kind_of(name) != name]:
             kind, _, own = name.partition(".")
@@ -51,53 +52,59 @@ class Rig(FileModel):
         return super().model_copy(update=changed, deep=deep)
 
     def section(self, name: str) -> Any:
-        """The settings in a section, ``bearing_range.front`` for one of several; None if the rig lacks it."""
+        """Return the settings in a section, or of one of several sensors (``bearing_range.front``). None if the rig lacks it."""
         return by_name(kind_of(name), getattr(self, kind_of(name), None)).get(name)
 
     def names(self, section: str) -> tuple[str, ...]:
-        """The names of the sensors with settings in a section."""
+        """Return the names of all sensors with settings in a section."""
         return tuple(by_name(section, getattr(self, section, None)))
 
     def expanded(self, sensors: Iterable[str]) -> tuple[str, ...]:
-        """``sensors`` with all names of several sensors in place of that of their kind."""
+        """Return the names ``sensors``, where the name of a kind is replaced by the names of all its sensors in the rig."""
         return tuple(dict.fromkeys(each for name in sensors for each in self.names(name) or (name,)))
 
     def alone(self, sensor: str) -> Self:
-        """The rig with one of several sensors as the only one of its kind; unchanged for a name without a dot."""
+        """Return the rig without the other sensors of the same kind as ``sensor``, which gets the name of the kind.
+
+        Example: ``bearing_range.front`` becomes ``bearing_range``. A name without a dot returns the rig unchanged.
+        """
         if kind_of(sensor) == sensor:
             return self
         sensors = tuple(as_only(self.sensors, sensor))
         return self.model_copy(update={kind_of(sensor): self.section(sensor), "sensors": sensors})
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
-        """The settings of class ``kind``, or None; ``section`` selects one if several have the same class."""
+        """Return the settings of class ``kind``, or None if the rig lacks them.
+
+        ``section`` is needed if several sections have this class.
+        """
         settings: S | None = self.section(section or _SECTIONS[kind])
         return settings
 
     def of(self, kind: type[S], section: str | None = None) -> S:
-        """As :meth:`find`; InputError if the rig lacks the section."""
+        """Return the settings of class ``kind``, as :meth:`find` does. Raises InputError if the rig lacks them."""
         settings = self.find(kind, section)
         if settings is None:
             raise InputError(f"the rig {self.name} has no [{section or _SECTIONS[kind]}]")
         return settings
 
     def estimated(self, section: str) -> Estimated:
-        """The constants of a sensor that are estimated; none if the rig lacks the sensor."""
+        """Return the constants of a sensor that estimators estimate. There are none if the rig lacks the sensor."""
         settings = self.section(section)
         return settings.estimated() if isinstance(settings, SensorSettings) else NOTHING
 
     def time_offset(self, channel: str) -> float:
-        """Seconds to add to the timestamps of a channel."""
+        """Return the seconds to add to the timestamps of a stream. ``channel``: the name of the stream."""
         kind = kind_of(channel)
         settings = self.section(_CLOCKS.get(kind, "") + channel.removeprefix(kind))
         return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0
 
     def placed(self, folder: Path) -> Self:
-        """A copy whose file references are relative to ``folder``."""
+        """Return a copy in which the names of files, such as those of learnt grids, are relative to ``folder``."""
         return self.model_copy(update={name: settings.placed(folder) for name, settings in self._of_sensors().items()})
 
     def write_beside(self, folder: Path) -> None:
-        """Write the files that the rig refers to into ``folder``."""
+        """Write the files that the rig names, such as learnt grids, into ``folder``."""
         for settings in self._of_sensors().values():
             settings.write_beside(folder)
 
@@ -112,7 +119,7 @@ _CLOCKS = sections_of_channels()
 
 
 def _type_of(name: str, section: Section) -> tuple[Any, Any]:
-    """The type of a section, and its default."""
+    """Return the type of a section's settings, and their default."""
     kind = _KINDS[name]
     if section.always:
         return kind, kind()

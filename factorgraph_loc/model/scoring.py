@@ -1,6 +1,7 @@
-"""The configuration of a run, and its ticks: a grid of 10 Hz from its start, except in long gaps between measurements.
+"""The configuration of a run, and its ticks, the times of the recorded estimates.
 
-Importable without numerical libraries.
+Ticks are a grid of 10 Hz from the start of a run, except in long gaps between measurements. This module imports no numerical
+libraries, so that the command line starts quickly.
 """
 
 import math
@@ -11,9 +12,9 @@ from typing import Any, Literal
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
 
-KINDS = ("causal", "final")  # of the estimates of a run
-MAX_GAP = 0.5  # s between estimates across which scoring interpolates
-MAX_DIFF = 0.01  # s between stamps that are taken for one
+KINDS = ("causal", "final")  # kinds of estimates of a run
+MAX_GAP = 0.5  # s: longest time between two estimates between which scoring interpolates
+MAX_DIFF = 0.01  # s: largest difference of two timestamps that scoring treats as equal
 Alignment = Literal["none", "origin", "se2", "yaw", "se3", "sim3"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "yaw", "se3", "sim3")
 Association = Literal["nearest", "interpolate"]
@@ -24,19 +25,21 @@ RATE = 10  # Hz
 TICK_GAP = 60.0  # s; gaps without measurements above this length have no ticks
 SHORTEST, LONGEST = 1.0, 86400.0  # s; bounds of the setting
 MOST_SEEDS = 10_000
-LARGEST_SEED = 2**63 - 1  # as in tables
-TOLERANCE = 1e-6  # fraction of a tick, for rounding at the last measurement
+LARGEST_SEED = 2**63 - 1  # the largest integer that a table of results can store
+TOLERANCE = 1e-6  # fraction of a tick by which a tick may follow the last measurement, for rounding
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """The configuration of a run on a log.
 
-    ``estimator``: its registered name; ``settings``: overrides of its settings. ``sensors``: names of the streams it may use,
-    None for those of the rig; ``rssi`` and ``phase`` are optional parts of the reads of ``rfid``. ``prior``: see
-    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: of the estimator's random generator. ``max_gap``
-    [s]: the largest interval between estimates that is interpolated for scoring. ``tick_gap`` [s]: there are no estimates inside
-    longer gaps between measurements. ``align``: also score after this alignment with the reference. Scoring changes no estimate.
+    ``estimator``: the name of the estimator. ``settings``: overrides of its default settings.
+    ``sensors``: names of the sensors to use, None for those in the rig; ``rssi`` and ``phase`` are optional parts of ``rfid``.
+    ``prior``: the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
+    ``seed``: the seed of the estimator's random generator.
+    ``max_gap``: the longest time between two estimates between which scoring interpolates [s].
+    ``tick_gap``: the longest gap between measurements in which estimates are recorded [s].
+    ``align``: an alignment with the reference, after which scores are computed again. Estimates do not change.
     """
 
     estimator: str
@@ -50,25 +53,25 @@ class RunConfig:
 
 
 def check_max_gap(max_gap: float) -> None:
-    """InputError if ``max_gap`` is not positive."""
+    """Raise InputError if ``max_gap`` [s] is not positive and finite."""
     if not 0.0 < max_gap < math.inf:
         raise InputError(f"max_gap is {max_gap:g}, expected a time above 0 s")
 
 
 def check_tick_gap(gap: float) -> None:
-    """InputError if ``gap`` is out of bounds."""
+    """Raise InputError if ``gap`` [s], the setting ``tick_gap``, is out of bounds."""
     if not SHORTEST <= gap <= LONGEST:
         raise InputError(f"tick_gap is {gap:g}, expected {SHORTEST:g} to {LONGEST:g} s")
 
 
 def check_prior(prior: str | None) -> None:
-    """InputError for a text that is no start of a run on any log."""
+    """Raise InputError if ``prior`` is neither the name of a start, such as ``reference``, nor a pose ``X,Y,HEADING``."""
     if prior is not None and prior not in NAMED_PRIORS:
         parse_position(prior)
 
 
 def parse_position(prior: str) -> list[float]:
-    """Position [m], and the heading [rad] if it is given, of a start ``X,Y`` or ``X,Y,HEADING``. InputError if it is neither."""
+    """Return the numbers of a start ``X,Y`` or ``X,Y,HEADING``, in m and rad. Raises InputError if the text is neither."""
     from factorgraph_loc.files.models import FARTHEST  # noqa: PLC0415 - imports pydantic
 
     try:
@@ -83,7 +86,10 @@ def parse_position(prior: str) -> list[float]:
 
 
 def parse_seeds(text: str, source: object = "--seeds") -> range:
-    """Parse ``0:10`` as the seeds 0 to 9, ``3`` as the seed 3. Raises InputError with ``source``."""
+    """Return the seeds in a text: ``0:10`` gives the seeds 0 to 9, ``3`` the seed 3.
+
+    Raises InputError if the text is invalid. ``source``: the option to name in the error.
+    """
     first, colon, end = text.partition(":")
     try:
         seeds = range(int(first), int(end) if colon else int(first) + 1)
@@ -97,10 +103,10 @@ def parse_seeds(text: str, source: object = "--seeds") -> range:
 
 
 class Ticks:
-    """The ticks of a run that starts at ``start``, generated as measurements arrive.
+    """The ticks of a run, the times of the recorded estimates, generated while measurements arrive.
 
-    A tick follows all measurements that arrived up to its time. Gaps of more than ``gap`` [s] between measurements (of all
-    sensors) have no ticks; the grid continues after them. So the cost of a gap does not grow with its length.
+    ``start``: time of the first tick [s]. A tick follows all measurements up to its time. A gap of more than ``gap`` [s] between
+    measurements has no ticks, so that the cost of a gap does not grow with its length. The grid continues after the gap.
     """
 
     def __init__(self, start: float, gap: float = TICK_GAP) -> None:
@@ -112,19 +118,19 @@ class Ticks:
 
     @property
     def seconds(self) -> float:
-        """Time since the start, without gaps."""
+        """The time from the start to the newest measurement without the skipped gaps [s]."""
         return self._newest - self._start - sum(end - begin for begin, end in self.skipped)
 
     @property
     def due(self) -> float:
-        """When the next tick is."""
+        """The time of the next tick [s]."""
         return self._start + self._next / RATE
 
     def advance(self, t: float) -> Iterable[float]:
-        """Advance to the next measurement, at ``t``: yields the ticks before it that were not yielded yet."""
+        """Advance to the next measurement, at time ``t`` [s]. Returns the ticks before it that were not returned yet."""
         if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:
             self._newest = t
-            return ()  # the usual case for odometry
+            return ()  # the most frequent case, which must be fast
         return self._pass(t)
 
     def _pass(self, t: float) -> Iterator[float]:
@@ -132,7 +138,7 @@ class Ticks:
             yield from self.rest()
             self.skipped.append((self._newest, t))
             self._next = max(self._next, math.floor((t - self._start) * RATE) - 1)
-            for _ in range(3):  # find the first tick that is not before `t` despite rounding
+            for _ in range(3):  # find the first tick that is not before `t`, in spite of rounding
                 self._next += self._start + self._next / RATE < t
         self._newest = max(self._newest, t)
         while (tick := self._start + self._next / RATE) < t:
@@ -141,7 +147,7 @@ class Ticks:
             yield tick
 
     def rest(self) -> Iterator[float]:
-        """The ticks up to the newest measurement."""
+        """Yield the remaining ticks up to the newest measurement."""
         last = math.floor((self._newest - self._start) * RATE + TOLERANCE)
         while self._next <= last:
             tick = self._start + self._next / RATE

@@ -1,6 +1,6 @@
-"""The rig sections and world layers that sensors register.
+"""Sections of a rig and layers of a map, which the packages of sensors register.
 
-Classes and functions are given as places, ``package.module:name``, and loaded when they are first used.
+Classes and functions are registered as texts ``package.module:name``, and loaded when they are first used.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,9 +15,13 @@ from factorgraph_loc.text import plain
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a rig. ``kind``: its class, a :class:`~factorgraph_loc.files.models.FileModel`; ``always``: whether a rig
-    without the section gets the default one. ``several``: whether a rig may have several such sensors by name,
-    ``[section.NAME]``. Their channel, its only table and the modality of its measurements have the name of the section then."""
+    """A section of a rig.
+
+    ``kind``: the class of its settings, a :class:`~factorgraph_loc.files.models.FileModel`.
+    ``always``: True if a rig without the section gets the default settings.
+    ``several``: True if a rig may have several such sensors by name, ``[section.NAME]``. Their stream, its only table and the
+    modality of the measurements must then have the name of the section.
+    """
 
     kind: Place
     always: bool = False
@@ -26,11 +30,15 @@ class Section:
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of a world: elements by name. ``kind``: the class of an element, a
-    :class:`~factorgraph_loc.files.models.FileModel`; ``table``: the description of a table that may hold many of them.
+    """A layer of a map: elements of one class by name, such as RFID tags.
 
-    ``read``: ``(content, source, folder) -> elements`` converts the content of a world file in ``folder``, such as the name of a
-    table. ``write``: ``(elements, path of the world file without suffixes) -> content``, or None. ``suffix``: of these tables.
+    ``kind``: the class of an element, a :class:`~factorgraph_loc.files.models.FileModel`.
+    ``table``: the description of a table with many elements.
+    ``read``: a function ``(content, source, folder) -> elements`` that converts the value in a world file, such as the name of a
+    table in ``folder``.
+    ``write``: a function ``(elements, path of the world file without suffixes) -> content``. It may write a table and returns the
+    value in the world file, or None to keep the elements there.
+    ``suffix``: the suffix of these tables.
     """
 
     kind: Place
@@ -42,8 +50,10 @@ class Layer:
 
 @cache
 def registered() -> Mapping[str, Any]:
-    """The registered sensors by name, each a :class:`~factorgraph_loc.sensors.registry.SensorType`, built-in ones first.
-    InputError if one cannot be loaded or two share a name."""
+    """Return the registered sensors by name, each a :class:`~factorgraph_loc.sensors.registry.SensorType`, built-in ones first.
+
+    Raises InputError if a sensor cannot be loaded, or if two sensors have the same channel, section or layer.
+    """
     known = dict(SENSORS)
     owners: dict[tuple[str, str], str] = {}
     for name, sensor in known.items():
@@ -56,34 +66,37 @@ def registered() -> Mapping[str, Any]:
 
 
 def sections() -> dict[str, Section]:
-    """The sections of a rig by name in the order of its file; those without a channel are last."""
+    """Return the sections of a rig by name, in the order of its file. Sections of sensors without measurements are last."""
     by_name = {name: section for sensor in registered().values() for name, section in sensor.settings.items()}
     used = set(sections_of_channels().values())
     return {name: by_name[name] for name in sorted(by_name, key=lambda name: name not in used)}
 
 
 def sections_of_channels() -> dict[str, str]:
-    """The rig section of each channel."""
+    """Return the section of the rig that belongs to each channel, the stream of measurements of a sensor."""
     return {channel.name: channel.section for sensor in registered().values() for channel in sensor.channels}
 
 
 @cache
 def several() -> frozenset[str]:
-    """The kinds of sensors that a rig may have several times, each with a name."""
+    """Return the kinds of sensors of which a rig may have several, each with a name."""
     return frozenset(name for name, section in sections().items() if section.several)
 
 
 def kind_of(name: str) -> str:
-    """The section or channel of a sensor by its name: ``bearing_range`` of ``bearing_range.front``."""
+    """Return the kind of a sensor, the part of its name before the dot: ``bearing_range`` for ``bearing_range.front``."""
     return name.partition(".")[0]
 
 
 def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
-    """``names`` without the other sensors of the kind of ``chosen``, by new names: ``chosen`` has the name of its kind."""
+    """Return the ``names`` of sensors without the others of the kind of ``chosen``. The keys are their new names.
+
+    The new name of ``chosen`` is the name of its kind. Other names do not change.
+    """
     kind = kind_of(chosen)
     return {kind if name == chosen else name: name for name in names if name == chosen or kind_of(name) != kind}
 
 
 def layers() -> dict[str, Layer]:
-    """The layers of a world by name."""
+    """Return the layers of a map by name."""
     return {name: layer for sensor in registered().values() for name, layer in sensor.layers.items()}

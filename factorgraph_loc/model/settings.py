@@ -1,6 +1,6 @@
-"""Types of settings of sensors: bounded numbers with units, constants that are estimated, and the base class.
+"""Types for the settings of sensors: bounded numbers with units, estimated constants, and the base class of sections of a rig.
 
-The bounds reject values in a wrong unit (degrees for radians, mm for m).
+Bounds reject values in a wrong unit (degrees for radians, mm for m).
 """
 
 from __future__ import annotations
@@ -47,7 +47,10 @@ Covariance = Annotated[tuple[Variance, Variance, Variance], AfterValidator(_posi
 
 
 def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Array:
-    """The covariance (2, 2) [m^2] of a position, from (xx, xy, yy) if given, else from the standard deviation ``sigma`` [m]."""
+    """Return the covariance (2, 2) [m^2] of a position, from ``covariance`` (xx, xy, yy) or the standard deviation ``sigma`` [m].
+
+    ``sigma`` is used if ``covariance`` is None.
+    """
     if covariance is None:
         return sigma**2 * np.eye(2)
     xx, xy, yy = covariance
@@ -56,9 +59,10 @@ def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Ar
 
 @dataclass(frozen=True)
 class Estimated:
-    """The constants of a sensor that are estimated, as corrections to the rig's values.
+    """The P calibration constants of a sensor that are estimated, as corrections to the values in the rig.
 
-    ``names`` (P,): their names; ``indices`` (P,): their indices among all constants; ``sigmas`` (P,): prior standard deviations.
+    ``names`` (P,): their names. ``indices`` (P,): their indices among all constants of the sensor. ``sigmas`` (P,): their prior
+    standard deviations.
     """
 
     names: tuple[str, ...]
@@ -67,17 +71,20 @@ class Estimated:
 
     @staticmethod
     def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
-        """Those of ``names`` whose uncertainty is above zero."""
+        """Return the constants among ``names`` whose standard deviation in ``uncertainty`` is above zero."""
         return Estimated.among(names, np.array([getattr(uncertainty, name, 0.0) for name in names]))
 
     @staticmethod
     def among(names: Sequence[str], sigmas: Array) -> Estimated:
-        """Those of ``names`` (P,) whose ``sigmas`` (P,) are above zero."""
+        """Return the constants among ``names`` (M,) whose ``sigmas`` (M,) are above zero."""
         indices = tuple(np.flatnonzero(sigmas).tolist())
         return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
 
     def full(self, values: Array, count: int) -> Array:
-        """``values`` (..., P) inserted among all ``count`` constants; the others are zero."""
+        """Return an array (..., count) of all constants of the sensor, with the ``values`` (..., P) of the estimated ones.
+
+        The values of other constants are zero.
+        """
         out = np.zeros((*np.shape(values)[:-1], count))
         out[..., list(self.indices)] = values
         return out
@@ -87,27 +94,29 @@ NOTHING = Estimated((), (), np.zeros(0))
 
 
 class SensorSettings(FileModel):
-    """The section of a sensor in a rig. ``constants``: names of the calibration constants that may be estimated; the section's
-    ``uncertainty`` holds their standard deviations."""
+    """The base class of the section of a sensor in a rig. ``constants``: names of calibration constants that may be estimated.
+
+    The key ``uncertainty`` of the section has their standard deviations.
+    """
 
     constants: ClassVar[tuple[str, ...]] = ()
     time_offset: Seconds = 0.0
-    """added to the timestamps"""
+    """added to the timestamps of the sensor"""
 
     def estimated(self) -> Estimated:
-        """The constants that are estimated."""
+        """Return the constants that are estimated, those with an uncertainty above zero."""
         return Estimated.of(self.constants, getattr(self, "uncertainty", None))
 
     def map_error(self, world: World) -> Callable[[Array], Array] | None:
-        """The error of the sensor's map: covariances (N, 3, 3) of (x, y, heading) of its frame at poses (N, 3).
+        """Return a function for the error of the sensor's map. Returns None if the frame of the map is exact.
 
-        None if the map is exact.
+        From poses (N, 3) the function computes covariances (N, 3, 3) of (x, y, heading), the error of the map's frame there.
         """
         return None
 
     def placed(self, folder: Path) -> Self:
-        """A copy whose file references are relative to ``folder``, which holds the rig's file."""
+        """Return a copy in which names of files are relative to ``folder``, the folder of the rig's file."""
         return self
 
     def write_beside(self, folder: Path) -> None:
-        """Write the files that the settings refer to into ``folder``, which holds the rig's file."""
+        """Write the files that the settings name into ``folder``, the folder of the rig's file."""

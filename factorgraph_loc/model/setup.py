@@ -1,4 +1,7 @@
-"""The common arguments of all estimators, and the frame of their map, whose error all estimates in it have in common."""
+"""The common arguments of all estimators, and the frame of their map.
+
+If a map was made without a reference, its frame has an error that all estimates in the map share.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Setup:
-    """The common arguments of all estimators: robot, map, usable sensors, and a random generator of their own."""
+    """The common arguments of all estimators: the robot, the map, the names of the sensors to use, and a random generator."""
 
     rig: Rig
     world: World
@@ -27,27 +30,31 @@ class Setup:
     rng: np.random.Generator
 
     def alone(self, sensor: str) -> Setup:
-        """The arguments with one of several sensors as the only one of its kind (:meth:`~factorgraph_loc.model.rig.Rig.alone`);
-        unchanged for an empty name."""
+        """Return the arguments without the other sensors of the same kind as ``sensor``, see
+        :meth:`~factorgraph_loc.model.rig.Rig.alone`."""
         return replace(self, rig=self.rig.alone(sensor), sensors=tuple(as_only(self.sensors, sensor)))
 
 
 MapUse = Literal["known", "extended", "unknown"]
-# which uncertain constants an estimator learns: all, those that may differ between particles, or none
+# which uncertain calibration constants an estimator estimates: all, those that may differ between particles, or none
 Calibration = Literal["all", "particles", "none"]
 
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Moves estimates between the frame of a map and the world. ``error``: the covariances (N, 3, 3) of (x, y, heading) of the
-    map's frame at poses (N, 3); None if the map is exact."""
+    """Converts estimates between the frame of a map and the world frame, by adding the covariance of the error of the map's frame.
+
+    ``error``: a function from poses (N, 3) to covariances (N, 3, 3) of (x, y, heading) of that error. None if the map is exact.
+    """
 
     error: Callable[[Array], Array] | None = None
 
     @classmethod
     def of(cls, setup: Setup, modalities: Container[str], landmarks: MapUse) -> MapFrame:
-        """The frame of a run, by the settings of its sensors. ``modalities``: those that the estimator uses; ``landmarks``: how it
-        uses the map."""
+        """Return the frame of the map of a run, from the settings of its sensors.
+
+        ``modalities``: the kinds of sensors that the estimator uses. ``landmarks``: how the estimator uses the map.
+        """
         for name in setup.sensors if landmarks != "unknown" else ():
             settings = setup.rig.section(name) if kind_of(name) in modalities else None
             error = settings.map_error(setup.world) if isinstance(settings, SensorSettings) else None
@@ -56,26 +63,26 @@ class MapFrame:
         return cls()
 
     def prior(self, prior: PosePrior) -> PosePrior:
-        """A start in the world, as one in the map."""
+        """Convert a start in the world frame to one in the frame of the map."""
         if self.error is None:
             return prior
         return replace(prior, covariance=prior.covariance + self.error(prior.pose[None])[0])
 
     def estimate(self, estimate: PoseEstimate) -> PoseEstimate:
-        """An estimate in the map, as one in the world."""
+        """Convert an estimate in the frame of the map to one in the world frame."""
         if self.error is None or estimate.status == "unlocalized":
             return estimate
         return replace(estimate, covariance=estimate.covariance + self.error(estimate.pose[None])[0])
 
     def belief(self, belief: Belief) -> Belief:
-        """The same of a belief; particles stay in the map."""
+        """Convert the modes of a belief to the world frame. Particles stay in the frame of the map."""
         if self.error is None:
             return belief
         modes = (replace(m, covariance=m.covariance + self.error(m.pose[None])[0]) for m in belief.modes)
         return replace(belief, modes=tuple(modes))
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """The same of a trajectory."""
+        """Convert a trajectory in the frame of the map to one in the world frame."""
         if self.error is None or trajectory.covariances is None or not len(trajectory):
             return trajectory
         return replace(trajectory, covariances=trajectory.covariances + self.error(trajectory.poses))

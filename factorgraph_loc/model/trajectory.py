@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Trajectory(Exchange):
-    """A planar trajectory: ``t`` (N,) seconds, strictly increasing; ``poses`` (N, 3) of the robot in the world; ``covariances``
-    (N, 3, 3) of (x, y, heading) in the world frame, or None. ``has_heading`` is False if the headings are meaningless."""
+    """A planar trajectory in the world frame.
+
+    ``t`` (N,): times [s], strictly increasing. ``poses`` (N, 3): x, y [m] and heading [rad] of the robot. ``covariances`` (N, 3, 3)
+    of (x, y, heading), or None. ``has_heading``: False if the headings are meaningless.
+    """
 
     t: Array
     poses: Array
@@ -43,23 +46,28 @@ class Trajectory(Exchange):
 
     @classmethod
     def of(cls, path: PosePath, t0_ns: int = 0) -> Self:
-        """The poses of a path, at times in seconds after ``t0_ns``, nanoseconds since 1970. InputError if it has no times, they do
-        not increase, or heights vary."""
+        """Return the planar poses of a path, at times in seconds after ``t0_ns`` [ns since 1970].
+
+        Raises InputError if the path has no times, if times do not increase, or if heights vary by metres.
+        """
         return cls(checks.seconds(path.stamps(), t0_ns), path.on_floor([]), has_heading=path.has_rotations)
 
     def path(self, name: str, t0_ns: int = 0) -> PosePath:
-        """The poses at height 0, with times that count from ``t0_ns``."""
+        """Return the poses as a :class:`PosePath` with that ``name``, at height 0. ``t0_ns``: absolute time of t = 0 [ns]."""
         headings = self.poses[:, 2] if self.has_heading else np.zeros(len(self))
         positions = np.column_stack((self.poses[:, :2], np.zeros(len(self))))
         return PosePath(name, positions, upright(headings), checks.absolute(self.t, t0_ns), self.has_heading)
 
     def rows(self, which: Integers | NDArray[np.bool_]) -> Self:
-        """The poses at indices ``which``, or where ``which`` (N,) is true."""
+        """Return the poses at the indices ``which``, or where the mask ``which`` (N,) is True."""
         covariances = None if self.covariances is None else self.covariances[which]
         return replace(self, t=self.t[which], poses=self.poses[which], covariances=covariances)
 
     def at(self, t: Array, *, max_gap: float = np.inf) -> Array:
-        """Poses (M, 3) at times ``t`` (M,), interpolated on SE(2); NaN outside and in gaps longer than ``max_gap``."""
+        """Return the poses (M, 3) at times ``t`` (M,) [s], interpolated on SE(2).
+
+        A pose is NaN outside of the trajectory, and in a gap longer than ``max_gap`` [s].
+        """
         out = np.full((len(t), 3), np.nan)
         if len(self.t) == 0:
             return out
@@ -70,8 +78,11 @@ class Trajectory(Exchange):
         return out
 
     def covariances_at(self, t: Array, *, max_gap: float = np.inf) -> Array:
-        """Covariances (M, 3, 3) at times ``t`` (M,), interpolated linearly; NaN outside and in gaps longer than ``max_gap``.
-        ValueError if the trajectory has no covariances."""
+        """Return the covariances (M, 3, 3) at times ``t`` (M,) [s], interpolated linearly.
+
+        A covariance is NaN outside of the trajectory, and in a gap longer than ``max_gap`` [s]. Raises ValueError if the trajectory
+        has no covariances.
+        """
         if self.covariances is None:
             raise ValueError("the trajectory has no covariances")
         out = np.full((len(t), 3, 3), np.nan)
@@ -82,15 +93,15 @@ class Trajectory(Exchange):
         return out
 
     def to_numpy(self) -> Array:
-        """The poses as an array (N, 4): t [s], x, y [m], heading [rad]."""
+        """Return the poses as an array (N, 4): t [s], x, y [m], heading [rad]."""
         return np.column_stack((self.t, self.poses))
 
     @classmethod
     def from_polars(cls, table: pl.DataFrame) -> Self:
-        """A trajectory from the columns t [s], x, y [m], heading [rad], and optionally those of covariances; others are ignored.
+        """Return a trajectory from a table with the columns t [s], x, y [m] and heading [rad]. Other columns are ignored.
 
-        Columns of covariances: cov_xx, cov_xy, cov_xh, cov_yy, cov_yh, cov_hh. InputError if a column is missing, or has values
-        that are no numbers.
+        Optional columns of covariances are cov_xx, cov_xy, cov_xh, cov_yy, cov_yh and cov_hh. Raises InputError if a column is
+        missing, or if it has values that are not numbers.
         """
         trajectory = super().from_polars(table)
         if not any(name in table.columns for name in COVARIANCES):
@@ -100,7 +111,7 @@ class Trajectory(Exchange):
         return replace(trajectory, covariances=symmetric(list(numbers(table, COVARIANCES).T)))
 
     def to_polars(self) -> pl.DataFrame:
-        """The poses as a table with the columns of :meth:`from_polars`, those of covariances if there are any."""
+        """Return the poses as a table with the columns of :meth:`from_polars`. It has covariances if the trajectory has them."""
         table, known = super().to_polars(), self.covariances
         return (
             table if known is None else table.with_columns(**{k: known[:, i, j] for k, (i, j) in COVARIANCES.items()})
@@ -120,10 +131,11 @@ class Trajectory(Exchange):
 
 
 def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
-    """Bracket times ``t`` (M,) in sorted ``stamps`` (N,), N > 0.
+    """Find the neighbours of the times ``t`` (M,) among sorted timestamps ``stamps`` (N,), N > 0, for interpolation.
 
-    Returns the indices of the previous and the next stamp, which are equal at a stamp; the fraction between them; and whether a
-    time is inside and not in a gap longer than ``max_gap``.
+    Returns four arrays (M,): the index of the timestamp before, the index of the timestamp after, the fraction of the time between
+    them, and a mask. The two indices are equal at a timestamp. The mask is True if a time is between the first and the last
+    timestamp, and not in a gap longer than ``max_gap`` [s].
     """
     t = np.asarray(t, dtype=float)
     last = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)
@@ -135,13 +147,16 @@ def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integ
 
 
 def averaged(covariances: Array, first: Integers, last: Integers, fraction: Array) -> Array:
-    """Covariances (M, D, D) interpolated in ``covariances`` (N, D, D): see :func:`neighbours`."""
+    """Return ``covariances`` (N, D, D) interpolated linearly to (M, D, D). The other arguments are from :func:`neighbours`."""
     weight = fraction[:, None, None]
     return np.asarray((1.0 - weight) * covariances[first] + weight * covariances[last])
 
 
 def write_tum(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> None:
-    """Write a TUM file with absolute timestamps in decimal seconds, to the nanosecond. ``t0_ns``: time zero of a trajectory."""
+    """Write a TUM file with absolute timestamps in seconds, exact to the nanosecond.
+
+    ``t0_ns``: absolute time [ns] of t = 0 of a :class:`Trajectory`.
+    """
     stamps = checks.absolute(trajectory.t, t0_ns) if isinstance(trajectory, Trajectory) else trajectory.stamps()
     rows = []
     for t_ns, row in zip(stamps.tolist(), trajectory._tum(), strict=True):

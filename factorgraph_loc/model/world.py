@@ -1,6 +1,7 @@
-"""The map, read from and written to ``NAME.world.toml``: layers of named elements registered by sensors, points, and walls.
+"""The map, as in a file ``NAME.world.toml``: layers of named elements, which sensors register, points, and walls.
 
-A layer may be kept in a table next to the file, such as ``NAME.tags.csv``; points always are, in ``NAME.points.parquet``.
+A layer may be stored in a table next to the file, such as ``NAME.tags.csv``. Points are always stored in
+``NAME.points.parquet``.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ L = TypeVar("L", bound=FileModel)
 
 
 class World(FileModel):
-    """A map. ``points``: points that cameras see. ``walls``: segments (x1, y1, x2, y2) [m]. Layers hold surveyed
-    elements by name, for example ``landmarks``, and RFID ``tags`` by EPC."""
+    """A map. ``points``: points that cameras observe. ``walls``: segments (x1, y1, x2, y2) [m].
+
+    A layer is an attribute with surveyed elements by name, for example ``landmarks`` by name, and RFID ``tags`` by EPC.
+    """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
@@ -35,17 +38,17 @@ class World(FileModel):
         def __getattr__(self, layer: str) -> Any: ...
 
     def of(self, kind: type[L]) -> dict[str, L]:
-        """The layer whose elements have class ``kind``."""
+        """Return the elements by name of the layer whose elements have the class ``kind``."""
         layer: dict[str, L] = getattr(self, next(name for name, of_layer in _KINDS.items() if of_layer is kind))
         return layer
 
     def position(self, name: str) -> Array | None:
-        """Position (2,) of a landmark; None if it is not in the map."""
+        """Return the position (2,) [m] of a landmark. Returns None if it is not in the map."""
         landmark = self.landmarks.get(name)
         return None if landmark is None else np.array((landmark.x, landmark.y))
 
     def positions(self) -> Array:
-        """Positions (K, 2) of all landmarks, in the order of the map."""
+        """Return the positions (K, 2) [m] of all landmarks, in the order of the map."""
         return np.array([(landmark.x, landmark.y) for landmark in self.landmarks.values()]).reshape(-1, 2)
 
 

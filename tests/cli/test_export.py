@@ -59,7 +59,7 @@ def test_all_runs_for_foxglove_and_rviz(fgloc, short_log, comparison, tmp_path):
 def test_bad_input(refused, short_log, comparison, ekf, tmp_path):
     assert "has the suffix '.csv', expected one of" in refused("export", ekf, short_log, "-o", "a.csv")
     several = refused("export", comparison, short_log, "-o", tmp_path / "a.tum")
-    assert "there are 2 (dead_reckoning, ekf)" in several
+    assert "2 runs are given (dead_reckoning, ekf)" in several
     bare = tmp_path / "bare"
     bare.mkdir()
     for file in short_log.iterdir():
@@ -83,4 +83,4 @@ def test_a_viewer_that_does_not_start(refused, short_log, monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(rerun_viewer, "_is_listening", lambda _: False)
     monkeypatch.setattr(rerun_viewer, "COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
-    assert "the viewer did not start; --rrd FILE writes a file" in refused("view", short_log)
+    assert "the viewer did not start: use --rrd FILE to write a file" in refused("view", short_log)

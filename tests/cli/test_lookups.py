@@ -114,7 +114,7 @@ def test_a_new_rig_has_the_sensors_that_are_named(fgloc, tmp_path):
     assert rig.bearing_range.range_sigma == 0.2
     assert [antenna.yaw for antenna in rig.rfid.antennas.values()] == pytest.approx([math.pi / 2.0, -math.pi / 2.0])
     assert (rig.camera.width, rig.camera.cx) == (640, 319.5)
-    assert fgloc("rigs", "new", "-o", file).stderr.endswith("exists already; choose another name or give --overwrite\n")
+    assert fgloc("rigs", "new", "-o", file).stderr.endswith("exists already: choose another name, or use --overwrite\n")
     assert fgloc("rigs", "new", "-o", file, "--overwrite").exit_code == 0
     assert read_rig(file).sensors == ("odometry",)
 

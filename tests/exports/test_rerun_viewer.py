@@ -74,7 +74,10 @@ def test_a_viewer_that_does_not_start(monkeypatch):
     program = "print('Error: no window'); raise SystemExit(1)"
     monkeypatch.setattr(rerun_viewer, "COMMAND", (sys.executable, "-c", program))
     viewer = rerun_viewer.open_viewer("127.0.0.1")
-    with pytest.raises(InputError, match=r"^the viewer did not start: no window; --rrd FILE writes a file"), viewer:
+    with (
+        pytest.raises(InputError, match=r"^the viewer did not start: no window: use --rrd FILE to write a file"),
+        viewer,
+    ):
         pass
 
 

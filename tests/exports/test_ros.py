@@ -148,6 +148,6 @@ def test_unknown_headings_and_covariances(log, tmp_path):
 def test_what_cannot_be_written(log, tmp_path):
     with pytest.raises(InputError, match=r"log.mcap: cannot be written: No such file"):
         write_mcap(log, [], tmp_path / "missing" / "log.mcap")
-    with pytest.raises(InputError, match=r"^arc: /\S+ has a stamp of -\d+ ns, expected one from 1970 to 2038$"):
+    with pytest.raises(InputError, match=r"^arc: /\S+ has the timestamp -\d+ ns, expected one from 1970 to 2038$"):
         write_mcap(replace(log, t0_ns=-(10**9)), [], tmp_path / "log.mcap")
     assert not list(tmp_path.iterdir())

@@ -196,7 +196,7 @@ def test_its_life(log):
     assert math.isnan(localizer.estimate(3.0).t)
     assert len(localizer.trajectory()) == 0
     with pytest.raises(
-        InputError, match=r"^VelocityOdometry at 1.000 s came before initialize\(\), expected initialize\(\) first$"
+        InputError, match=r"^VelocityOdometry at 1.000 s came before initialize\(\): call initialize\(\) first$"
     ):
         localizer.push(VelocityOdometry(1.0, 0.1, 0.0))
     localizer.initialize((1.0, 2.0, 0.5))
