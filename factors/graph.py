@@ -251,7 +251,9 @@ def _checked(
             total += np.vdot(block, _zeros(block.size))
         if not fits:
             shapes = [part.shape for part in (residual, *blocks)]
-            raise ValueError(f"shapes {shapes}, expected {rows} rows for {len(values)} variables")
+            raise ValueError(
+                f"a factor returns arrays of shapes {shapes}, expected {rows} rows and {len(values)} Jacobians"
+            )
         if not math.isfinite(total):
             raise ValueError("a residual or Jacobian is not finite")
     except (ValueError, FloatingPointError, np.linalg.LinAlgError) as failure:

@@ -54,7 +54,7 @@ class Estimator(Protocol):
         """The estimates of sensor constants and landmarks from all measurements, consistent with :meth:`trajectory`."""
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of all past poses, with covariances, at the times of the ticks."""
+        """The best estimate of all past poses, with covariances, at the times of the ticks, which the run requests."""
 
 
 @runtime_checkable

@@ -137,7 +137,7 @@ class BearingRangeFactor:
         return geman_mcclure_weight(squared, self.model.robust)
 
     def widened(self, width: float) -> BearingRangeFactor:
-        """The factor with a robust loss that is ``width`` times as wide."""
+        """The factor with the scale of its robust loss multiplied by ``width``."""
         return self if width == 1.0 else replace(self, model=widened(self.model, width))
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:

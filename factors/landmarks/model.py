@@ -130,7 +130,7 @@ def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> Beari
 
 @lru_cache(maxsize=64)
 def widened(model: BearingRangeModel, width: float) -> BearingRangeModel:
-    """The model with a robust loss that is ``width`` times as wide."""
+    """The model with the scale of its robust loss multiplied by ``width``."""
     return replace(model, robust=width * model.robust)
 
 

@@ -78,7 +78,7 @@ class LoopFactor:
         return float(geman_mcclure_loss(float(error @ error), self.robust))
 
     def widened(self, width: float) -> LoopFactor:
-        """The factor with a robust loss that is ``width`` times as wide."""
+        """The factor with the scale of its robust loss multiplied by ``width``."""
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:

@@ -82,7 +82,7 @@ class PositionFactor:
         return 2
 
     def widened(self, width: float) -> PositionFactor:
-        """The factor with a robust loss that is ``width`` times as wide."""
+        """The factor with the scale of its robust loss multiplied by ``width``."""
         return replace(self, robust=width * self.robust)
 
     def _covariances(self, poses: Array) -> Array:

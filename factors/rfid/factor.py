@@ -224,7 +224,7 @@ def _score(
     if strength is not None:
         nll, gradient, information = strength_scores(strength, pose.copy().reshape(1, 3), True)
         return nll[0], gradient[0], information[0], nll[0], 0.0
-    raise ValueError("expected one problem")
+    raise ValueError("read counts, phases and strengths are all None, expected one of them")
 
 
 @compiled

@@ -169,7 +169,7 @@ class Incremental:
             self._read(newest, {key for node in nodes for key in node.keys})
         except GTSAM_ERRORS as error:
             why = self._graph.reason(error)
-            self._graph.diagnostics.event(newest.t, "solver_rebuilt", "solver rebuilt: {why}", why=why)
+            self._graph.diagnostics.event(newest.t, "solver_rebuilt", "the solver was rebuilt: {why}", why=why)
             newest.causal = guess
             self._start_again(newest, self._solver.summary(failed=True), failed=True)
         while self._failed:

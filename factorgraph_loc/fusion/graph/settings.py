@@ -48,8 +48,10 @@ class SmootherSettings(GraphSettings):
     @model_validator(mode="after")
     def _has_a_final(self) -> "SmootherSettings":
         if self.final_only and not (self.smooth and self.lag in (None, math.inf)):
-            given = "smooth is false" if not self.smooth else f"lag is {self.lag:g}"
-            raise ValueError(f"final_only is true, but {given}, expected one of the two")
+            given, remedy = (
+                (f"lag is {self.lag:g}", "lag to all") if self.smooth else ("smooth is false", "smooth to true")
+            )
+            raise ValueError(f"final_only is true, but {given}: set {remedy}, or final_only to false")
         return self
 
 
