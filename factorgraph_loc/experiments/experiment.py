@@ -1,4 +1,4 @@
-"""An experiment from its file to the table of its results; stored runs are not repeated."""
+"""Execution of an experiment: from its file to the table of its results. Runs with stored results are not repeated."""
 
 from __future__ import annotations
 
@@ -23,13 +23,16 @@ if TYPE_CHECKING:
     import polars as pl
 
 STATES = get_args(State)
-PACE = 20.0  # assumed ratio of log time to computing time of an unknown estimator
+PACE = 20.0  # assumed ratio of a log's duration to the computing time, for estimators without stored runs
 Run = TypeVar("Run", bound=Planned)
 
 
 @dataclass(frozen=True)
 class Prepared(Generic[Run]):
-    """Planned ``runs`` with their ``limits``; results go to ``folder``, and ``states`` are those of the stored results by key."""
+    """The planned runs of an experiment. ``folder``: folder of the results. ``limits``: limits of each run.
+
+    ``states``: by key of a run, the state of its stored results (ok, failed, missing, damaged).
+    """
 
     folder: Path
     runs: Sequence[Run]
@@ -38,7 +41,7 @@ class Prepared(Generic[Run]):
 
     @classmethod
     def of(cls, folder: Path, runs: Sequence[Run], limits: Limits) -> Prepared[Run]:
-        """The same with the states of stored results."""
+        """Return the runs with the states of their stored results, which are read from ``folder``."""
         store = Store(folder)
         return cls(folder, runs, limits, {key: store.state(key) for key in dict.fromkeys(run.key for run in runs)})
 
@@ -48,19 +51,22 @@ class Prepared(Generic[Run]):
         return Store(self.folder)
 
     def damaged(self) -> list[Run]:
-        """The runs with damaged results."""
+        """Return the runs with damaged results."""
         return [run for run in self.runs if self.states[run.key] == "damaged"]
 
     def todo(self, *, again: bool = False) -> list[Run]:
-        """The runs to be made; with ``again`` also the failed ones."""
+        """Return the runs to execute, which have no usable results. ``again``: whether to include failed runs."""
         done = ("ok",) if again else ("ok", "failed")
         return [run for run in self.runs if self.states[run.key] not in done]
 
 
 @dataclass(frozen=True)
 class Done:
-    """The results of several runs. ``table``: a row per run, see
-    :func:`~factorgraph_loc.experiments.result_table.load_results`. ``failures``: a line each; ``warnings``: each once."""
+    """The results of several runs.
+
+    ``table``: a row for each run, see :func:`~factorgraph_loc.experiments.result_table.load_results`. ``failures``: a text for each
+    failed run. ``warnings``: each warning once.
+    """
 
     table: pl.DataFrame
     failures: list[str]
@@ -74,8 +80,11 @@ class Done:
 
 @dataclass(frozen=True)
 class ExperimentStatus:
-    """``labels``: for each label of the plan how many runs are ok, failed, missing and damaged. ``failures``: a row for each
-    failed run, with its ``reason``; ``damaged``: names of runs whose stored results are."""
+    """The state of an experiment. ``folder``: folder of its results.
+
+    ``labels``: by label of an estimator, the numbers of runs that are ok, failed, missing and damaged. ``failures``: a row for each
+    failed run, with its ``reason``. ``damaged``: descriptions of the runs whose stored results are damaged.
+    """
 
     folder: Path
     labels: Mapping[str, Mapping[str, int]]
@@ -94,11 +103,14 @@ def experiment(
     retry_failed: bool = False,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
-    """Execute those runs of an experiment file that have no stored result yet.
+    """Execute the runs of an experiment file that have no stored results yet.
 
-    ``changes``, ``out``, ``data_root``: see :func:`prepare`. ``jobs``: number of processes, by default one per core.
-    ``scheduler``: address of a ``dask.distributed`` cluster to use instead. ``progress`` is called with the numbers of finished,
-    all and failed runs. Damaged runs are repeated. A failed run is recorded as a row and in ``failures``; it raises nothing.
+    ``changes``, ``out``, ``data_root``: see :func:`prepare`. ``jobs``: number of processes, None for one per core.
+    ``scheduler``: address of the scheduler of a ``dask.distributed`` cluster, which then executes the runs.
+    ``retry_failed``: whether to repeat failed runs. Damaged runs are always repeated.
+    ``progress``: called with the numbers of finished, all and failed runs.
+
+    A failed run raises no exception. It has a row in the table of results and an entry in ``failures``.
     """
     _, prepared = prepare(file, changes, out=out, data_root=data_root)
     return run_experiment(prepared, jobs=jobs, scheduler=scheduler, again=retry_failed, progress=progress)
@@ -111,7 +123,7 @@ def status(
     out: str | Path | None = None,
     data_root: str | Path | None = None,
 ) -> ExperimentStatus:
-    """How many runs of an experiment file are done, failed, missing or damaged. For the arguments see :func:`prepare`."""
+    """Count the runs of an experiment file that are done, failed, missing or damaged. For the arguments see :func:`prepare`."""
     _, planned = prepare(file, changes, out=out, data_root=data_root)
     counts = {run.label: dict.fromkeys(STATES, 0) for run in planned.runs}
     for run in planned.runs:
@@ -131,12 +143,13 @@ def prepare(
     data_root: str | Path | None = None,
     out: str | Path | None = None,
 ) -> tuple[Experiment, Prepared[PlannedRun]]:
-    """The experiment of a ``file`` with ``changes``, and its runs with the states of stored results.
+    """Read an experiment file and plan its runs. Return the experiment, and the runs with the states of stored results.
 
-    ``changes``: values by dotted key, see :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``out``: folder of
-    the results, by default the file's.
+    ``changes``: values by dotted key that replace those of the file, see
+    :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``data_root``: the data folder, None for the environment
+    variable FGLOC_DATA. ``out``: folder of the results, None for the folder that the file names.
 
-    Raises InputError for errors in the file and for too many runs, StoreError if the folder for results cannot be written.
+    Raises InputError for errors in the file and for too many runs, and StoreError if the folder for results cannot be written.
     """
     file = Path(file)
     experiment = read_experiment(file, changes)
@@ -157,9 +170,9 @@ def run_experiment(
     again: bool = False,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
-    """Make the runs that are not stored, with ``again`` also the failed ones, and write the table of all results.
+    """Execute the runs without stored results, and write the table of all results. ``again``: whether to repeat failed runs.
 
-    For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The table is written also after an error or interrupt.
+    For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The table is written also after an error or an interrupt.
     Raises StoreError if the store cannot be written.
     """
     from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
@@ -183,7 +196,7 @@ def run_experiment(
             made, failed = made + 1, failed + (state == "failed")
             progress(made, len(todo), failed)
     finally:
-        for run in todo:  # an interrupt may come between a run's end and its state
+        for run in todo:  # an interrupt may come after a run is stored and before its state is recorded
             if states[run.key] not in ("ok", "failed"):
                 states[run.key] = prepared.store.state(run.key)
         finished = [run for run in prepared.runs if states[run.key] in ("ok", "failed")]
@@ -197,7 +210,10 @@ def run_experiment(
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
-    """Estimated sum of the run times [s], from stored runs of the same label and the duration of the log, else a default."""
+    """Estimate the total computing time [s] of runs, from the durations of their logs and from stored runs with the same label.
+
+    ``folder``: folder of the stored results. Without stored runs of a label, :data:`PACE` is assumed.
+    """
     from factorgraph_loc.experiments.result_table import load_results  # noqa: PLC0415
 
     paces: dict[str, list[float]] = {}

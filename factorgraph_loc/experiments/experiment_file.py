@@ -1,4 +1,4 @@
-"""The experiment file: logs, estimators, sensors, seeds, and settings to sweep over."""
+"""The experiment file: which estimators run on which logs, with which sensors, seeds and swept settings."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ from factorgraph_loc.text import listed, plain, quoted
 LONGEST_NAME = 200  # maximum characters of the experiment's name, which is a folder name
 MOST = 1000  # maximum number of logs, estimators, sets of sensors and metrics in a file; globs and seeds may expand to more
 MOST_RUNS = 100_000  # maximum number of runs
-NO_TIME_LIMIT = 1e9  # s: no limit of a run
-MOST_SWEPT, MOST_VALUES = 50, 10_000  # maximum number of swept settings, and of values of one
+NO_TIME_LIMIT = 1e9  # s; time limit of a run that is never reached
+MOST_SWEPT, MOST_VALUES = 50, 10_000  # maximum number of swept settings, and of values of one setting
 FIRST = """\
 name = "{name}"  # the results go to out/{name}
 logs = [{{ simulate = "office", seeds = "0:3" }}]  # or names and files of logs: ["plaza1", "monday.toml"]
 estimators = ["ekf", "smoother"]
-# sensors = ["odometry", "rfid"]  # by default those of each rig
-# prior = "unknown"  # of the start; by default that of the log
-# seeds = "0:5"  # of the estimators that draw random numbers
+# sensors = ["odometry", "rfid"]  # default: the sensors of each rig
+# prior = "unknown"  # start pose; default: the start in the log
+# seeds = "0:5"  # random seeds of estimators that draw random numbers
 
 # [sweep]  # values of settings, by estimator
 # "smoother.lag" = [5.0, 10.0, 20.0]
 
 [report]
-baseline = "ekf"  # the others are compared with it
+baseline = "ekf"  # other estimators are compared with this one
 """
 Name = Annotated[str, Field(min_length=1)]
 Seeds = Annotated[
@@ -64,11 +64,12 @@ Scalar = str | int | float | bool
 
 
 def _is_scalar(value: Any) -> bool:
+    """True if a value is a text, a boolean or a finite number."""
     return isinstance(value, str | int) or (isinstance(value, float) and math.isfinite(value))
 
 
 def _seeds(value: Any) -> Any:
-    """``"0:5"`` and 3 as tuples; a list is unchanged."""
+    """Convert seeds to a tuple: "0:5" becomes (0, 1, 2, 3, 4), and 3 becomes (3,). Other values are returned unchanged."""
     if isinstance(value, int) and not isinstance(value, bool):
         return (value,)
     if isinstance(value, str):
@@ -80,11 +81,12 @@ def _seeds(value: Any) -> Any:
 
 
 class LogEntry(FileModel):
-    """Stored logs (``log``) or simulated ones (``simulate``).
+    """An entry of ``logs``: either recorded logs (``log``) or simulated logs (``simulate``).
 
-    ``log``: a name listed by ``fgloc datasets``, a path relative to the file's folder, or a glob over either. Its keys are
-    ``reader``, its ``options``, and files ``rig`` and ``world`` in place of the log's own. ``simulate``: a preset or a TOML file
-    with changed ``settings``; each of its ``seeds`` makes a log.
+    ``log``: a name that ``fgloc datasets`` lists, a path relative to the folder of the experiment file, or a glob for several names
+    or paths. With ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world`` that replace those of the
+    log. ``simulate``: a preset or a TOML file. With ``simulate`` there may be ``settings`` of the simulation, and ``seeds``. There
+    is one simulated log per seed.
     """
 
     log: Name | None = None
@@ -104,12 +106,12 @@ class LogEntry(FileModel):
             raise ValueError("expected either log or simulate")
         unusable = ("settings", "seeds") if self.log is not None else ("reader", "options", "rig", "world")
         if wrong := [name for name in unusable if name in self.model_fields_set]:
-            raise ValueError(f"{wrong[0]} says nothing about {'log' if self.log is not None else 'simulate'}")
+            raise ValueError(f"{wrong[0]} cannot be used with {'log' if self.log is not None else 'simulate'}")
         return self
 
 
 class EstimatorEntry(FileModel):
-    """An estimator by its ``name``, with ``settings``; ``label``: its name in the results, by default its name."""
+    """An entry of ``estimators``: its ``name`` and ``settings``. ``label``: name in the results, "" for the name itself."""
 
     name: Name
     label: str = ""
@@ -117,13 +119,16 @@ class EstimatorEntry(FileModel):
 
     @property
     def shown(self) -> str:
-        """The label, or the name."""
+        """The label of the estimator, or its name if it has no label."""
         return self.label or self.name
 
 
 class Sweep(FileModel):
-    """Settings by dotted name, ``LABEL.KEY`` or ``simulation.KEY``, and the values of each. ``mode``: ``grid``, all combinations,
-    or ``list``, the first with the first, the second with the second."""
+    """The settings that an experiment varies.
+
+    ``over``: by dotted name of a setting, ``LABEL.KEY`` or ``simulation.KEY``, the list of its values. ``mode``: "grid" for all
+    combinations of the values. "list" combines the first values of all settings, then the second values, and so on.
+    """
 
     mode: Literal["grid", "list"] = "grid"
     over: Mapping[str, tuple[Scalar, ...]] = Field(default_factory=dict)
@@ -137,7 +142,7 @@ class Sweep(FileModel):
         mode = {"mode": content["mode"]} if "mode" in content else {}
         over = dict(flattened(rest))
         if len(over) > MOST_SWEPT:
-            raise ValueError(f"{len(over):,} settings are swept over, expected at most {MOST_SWEPT}")
+            raise ValueError(f"{len(over):,} settings are swept, expected at most {MOST_SWEPT}")
         for key, values in over.items():
             if not isinstance(values, list | tuple) or not 0 < len(values) <= MOST_VALUES:
                 raise ValueError(f"{plain(key)} is {quoted(values)}, expected a list of 1 to {MOST_VALUES:,} values")
@@ -148,12 +153,15 @@ class Sweep(FileModel):
     @model_validator(mode="after")
     def _in_step(self) -> Sweep:
         if self.mode == "list" and len({len(values) for values in self.over.values()}) > 1:
-            raise ValueError(f"a list needs as many values of each of {listed(self.over)}")
+            raise ValueError(f"mode list requires equal numbers of values of {listed(self.over)}")
         return self
 
     def points(self, *words: str) -> list[dict[str, Scalar]]:
-        """The combinations of settings whose keys begin with one of ``words``, by default of all, without duplicates; one empty
-        combination if there are none. If there are more than :data:`MOST_RUNS`, only one more than that."""
+        """Return the combinations of values of swept settings, without duplicates. Each is a dictionary by dotted name.
+
+        ``words``: only settings whose names start with one of these words are combined; none for all settings. Without settings,
+        the result is one empty combination. At most :data:`MOST_RUNS` + 1 combinations are returned.
+        """
         columns = {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
         combined: Iterable[tuple[Scalar, ...]] = itertools.product(*map(dict.fromkeys, columns.values()))
         if self.mode == "list":
@@ -162,25 +170,34 @@ class Sweep(FileModel):
 
 
 class ReportSettings(FileModel):
-    """``metrics``: the scores in the report; ``baseline``: the label that the others are compared with."""
+    """Settings of the report. ``metrics``: keys of its scores. ``baseline``: the label with which the others are compared."""
 
     metrics: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST, fail_fast=True)] = SUMMARY
     baseline: str | None = None
 
 
 class Limits(FileModel):
-    """Limits of one run: ``memory`` [10^6 bytes] of its process, and ``time`` [s]. By default ``memory`` is 90 % of the machine's
-    memory, divided by the number of processes."""
+    """Limits of one run. ``memory`` [10^6 bytes]: of its process. ``time`` [s]: of its computation.
+
+    The default of ``memory`` is 90 % of the machine's memory, divided by the number of processes.
+    """
 
     memory: Annotated[float, Field(gt=0.0)] | None = None
     time: Annotated[float, Field(gt=0.0)] = 3600.0
 
 
 class Experiment(FileModel):
-    """An experiment. ``out``: the folder of the results, by default out/NAME; ``sensors``: one list, or a list of lists, by
-    default those of each log's rig; ``prior``: of the start; ``seeds``: of the estimators; ``max_gap`` [s]: the largest interval
-    between estimates that is interpolated for scoring; ``tick_gap`` [s]: there are no estimates inside longer gaps between
-    measurements; ``align``: also score after this alignment with the reference."""
+    """The content of an experiment file.
+
+    ``name``: name of the experiment. ``out``: folder of the results, None for out/NAME.
+    ``logs``, ``estimators``: every estimator runs on every log.
+    ``sensors``: sets of used sensors, where None stands for the sensors of each log's rig. Runs are made with each set.
+    ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
+    ``seeds``: random seeds of the estimators.
+    ``max_gap`` [s]: for scores, estimates are not interpolated across longer gaps.
+    ``tick_gap`` [s]: in longer gaps between measurements there are no estimates.
+    ``align``: there are also scores after this alignment with the reference.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=LONGEST_NAME)]
     out: Name | None = None
@@ -204,7 +221,7 @@ class Experiment(FileModel):
     @field_validator("logs", "estimators", mode="before")
     @classmethod
     def _named(cls, value: Any, info: Any) -> Any:
-        """Allow a name in place of an entry."""
+        """Convert entries that are only a name to tables."""
         key = "log" if info.field_name == "logs" else "name"
         return (
             [{key: entry} if isinstance(entry, str) else entry for entry in value] if isinstance(value, list) else value
@@ -219,7 +236,7 @@ class Experiment(FileModel):
     def _fits(self) -> Experiment:
         labels = [entry.shown for entry in self.estimators]
         if twice := [label for label, count in Counter(labels).items() if count > 1]:
-            raise ValueError(f"two estimators are called {quoted(twice[0])}, expected a label of its own for each")
+            raise ValueError(f"two estimators are called {quoted(twice[0])}, expected different labels")
         known = {SIMULATION, *labels, *(entry.name for entry in self.estimators)}
         for key in self.sweep.over:
             first, _, rest = key.partition(".")
@@ -236,17 +253,20 @@ class Experiment(FileModel):
 
 
 def write_new(file: Path, *, overwrite: bool = False) -> None:
-    """Write a first experiment, with comments. InputError if the file exists, unless it is to ``overwrite``."""
+    """Write an example of an experiment file, with comments. Raises InputError if the file exists and ``overwrite`` is not set."""
     if file.suffix != ".toml":
-        raise InputError(f"{file}: is no name of an experiment, expected one that ends in .toml")
+        raise InputError(f"{file}: the name of an experiment file must end in .toml")
     if file.exists() and not overwrite:
         raise InputError(f"{file}: exists already; choose another name or give --overwrite")
     write_text(file, FIRST.format(name=file.stem))
 
 
 def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Experiment:
-    """Read an experiment from a TOML file. ``changes``: dotted keys of the file with other values; ``LABEL.KEY`` is a setting of
-    an estimator, ``simulation.KEY`` one of all simulated logs. Raises InputError with file, key and what is expected."""
+    """Read an experiment from a TOML file.
+
+    ``changes``: by dotted key of the file, a value that replaces that of the file. The key ``LABEL.KEY`` is a setting of an
+    estimator, and ``simulation.KEY`` a setting of all simulated logs. Raises InputError with file and key if a value is invalid.
+    """
     content = read_toml(path)
     for key, value in (changes or {}).items():
         _change(content, key, value, path)
@@ -255,7 +275,7 @@ def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Exp
 
 
 def _change(content: dict[str, Any], key: str, value: Any, source: object) -> None:
-    """Set a dotted key of the file's content; see :func:`read_experiment`."""
+    """Set the value of a dotted key in the content of a file; see :func:`read_experiment`."""
     first, _, rest = key.partition(".")
     if first in Experiment.model_fields:
         set_key(content, key, value, source)
@@ -273,7 +293,10 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def _tables(content: dict[str, Any], key: str, named: str, source: object) -> list[dict[str, Any]]:
-    """The entries of a list of the file, with names replaced by tables with the key ``named``."""
+    """Return the entries of the list ``key`` in the content of a file. An entry that is only a name becomes a table.
+
+    ``named``: the key of the name in that table. Raises InputError if there is no list of names or tables.
+    """
     entries = content.setdefault(key, [])
     if not isinstance(entries, list):
         raise InputError(f"{source}: {key} is {quoted(entries)}, expected a list")
@@ -284,5 +307,5 @@ def _tables(content: dict[str, Any], key: str, named: str, source: object) -> li
 
 
 def canonical(settings: Mapping[str, Any]) -> str:
-    """Settings as canonical JSON."""
+    """Return settings as JSON with sorted keys, so that equal settings have equal texts."""
     return json.dumps(settings, sort_keys=True)

@@ -1,7 +1,7 @@
-"""Keys of runs, and cached facts about logs and estimators for planning.
+"""Keys of runs, and cached facts about logs and estimators, which the planning of an experiment needs.
 
-A key is a digest of everything that a result depends on: log, configuration, code, libraries. Facts are cached because computing
-them imports numerical libraries or reads the log.
+The key of a run is a hash of everything on which its results depend: log, configuration, code and libraries. A fact is for instance
+the duration of a log. Facts are cached, because their computation reads the log or imports numerical libraries.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ if TYPE_CHECKING:
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
 PACKAGES = (__name__.partition(".")[0], "factors")
-_UNSETTLED = 2.0  # s: a younger file may change again without a new modification time
+_UNSETTLED = 2.0  # s; a file that was modified later may change again without a new modification time
 
 
 def digest_of(content: Any) -> str:
-    """The sha256 of plain data, in hexadecimal digits."""
+    """Return the sha256 of data that JSON can represent, as hexadecimal digits."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 @lru_cache
 def code_version() -> str:
-    """A digest of the source files of this project."""
+    """Return a hash of the source files of this project."""
     return digest_of_code(Path(__file__).parents[2])
 
 
 def digest_of_code(root: Path) -> str:
-    """The digest of the source files of the packages in the folder ``root``, and of the shipped descriptions of readers."""
+    """Return a hash of the source files of this project's packages in the folder ``root``, and of its descriptions of readers."""
     total = hashlib.sha256()
     for package in PACKAGES:
         for file in sorted((root / package).rglob("*")):
@@ -62,31 +62,34 @@ def digest_of_code(root: Path) -> str:
 
 @lru_cache
 def library_versions() -> dict[str, str]:
-    """The versions of numerical libraries, by name."""
+    """Return the versions of the numerical libraries and of Python, by name."""
     return {name: importlib.metadata.version(name) for name in LIBRARIES} | {"python": platform.python_version()}
 
 
 def software_digest() -> str:
-    """A digest of the code and the libraries of this process."""
+    """Return a hash of the code and the library versions of this process."""
     return digest_of([code_version(), library_versions()])
 
 
 def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
-    """The key of a run, from a log's digest and its effective configuration as plain data."""
+    """Return the key of a run. ``log_digest``: hash of the log. ``config``: the configuration of the run, including defaults."""
     return digest_of({"log": log_digest, "config": dict(config), "software": software_digest()})
 
 
 class VanishedError(InputError):
-    """A log disappeared, or differs from the planned one."""
+    """A log does not exist any more, or its content has changed since the experiment was planned."""
 
 
 @lru_cache(maxsize=4)
 def load_planned(source: LogSource, digest: str) -> Log:
-    """The log of a source that has the ``digest`` of the plan; cached, as consecutive runs use the same log."""
+    """Load the log of a source. The last logs are cached, because consecutive runs often use the same log.
+
+    ``digest``: hash of the log when the experiment was planned. Raises VanishedError if the log is missing or has changed.
+    """
     try:
         now = Facts().digest(source)
     except InputError as error:
-        raise VanishedError(f"the log has vanished: {error}") from error
+        raise VanishedError(f"the log cannot be read any more: {error}") from error
     if now != digest:
         raise VanishedError("the log has changed since the experiment was planned")
     return source.load()
@@ -94,7 +97,7 @@ def load_planned(source: LogSource, digest: str) -> Log:
 
 @dataclass(frozen=True)
 class LogFacts:
-    """The ``name`` of a log, its ``duration`` [s], and the ``sensors`` available to a run."""
+    """Facts about a log: its ``name``, its ``duration`` [s], and the names of its ``sensors``."""
 
     name: str
     duration: float
@@ -103,15 +106,19 @@ class LogFacts:
 
 @dataclass(frozen=True)
 class EstimatorFacts:
-    """The ``effective`` settings of an estimator as plain data, and whether it is deterministic."""
+    """Facts about an estimator. ``effective``: its settings, including defaults. ``deterministic``: whether it uses no random
+    numbers."""
 
     effective: Mapping[str, Any]
     deterministic: bool
 
 
 class _Kept(BaseModel):
-    """Facts obtained with code and libraries of this ``version``: size, modification time and sha256 of ``files`` by path,
-    ``logs`` by digest, ``estimators`` by name and settings."""
+    """The content of a cache of facts. ``version``: hash of the code and libraries that computed them.
+
+    ``files``: by path, the size, modification time and sha256 of a file. ``logs``: by hash of a source, facts about its logs.
+    ``estimators``: by name and settings.
+    """
 
     version: str = ""
     files: dict[str, tuple[int, int, str]] = {}
@@ -120,24 +127,26 @@ class _Kept(BaseModel):
 
 
 class Facts:
-    """Digests of files, and facts about logs and estimators. A JSON file ``cache`` keeps them for unchanged files, code and
-    libraries, so that each file is read once."""
+    """Computes hashes of files, and facts about logs and estimators.
+
+    ``cache``: a JSON file that keeps them, None for none. Cached facts are used if files, code and libraries are unchanged.
+    """
 
     def __init__(self, cache: Path | None = None) -> None:
         self._cache = cache
         self._known = _Kept() if cache is None else _kept(cache)
 
     def digest(self, source: LogSource) -> str:
-        """The digest of a log's source. Raises InputError if a file is missing."""
+        """Return the hash of the source of a log, including its files. Raises InputError if a file is missing."""
         try:
             paths = source.files()
-        except OSError as error:  # a folder that must not be read
+        except OSError as error:  # no permission to read a folder
             raise InputError(f"{plain(error.filename)}: cannot be read: {error.strerror}") from error
         files = {name: self._of_file(path) for name, path in paths.items()}
         return digest_of({"identity": source.identity(), "files": files})
 
     def _of_file(self, path: Path) -> str:
-        """The sha256 of a file. Raises InputError if it cannot be read."""
+        """Return the sha256 of a file. Raises InputError if it cannot be read."""
         try:
             stat = path.stat()
             known = self._known.files.get(str(path))
@@ -152,27 +161,27 @@ class Facts:
         return digest
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
-        """Facts of all logs of a source. Raises InputError as the reader or the simulation's settings do."""
+        """Return facts about all logs of a source, which has the hash ``digest``. Raises InputError if they cannot be loaded."""
         if digest not in self._known.logs:
             self._known.logs[digest] = [_facts(log) for log in source.load_all()]
         return self._known.logs[digest]
 
     def estimator(self, name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
-        """Facts of an estimator with these settings. Raises InputError for an unknown estimator or invalid settings."""
+        """Return facts about an estimator with these settings. Raises InputError for an unknown name or invalid settings."""
         key = f"{name} {canonical(settings)}"
         if key not in self._known.estimators:
             self._known.estimators[key] = _of_estimator(name, settings)
         return self._known.estimators[key]
 
     def save(self) -> None:
-        """Write the facts to the cache; errors are ignored."""
+        """Write the facts to the cache, if there is one. Errors of writing are ignored."""
         if self._cache is not None:
             with suppress(OSError):
                 write_text(self._cache, json.dumps(self._known.model_dump()))
 
 
 def _kept(cache: Path) -> _Kept:
-    """The content of a cache; empty if it is missing, damaged, or of other code or libraries."""
+    """Read a cache. Return an empty one if it is missing, damaged, or was made by other code or libraries."""
     with suppress(InputError, ValidationError):
         kept = _Kept.model_validate_json(bounded.read_bytes(cache, bounded.DATA))
         if kept.version == software_digest():
@@ -181,6 +190,7 @@ def _kept(cache: Path) -> _Kept:
 
 
 def _facts(log: Any) -> LogFacts:
+    """Return facts about a loaded log."""
     from factorgraph_loc.experiments.preparation import columns_of  # noqa: PLC0415
 
     first, last = log.span()
@@ -188,6 +198,7 @@ def _facts(log: Any) -> LogFacts:
 
 
 def _of_estimator(name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
+    """Compute facts about an estimator, which imports it."""
     from factorgraph_loc.fusion import registry  # noqa: PLC0415
 
     effective = registry.settings_of(name, settings).model_dump(mode="json")

@@ -1,6 +1,7 @@
-"""Sources of an experiment's logs, as plain data that other processes use to load them.
+"""Sources of the logs of an experiment: small objects that can be sent to other processes, which load the logs.
 
-Nothing numerical is imported until a log is loaded, so that an experiment with stored results starts quickly."""
+Numerical libraries are imported only when a log is loaded, so that an experiment with stored results starts quickly.
+"""
 
 from __future__ import annotations
 
@@ -27,16 +28,23 @@ if TYPE_CHECKING:
     from factorgraph_loc.model.log import Log
 
 _MAGIC = re.compile(r"[*?[]")
-NAMING = {".toml": read_toml, ".yaml": read_yaml, ".yml": read_yaml}  # files that name others
+NAMING = {
+    ".toml": read_toml,
+    ".yaml": read_yaml,
+    ".yml": read_yaml,
+}  # readers of files that contain paths of other files
 
 
 def is_pattern(name: str) -> bool:
+    """True if a name is a glob, with ``*``, ``?`` or ``[``."""
     return _MAGIC.search(name) is not None
 
 
 def matching(pattern: str, folder: Path, source: object) -> list[Path]:
-    """The sorted paths that match a ``pattern`` of :meth:`pathlib.Path.glob`, relative to ``folder``. Raises InputError for an
-    invalid pattern."""
+    """Return the sorted paths that match a glob. ``folder``: a relative glob starts here. ``source``: name for messages.
+
+    Raises InputError for an invalid glob.
+    """
     path = Path(pattern)
     root = Path(path.anchor) if path.anchor else folder
     with foreign(source, f"{quoted(pattern)} is not a pattern of paths"):
@@ -44,39 +52,40 @@ def matching(pattern: str, folder: Path, source: object) -> list[Path]:
 
 
 def _fixed_part(pattern: str) -> str:
-    """The path before the first part of a pattern that may match several names."""
+    """Return the leading folders of a glob that contain no ``*``, ``?`` or ``[``."""
     parts = itertools.takewhile(lambda part: not is_pattern(part), Path(pattern).parts)
     return str(Path(*parts))
 
 
 class LogSource(ABC):
-    """The source of a log: number ``number`` of those that it stands for."""
+    """The source of a log. A source may contain several logs; ``number`` is the index of the log."""
 
     number: int = 0
 
     @abstractmethod
     def load_all(self) -> list[Log]:
-        """All logs that it stands for. Raises InputError as the reader does."""
+        """Load all logs of the source. Raises InputError if they cannot be read or simulated."""
 
     @abstractmethod
     def files(self) -> dict[str, Path]:
-        """The files that the log is read from, by names independent of their location."""
+        """Return the files from which the log is read, by names that do not depend on their location."""
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """The values that, with the content of the files, determine the log."""
+        """Return the values that determine the log, together with the content of its files."""
 
     def load(self) -> Log:
-        """The log."""
+        """Load the log."""
         return self.load_all()[self.number]
 
 
 @dataclass(frozen=True)
 class RecordedSource(LogSource):
-    """One recorded log: the one with this ``number``, from 0, that :func:`~factorgraph_loc.io.readers.load` returns for ``log``.
+    """A recorded log.
 
-    ``options``: of the reader, as JSON. ``rig``, ``world``: files replacing the log's own. ``data_root``: a manifest may also find
-    its data in this folder; by default the environment's FGLOC_DATA.
+    ``log``: a name or path for :func:`~factorgraph_loc.io.readers.load`. ``number``: index of the log among those it returns.
+    ``reader``: name of the reader, None to find it by the file. ``options``: options of the reader as JSON. ``rig``, ``world``:
+    files that replace those of the log. ``data_root``: the data folder, None for the environment variable FGLOC_DATA.
     """
 
     log: str
@@ -105,11 +114,12 @@ class RecordedSource(LogSource):
         return {"log": name, "number": self.number, "reader": self.reader, "options": json.loads(self.options)}
 
     def _data(self) -> Iterator[tuple[str, Path]]:
+        """Yield names and paths of the files of the log, except for ``self.rig`` and ``self.world``."""
         path = Path(self.log)
         if self.log in manifests():
             path = manifests()[self.log]
         run = path / RUN_FILE if path.is_dir() else path
-        if run.name == RUN_FILE and run.is_file():  # of a native log, unless it is a manifest
+        if run.name == RUN_FILE and run.is_file():  # a file of the native format, or a manifest
             path = run if "reader" in read_toml(run) else run.parent
         if path.is_dir():
             yield from _of_folder(path)
@@ -124,7 +134,7 @@ class RecordedSource(LogSource):
                 file = named_path(path.parent, content[what], path, self.data_root)
                 if not _is_below(file, path.parent):
                     yield from ((f"{what}/{name}", part) for name, part in _of_toml(str(file)))
-        if content.get("path") is None:  # the data come with a library, whose version is part of the key
+        if content.get("path") is None:  # the data are part of a library, whose version is part of the key
             return
         summed = content.get("checksums")
         for name in list(summed) if isinstance(summed, dict) and summed else [str(content["path"])]:
@@ -136,7 +146,7 @@ class RecordedSource(LogSource):
 
 @dataclass(frozen=True)
 class SimulatedSource(LogSource):
-    """The log of a ``preset`` (a name, or a TOML file), with changed ``settings`` (JSON) and a ``seed``."""
+    """A simulated log. ``preset``: a name or a TOML file. ``settings``: changed settings as JSON. ``seed``: random seed."""
 
     preset: str
     settings: str = "{}"
@@ -156,7 +166,7 @@ class SimulatedSource(LogSource):
 
 @dataclass(frozen=True)
 class GivenSource(LogSource):
-    """A ``log`` in memory, whose content has the ``digest``, in place of files."""
+    """A ``log`` in memory. ``digest``: hash of its content."""
 
     log: Log = field(compare=False)
     digest: str
@@ -172,16 +182,17 @@ class GivenSource(LogSource):
 
 
 def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSource]:
-    """The sources that ``name`` stands for: a known name, a path relative to ``folder``, or a glob over either.
+    """Return the sources for a name in an experiment file: a known name, a path relative to ``folder``, or a glob for either.
 
-    ``options``: fields of the sources. Raises InputError if there is none, or if a path leaves ``folder`` and the data folder.
+    ``options``: further fields of the sources. Raises InputError if a glob matches no log, or if a path leads out of ``folder`` and
+    of the data folder.
     """
     known = manifests()
     if name in known:
         return [RecordedSource(name, **options)]
     data_root = options.get("data_root")
     if not is_pattern(name):
-        # for anything else the reader raises the error, with the nearest name
+        # if nothing has this name or path, the reader raises an error later, which proposes a similar name
         path = named_path(folder, name, "logs", data_root)
         return [RecordedSource(str(path) if kind(path) or kind(Path(name)) else name, **options)]
     names = [candidate for candidate in known if fnmatchcase(candidate, name)]
@@ -196,6 +207,7 @@ def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSo
 
 
 def _is_log(path: Path) -> bool:
+    """True if a path is a manifest, or a log in the native format."""
     if path.is_dir():
         return (path / RUN_FILE).is_file()
     return path.name == RUN_FILE or (
@@ -204,13 +216,14 @@ def _is_log(path: Path) -> bool:
 
 
 def _of_folder(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Yield names and paths of all files in a folder and its subfolders."""
     for file in sorted(folder.rglob("*")):
         if file.is_file():
             yield f"{folder.name}/{file.relative_to(folder).as_posix()}", file
 
 
 def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
-    """A file of settings and, recursively, the files of its folder that it names."""
+    """Yield names and paths of a file of settings and, recursively, of files in its folder whose paths it contains."""
     if path is None:
         return
     folder = Path(path).parent
@@ -229,11 +242,12 @@ def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
 
 
 def _is_below(path: Path, folder: Path) -> bool:
-    """Whether an existing path lies below ``folder``, with links resolved."""
+    """True if an existing path lies below ``folder``, after links are resolved."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def _texts(content: Any) -> Iterator[str]:
+    """Yield all texts in nested tables and lists."""
     if isinstance(content, str):
         yield content
     elif isinstance(content, Mapping):

@@ -1,4 +1,4 @@
-"""Maps from a log: of its landmarks, of the RFID tags that it read, or of the points in its images."""
+"""Making of a map from a log: of its landmarks, of the RFID tags that it read, or of the points in its images."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
 
 SUFFIX = ".world.toml"
 POINTS = "points"
-KINDS = (POINTS, "landmarks", "tags")  # the first that a log has is mapped
-FLAGS = {  # options of one kind of map
+KINDS = (POINTS, "landmarks", "tags")  # kinds of maps; by default the first kind that a log has is mapped
+FLAGS = {  # by option that applies to one kind of map: its flag, and the kind
     "estimator": ("--estimator", "landmarks"),
     "settings": ("--set", "landmarks"),
     "tag_height": ("--tag-height", "tags"),
     "points": ("--set points", POINTS),
 }
-HEIGHTS = (-10.0, 20.0)  # m
+HEIGHTS = (-10.0, 20.0)  # m; bounds of the height of tags
 OF_REFERENCE = "that of the reference"
 BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without one"
 SOURCES = {"log": "the log's start", "reference": "its reference"}
@@ -63,12 +63,15 @@ Progress = Callable[[float], None]
 class MapOptions:
     """How a map is made.
 
-    ``of``: landmarks, tags or points; None: points if the log has images, landmarks if it has sightings of them, else tags.
-    ``estimator`` and ``settings``: for landmarks; ``points``: settings of points, fields of
-    :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`. ``extend``: keep the log's map, and add what it lacks. ``poses``:
-    of the robot, for tags: reference, or odometry, with estimation of the poses; None: the reference if there is one.
-    ``tag_height`` [m]: of tags that the log's map lacks; None: that of the antennas. ``drop_dead``: write the log's map without the
-    tags that are believed dead, and map nothing. ``prior``: see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
+    ``of``: landmarks, tags or points. None: points if the log has images, landmarks if it has sightings of them, else tags.
+    ``estimator``, ``settings``: the estimator of landmarks, and its settings.
+    ``points``: settings of a map of points, fields of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`.
+    ``extend``: whether to keep the log's map and to add what it lacks.
+    ``poses``: robot poses for a map of tags: reference, or odometry, with which the poses are estimated too. None: the reference if
+    the log has one, else odometry.
+    ``tag_height`` [m]: height of tags that the log's map lacks, None for the height of the antennas.
+    ``drop_dead``: if set, nothing is mapped, and the log's map is written without the tags that are believed dead.
+    ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
 
     of: str | None = None
@@ -84,7 +87,8 @@ class MapOptions:
 
 @dataclass(frozen=True)
 class DroppedTags:
-    """An edited map: ``dropped`` tags with their probability of being dead, and the number ``kept``."""
+    """The result of the removal of dead tags. ``dropped``: by removed tag, its probability of being dead. ``kept``: number of the
+    remaining tags."""
 
     dropped: Mapping[str, float]
     kept: int
@@ -92,9 +96,9 @@ class DroppedTags:
 
 @dataclass(frozen=True, eq=False)
 class MadeMap:
-    """A map: the ``world`` to be written; ``frame``: its frame in words; ``details``: results, by kind of map.
+    """A new map. ``world``: its content. ``frame``: a description of its frame. ``details``: results of the mapping.
 
-    ``warnings``: of the log and the run. ``draw`` makes a plot of it.
+    ``warnings``: warnings about the log and the run. ``draw``: returns a plot of the map.
     """
 
     world: World
@@ -104,22 +108,25 @@ class MadeMap:
     draw: Callable[[], Figure]
 
     def write(self, out: Path, *, overwrite: bool = False) -> None:
-        """Write the map and its plot. Raises InputError as :func:`plot_path`, or if they cannot be written."""
+        """Write the map to ``out``, and its plot next to it. Raises InputError as :func:`plot_path`, or if writing fails."""
         picture = plot_path(out, overwrite=overwrite)
-        with writing(out), replacing(picture) as temporary:  # write both or none
+        with writing(out), replacing(picture) as temporary:  # so that either both files are written, or none
             temporary.write_bytes(png_bytes(self.draw()))
             write_world(self.world, out)
 
 
 def plot_path(out: Path, *, overwrite: bool) -> Path:
-    """The path of the plot of a map. Raises InputError for a wrong name of the map, or if a file exists already."""
+    """Return the path of the plot of a map with the path ``out``.
+
+    Raises InputError if the name of the map does not end in :data:`SUFFIX`, or a file exists and ``overwrite`` is not set.
+    """
     return with_ending(out, SUFFIX, ".map.png", overwrite=overwrite)
 
 
 def make_map(log: Log, options: MapOptions | None = None, progress: Progress = lambda _share: None) -> MadeMap:
-    """Make a map from a log. An existing map of the log is compared, or extended.
+    """Make a map from a log. If the log has a map already, it is compared with the new map, or extended.
 
-    ``progress`` is called with the fraction done. Raises InputError for options that do not fit together or the log,
+    ``progress``: called with the fraction done. Raises InputError if options contradict each other or do not fit the log, and
     RunFailedError if nothing could be located.
     """
     options = options or MapOptions()
@@ -132,25 +139,28 @@ def make_map(log: Log, options: MapOptions | None = None, progress: Progress = l
 
 
 def _mapped_kind(log: Log, options: MapOptions) -> str:
-    """The kind of map. Raises InputError for options of another kind."""
+    """Return the kind of map to make: that of ``options.of``, or of other options, or the default for the log.
+
+    Raises InputError if an option belongs to another kind.
+    """
     if options.of not in (None, *KINDS):
         raise InputError(f"--of is {quoted(options.of)}, expected {' or '.join(KINDS)}")
     usual = MapOptions()
     given = {flag: kind for name, (flag, kind) in FLAGS.items() if getattr(options, name) != getattr(usual, name)}
     what = options.of or next(iter(given.values()), None) or _usual_kind(log, extend=options.extend)
     if flag := next((flag for flag, kind in given.items() if kind != what), None):
-        raise InputError(f"{flag} is for maps of {given[flag]}, but {what} are mapped here; leave {flag} out")
+        raise InputError(f"{flag} is for maps of {given[flag]}, but this is a map of {what}: remove {flag}")
     return what
 
 
 def _usual_kind(log: Log, *, extend: bool) -> str:
-    """The kind of map that is made by default."""
+    """Return the default kind of map for a log. ``extend``: if set, points are mapped only if the log's map has points."""
     known = _mappable(log) - ({POINTS} if extend and log.world.points is None else set())
     return next((kind for kind in KINDS if kind in known), "landmarks")
 
 
 def _mappable(log: Log) -> set[str]:
-    """The layers of a world that can be mapped from a log."""
+    """Return the kinds of maps that can be made from the streams of a log with its rig."""
     return {
         sensor.detects
         for sensor in sensors().values()
@@ -160,16 +170,17 @@ def _mappable(log: Log) -> set[str]:
 
 
 def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
+    """Make a map of landmarks by a run of an estimator."""
     estimator, settings = options.estimator, dict(options.settings)
     if estimator not in MAP_ESTIMATORS:
         raise InputError(
             f"--estimator is {quoted(estimator)}, expected one that estimates landmarks: {', '.join(MAP_ESTIMATORS)}"
         )
     if options.poses is not None:
-        raise InputError("--poses is for maps of tags, but landmarks are mapped here; leave it out")
+        raise InputError("--poses is for maps of tags, but this is a map of landmarks: remove --poses")
     if "landmarks" in settings:
         raise InputError(
-            f"--set is {estimator}.landmarks, but --extend alone selects how the map is used; leave it out"
+            f"--set is {estimator}.landmarks, but --extend alone selects how the map is used: remove this --set"
         )
     require_mappable(log)
     if options.extend and not log.world.landmarks:
@@ -189,6 +200,7 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
+    """Make a map of RFID tags."""
     uses_reference = _uses_reference(options, has_reference=log.reference is not None)
     height = options.tag_height
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
@@ -204,11 +216,11 @@ def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _without_dead(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
-    """The map without tags that were not read where the smoother expects them to be."""
+    """Return the log's map without dead tags: tags that were not read although the smoother expected reads."""
     if options != MapOptions(drop_dead=True, prior=options.prior):
         raise InputError("--drop-dead edits the log's map and maps nothing, expected no other option but --prior")
     if "tags" not in _mappable(log) or not log.world.tags:
-        raise InputError(f"{log.name}: has no reads, or no map of tags, expected both to find tags that are dead")
+        raise InputError(f"{log.name}: has no reads or no map of tags, but --drop-dead requires both")
     result = run(log, RunConfig("smoother", prior=options.prior), progress)
     dead = dict(sorted(result.diagnostics.doubted.get("dead_tags", {}).items(), key=lambda row: -row[1]))
     world = log.world.model_copy(update={"tags": {n: tag for n, tag in log.world.tags.items() if n not in dead}})
@@ -220,6 +232,7 @@ def _without_dead(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
+    """Make a map of points from images along the reference."""
     camera = log.rig.find(CameraSettings)
     if camera is None:
         raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
@@ -231,7 +244,7 @@ def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference for points: {BY_RUN}")
     settings = parse_model(PointSettings, options.points, "--set points")
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference that says where its images were taken: {BY_RUN}")
+        raise InputError(f"{log.name}: has no reference with the poses of its images: {BY_RUN}")
     observed, doubts = with_features(log, camera.frontend, lambda share: progress(share / 2.0))
     posed = posed_frames(observed)
     made = map_points(camera.model(), posed, settings, progress=lambda share: progress((1.0 + share) / 2.0))
@@ -247,14 +260,17 @@ def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _uses_reference(options: MapOptions, *, has_reference: bool) -> bool:
-    """Whether the robot's poses are those of the reference; ``has_reference``: whether a usable one exists."""
+    """True if a map of tags is made with the poses of the reference. ``has_reference``: whether the log has a reference."""
     if options.poses not in (None, "reference", "odometry"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference or odometry")
     return has_reference if options.poses is None else options.poses == "reference"
 
 
 def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
-    """The log with an exact start, and its position in words."""
+    """Return the log with a start pose that is known exactly, and a description of the start.
+
+    The start is exact, because it defines the frame of the map.
+    """
     start, source = resolve_prior(log, prior)
     if start is None:
         t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"
@@ -264,7 +280,10 @@ def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
 
 
 def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str]:
-    """The start of the robot, and the frame in words. If no map is used the start is exact, as it defines the frame."""
+    """Return the prior of the start for a map of tags without a reference, and a description of the map's frame.
+
+    The prior is None if the start is unknown. If the log's map is not extended, the start is exact, because it defines the frame.
+    """
     prior, source = resolve_prior(log, options.prior)
     if prior is None or (options.extend and not prior.has_heading):
         if options.extend:
@@ -276,6 +295,7 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
 
 
 def _in_words(start: PosePrior, source: str) -> str:
+    """Describe a start pose and its source."""
     x, y, heading = start.pose
     chosen = "" if start.has_heading else ", which has no heading"
     source = SOURCES.get(source, "--prior")

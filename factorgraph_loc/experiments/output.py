@@ -1,5 +1,4 @@
-"""Files of a run: trajectories, estimates, learnt values, events, scores, configuration. Files kept by a store. Tables of several
-runs.
+"""Writing of the files of a run (trajectories, estimates, learnt values, events, scores, configuration) and of tables of runs.
 
 Except for times, all files of a run are reproducible to the byte.
 """
@@ -50,29 +49,31 @@ TABLES = ("results.csv", "differences.csv", "table.md")
 def write_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Score a run, write its files into the folder ``out``, and return the scores; for ``align`` see
-    :func:`~factorgraph_loc.evaluation.metrics.score`.
+    """Score a run, write its files into the folder ``out``, and return the scores.
 
-    ``estimates.parquet`` has one row per tick and kind: ``kind`` (causal, final), ``t_ns`` (absolute), ``x``, ``y`` [m],
-    ``heading`` [rad], covariances in the world frame; ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees`` at the
-    stamp of the reference nearest to the tick (null if another tick is nearer); ``update_ms`` (causal: the slowest update since the
-    previous tick, null if there was none), and of the causal estimate ``status`` and ``doubts_model`` (whether measurements
-    contradict the model of their sensor). ``causal.tum`` contains the estimates from the first localized one on. ``learnt.json``:
-    ``constants`` by name with ``value`` and ``sigma``, ``landmarks`` by name with ``x``, ``y`` [m] and ``covariance`` (xx, xy, yy)
-    [m^2] in the world frame. ``events.csv``: ``t_ns`` (absolute), ``t`` [s from the log's start] and the event.
-    ``innovations.parquet``: ``sensor``, ``t_ns`` (absolute), the normalised innovation squared ``nis`` and its degrees of freedom
-    ``dof``, of each update. ``map.world.toml`` and the file of its points: the map with the learnt points, if there are any; see
-    :func:`map_of`.
+    ``align``: see :func:`~factorgraph_loc.evaluation.metrics.score`. The files are written to a temporary folder first. Other files
+    in ``out`` are not changed. Raises InputError if ``out`` contains results and ``overwrite`` is not set. The files are:
 
-    Everything is written to a temporary folder first; other files in ``out`` are not changed. Raises InputError if ``out``
-    contains results and ``overwrite`` is off.
+    - ``final.tum``, ``causal.tum``: trajectories. The latter starts when the robot is localized first.
+    - ``estimates.parquet``: a row for each tick and ``kind`` (causal, final), with the timestamp ``t_ns``, ``x``, ``y`` [m],
+      ``heading`` [rad] and covariances in the world frame. ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees``
+      are those at the timestamp of the reference nearest to the tick, null if another tick is nearer. ``update_ms`` is the slowest
+      update since the previous tick, null if there was none or for the kind final. ``status`` and ``doubts_model`` (whether
+      measurements contradict the model of their sensor) are those of the causal estimate.
+    - ``learnt.json``: ``constants`` by name with ``value`` and ``sigma``; ``landmarks`` by name with ``x``, ``y`` [m] and
+      ``covariance`` (xx, xy, yy) [m^2] in the world frame.
+    - ``events.csv``: the timestamp ``t_ns``, the time ``t`` [s] since the log's start, and the event.
+    - ``innovations.parquet``: for each update the ``sensor``, the timestamp ``t_ns``, the normalised innovation squared ``nis`` and
+      its degrees of freedom ``dof``.
+    - ``metrics.json``: the scores. ``config.toml``: the configuration of the run.
+    - ``map.world.toml`` and a file of points: the map with the points that the run learnt, if there are any; see :func:`map_of`.
     """
     require_free(out, FILES, overwrite=overwrite)
     scores = score(result, log, align)
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(out) as temporary:
-            content = temporary / "run"  # with the permissions of any new folder
+            content = temporary / "run"  # unlike the temporary folder, it has the usual permissions of a new folder
             content.mkdir()
             write_files(result, log, scores, content)
             if (world := map_of(result, log)) is not None:
@@ -89,8 +90,8 @@ def write_run(
 def save_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Write a run as :func:`write_run` does. If that fails, the files go to a new folder in the system's temporary folder, and the
-    InputError names it."""
+    """Write the files of a run as :func:`write_run`. If that fails, they are written to a new folder in the temporary folder of the
+    system, and the raised InputError names this folder."""
     try:
         return write_run(result, log, out, align=align, overwrite=overwrite)
     except InputError as error:
@@ -101,7 +102,7 @@ def save_run(
 
 
 def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
-    """Write a run into a new folder in the system's temporary folder; None if that fails too."""
+    """Write the files of a run to a new folder in the temporary folder of the system. Return the folder, or None on failure."""
     folder = None
     try:
         folder = Path(tempfile.mkdtemp(prefix="fgloc-run-"))
@@ -114,7 +115,7 @@ def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
 
 
 def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:
-    """Write the files of a run with these scores into an empty folder; see :func:`write_run`."""
+    """Write the files of a run into an empty folder, except for a map; see :func:`write_run`. ``scores``: of the run."""
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
     write_tum(result.final, folder / FINAL, log.t0_ns)
     write_tum(causal, folder / CAUSAL, log.t0_ns)
@@ -127,9 +128,9 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
 
 
 def map_of(result: RunResult, log: Log) -> World | None:
-    """The log's map with the points that a run learnt; None without any.
+    """Return the log's map with the points that a run learnt, or None if the run learnt no points.
 
-    They replace the points of the map, or are added to these if the run used them.
+    The learnt points replace those of the map. If the run extended the map, they are added to its points.
     """
     points, known = result.learnt.points, log.world.points
     if points is None or not len(points):
@@ -142,9 +143,10 @@ def map_of(result: RunResult, log: Log) -> World | None:
 
 
 def with_ending(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
-    """The path ``out`` with its ``suffix`` replaced by ``ending``.
+    """Return the path ``out`` with its ``suffix`` replaced by ``ending``, for a second file next to ``out``.
 
-    Raises InputError if the name of ``out`` has another suffix, if its folder is missing, or if either file exists already.
+    Raises InputError if the name of ``out`` has another suffix, if its folder is missing, or if either file exists and
+    ``overwrite`` is not set.
     """
     name = out.name.removesuffix(suffix)
     if name in ("", out.name):
@@ -160,13 +162,13 @@ def with_ending(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path
 
 
 def remove_run(out: Path) -> None:
-    """Remove the files of a previous run, the mark of completeness first, and nothing else."""
+    """Remove the files of a previous run from a folder. The file that marks a complete run is removed first."""
     for name in (*reversed(FILES), *(path.name for path in out.glob(f"{MAP.partition('.')[0]}.*"))):
         (out / name).unlink(missing_ok=True)
 
 
 def estimates(result: RunResult, log: Log) -> pl.DataFrame:
-    """The table of ``estimates.parquet``; see :func:`write_run`."""
+    """Return the table of ``estimates.parquet``; see :func:`write_run`."""
     flags = pl.DataFrame(
         {"status": list(result.status), "doubts_model": list(result.doubts_model) or [False] * len(result.status)},
         {"status": pl.String, "doubts_model": pl.Boolean},
@@ -182,7 +184,7 @@ def estimates(result: RunResult, log: Log) -> pl.DataFrame:
 
 
 def learnt_tables(learnt: Learnt) -> dict[str, Any]:
-    """The content of ``learnt.json``; see :func:`write_run`."""
+    """Return the content of ``learnt.json``; see :func:`write_run`."""
     constants = {name: {"value": value, "sigma": sigma} for name, (value, sigma) in learnt.values.items()}
     landmarks = {}
     for name, point in learnt.landmarks.items():
@@ -193,13 +195,13 @@ def learnt_tables(learnt: Learnt) -> dict[str, Any]:
 
 
 def events(result: RunResult, log: Log) -> pl.DataFrame:
-    """The table of ``events.csv``; see :func:`write_run`."""
+    """Return the table of ``events.csv``; see :func:`write_run`."""
     rows = [(log.t0_ns + round(e.t * 1e9), e.t, str(e)) for e in result.diagnostics.events]
     return pl.DataFrame(rows, schema={"t_ns": pl.Int64, "t": pl.Float64, "event": pl.String}, orient="row")
 
 
 def innovations(result: RunResult, log: Log) -> pl.DataFrame:
-    """The table of ``innovations.parquet``; see :func:`write_run`."""
+    """Return the table of ``innovations.parquet``; see :func:`write_run`."""
     updates = sorted(result.diagnostics.nis.items())
     rows = [(sensor, log.t0_ns + round(t * 1e9), nis, dof) for sensor, rows in updates for t, nis, dof in rows]
     schema = {"sensor": pl.String, "t_ns": pl.Int64, "nis": pl.Float64, "dof": pl.Float64}
@@ -214,6 +216,7 @@ def _rows(
     update_ms: Array,
     flags: pl.DataFrame,
 ) -> pl.DataFrame:
+    """Return the rows of ``estimates.parquet`` for one trajectory. ``flags``: the columns ``status`` and ``doubts_model``."""
     n = len(trajectory)
     covariances = trajectory.covariances if trajectory.covariances is not None else np.full((n, 3, 3), np.nan)
     position, heading, nees = np.full((3, n), np.nan)
@@ -239,17 +242,19 @@ def _rows(
 
 
 def _slowest_update(result: RunResult) -> Array:
+    """Return for each tick the time [ms] of the slowest update since the previous tick, NaN if there was none."""
     slowest = np.full(len(result.t), np.nan)
     tick = np.searchsorted(result.t, result.timings.update_t)
-    inside = tick < len(result.t)  # updates after the last tick belong to none
+    inside = tick < len(result.t)  # updates after the last tick are omitted
     np.fmax.at(slowest, tick[inside], result.timings.update_ms[inside])
     return slowest
 
 
 def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:
-    """The files of a run by name: see :func:`~factorgraph_loc.experiments.output.write_run`; ``update_ms`` is empty.
+    """Return the content of the files of a run by name, for the store of an experiment.
 
-    ``started``: the value of ``perf_counter`` at the start, to compute the total time.
+    The files are those of :func:`write_run`, except that times are in a file of their own and ``update_ms`` is empty. Therefore all
+    other files are reproducible. ``started``: value of ``perf_counter`` at the start of the run.
     """
     scores = score(result, log, align)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}
@@ -261,7 +266,7 @@ def run_files(result: RunResult, log: Log, started: float, align: Alignment = "n
 
 
 def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out: Path) -> None:
-    """Write :data:`TABLES` into a folder: a row per run, the differences between methods, and ``text``."""
+    """Write :data:`TABLES` into the folder ``out``: a row for each run, the differences between methods, and the text ``text``."""
     write_text(out / "results.csv", plain_lines(table.write_csv()))
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))

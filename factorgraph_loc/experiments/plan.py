@@ -1,4 +1,4 @@
-"""Planning of an experiment: its runs with their keys, before any of them is made."""
+"""Planning of an experiment: it lists all runs with the keys of their results, before any run is executed."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from factorgraph_loc.text import quoted
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedRun(RunConfig):
-    """One run, as plain data that can be sent to other processes.
+    """A planned run of an estimator on a log, which can be sent to other processes.
 
-    ``source``: of the log, whose content has the digest ``log_digest``; ``log``: its name; ``duration`` [s] of it. ``label``: of
-    the estimator with these settings; ``sweep``: swept settings by dotted name. ``key``: of its results.
+    ``source``: source of the log. ``log_digest``: hash of its content. ``log``: name of the log. ``duration`` [s]: of the log.
+    ``label``: label of the estimator. ``sweep``: by dotted name, the values of swept settings. ``key``: key of the results.
     """
 
     source: LogSource
@@ -48,13 +48,14 @@ class PlannedRun(RunConfig):
 
     @property
     def shown(self) -> str:
-        """A description that distinguishes it from the other runs."""
+        """A description that distinguishes this run from the other runs, for messages."""
         swept = "".join(f", {key} {value}" for key, value in self.sweep.items())
         return f"{self.log}, {self.label}{swept}, seed {self.seed}"
 
     @property
     def columns(self) -> dict[str, Any]:
-        """The first columns of its row, see :func:`~factorgraph_loc.experiments.result_table.load_results`."""
+        """The first columns of the run's row in the table of results, see
+        :func:`~factorgraph_loc.experiments.result_table.load_results`."""
         return {
             "label": self.label,
             "log": self.log,
@@ -68,7 +69,10 @@ class PlannedRun(RunConfig):
         }
 
     def make(self) -> dict[str, bytes]:
-        """The files of the run. Raises VanishedError if the log differs from the planned one, FglocError if the run fails."""
+        """Execute the run, and return the content of its files by name.
+
+        Raises VanishedError if the log has changed since the experiment was planned, and FglocError if the run fails.
+        """
         from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
         from factorgraph_loc.experiments.run import run  # noqa: PLC0415
 
@@ -79,6 +83,8 @@ class PlannedRun(RunConfig):
 
 @dataclass(frozen=True)
 class _PlannedLog(LogFacts):
+    """Facts about a log, its source, and the hash of its content."""
+
     source: LogSource
     digest: str
 
@@ -91,13 +97,17 @@ def plan(
     *,
     given: Sequence[LogSource] = (),
 ) -> list[PlannedRun]:
-    """All runs of an experiment with paths relative to ``folder``; cached facts are stored below ``cache``. ``given``: logs in
-    place of those that the experiment names.
+    """Return all runs of an experiment.
 
-    Estimators are run once for values of a sweep that do not apply to them, deterministic ones with the first seed only.
+    ``folder``: paths in the experiment are relative to it. ``cache``: folder for cached facts about logs and estimators.
+    ``data_root``: the data folder, None for the environment variable FGLOC_DATA. ``given``: sources of logs that replace those of
+    the experiment.
 
-    Before any log is read, raises InputError for more than :data:`MOST_RUNS` runs. Before anything runs, raises it for an
-    unreadable log, two logs of one name, invalid settings or prior, or a sensor that no log has.
+    Swept settings of one estimator do not multiply the runs of other estimators. Deterministic estimators run only with the first
+    seed.
+
+    Raises InputError for more than :data:`MOST_RUNS` runs, an unreadable log, two logs with the same name, invalid settings, an
+    invalid prior, or a sensor that no log has.
     """
     facts = Facts(cache / "facts.json")
     experiment = _placed(experiment, folder, data_root)
@@ -114,12 +124,13 @@ def plan(
             facts.estimator(entry.name, _settings(entry, swept))  # report a wrong setting before logs are read
     try:
         runs = _all_runs(experiment, recorded, facts)
-    finally:  # keep what was looked up, even if interrupted
+    finally:  # facts are kept even if the planning is interrupted
         facts.save()
     return runs
 
 
 def _all_runs(experiment: Experiment, recorded: Mapping[int, Sequence[LogSource]], facts: Facts) -> list[PlannedRun]:
+    """Return all runs of an experiment. ``recorded``: by index in ``experiment.logs``, the sources of recorded logs."""
     sweep = experiment.sweep
     of_others = {entry.shown: sweep.points(entry.shown, entry.name) for entry in experiment.estimators}
     of_simulated = {entry.shown: _by_simulation(sweep, entry) for entry in experiment.estimators}
@@ -146,7 +157,7 @@ def _all_runs(experiment: Experiment, recorded: Mapping[int, Sequence[LogSource]
 
 
 def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
-    """The number of runs on ``recorded`` sources, each with at least one log, and on the simulated logs."""
+    """Return a lower bound for the number of runs. ``recorded``: number of sources of recorded logs, each with a log or more."""
     simulated = sum(len(entry.seeds) for entry in experiment.logs if entry.simulate is not None)
     total = 0
     for entry in experiment.estimators:
@@ -159,12 +170,13 @@ def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
 
 
 def _check_count(count: int, experiment: Experiment) -> None:
+    """Raise InputError if a number of runs is too large."""
     if count > MOST_RUNS:
         raise InputError(f"the experiment {experiment.name} plans more than {MOST_RUNS:,} runs")
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
-    """The points of a sweep that apply to an estimator or to simulated logs, by the values of the latter."""
+    """Return combinations of swept settings of an estimator and of simulated logs, grouped by the values of the latter."""
     points: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
         points.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)
@@ -174,6 +186,7 @@ def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...],
 def _runs(
     experiment: Experiment, log: _PlannedLog, entry: EstimatorEntry, point: Mapping[str, Any], facts: Facts
 ) -> Iterator[PlannedRun]:
+    """Yield the runs of an estimator on a log at a ``point`` of the sweep: one for each set of sensors and each seed."""
     settings = _settings(entry, point)
     estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
@@ -198,7 +211,7 @@ def _runs(
 
 
 def _placed(experiment: Experiment, folder: Path, data_root: str | None) -> Experiment:
-    """The experiment with the paths of its rigs, maps and simulations in place of their names."""
+    """Return the experiment with the names of its rigs, maps and simulations replaced by paths."""
 
     def placed(entry: LogEntry) -> LogEntry:
         named = {"rig": entry.rig, "world": entry.world}
@@ -211,6 +224,7 @@ def _placed(experiment: Experiment, folder: Path, data_root: str | None) -> Expe
 
 
 def _recorded(entry: LogEntry, folder: Path, data_root: str | None) -> list[RecordedSource]:
+    """Return the sources of an entry with recorded logs."""
     assert entry.log is not None
     return recorded_sources(
         entry.log,
@@ -224,6 +238,7 @@ def _recorded(entry: LogEntry, folder: Path, data_root: str | None) -> list[Reco
 
 
 def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSource]:
+    """Return the sources of an entry with simulated logs, one per seed, at a ``point`` of the sweep of the simulation."""
     assert entry.simulate is not None
     settings = json.loads(canonical(entry.settings))
     for key, value in point.items():
@@ -232,6 +247,7 @@ def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSourc
 
 
 def _logs(sources: Sequence[LogSource], facts: Facts) -> Iterator[_PlannedLog]:
+    """Yield all logs of several sources."""
     for first in sources:
         for number, log in enumerate(facts.logs(first, facts.digest(first))):
             source = RecordedSource(**vars(first) | {"number": number}) if isinstance(first, RecordedSource) else first
@@ -239,7 +255,7 @@ def _logs(sources: Sequence[LogSource], facts: Facts) -> Iterator[_PlannedLog]:
 
 
 def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of an estimator at a point of the sweep."""
+    """Return the settings of an estimator at a ``point`` of the sweep."""
     settings: dict[str, Any] = json.loads(canonical(entry.settings))
     for key, value in _part(point, (entry.shown, entry.name)).items():
         set_key(settings, key.partition(".")[2], value, "the sweep")
@@ -247,7 +263,7 @@ def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _part(point: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """The part of a sweep's point that applies to ``words``."""
+    """Return the values of a ``point`` of the sweep whose names start with one of ``words``."""
     return {key: value for key, value in point.items() if key.partition(".")[0] in words}
 
 
@@ -256,6 +272,7 @@ def _is_simulated(log: _PlannedLog) -> bool:
 
 
 def _check(logs: Sequence[_PlannedLog], sensors: Sequence[tuple[str, ...] | None]) -> None:
+    """Raise InputError if two logs have the same name, or if no log has one of the ``sensors``."""
     names = [log.name for log in logs]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"two logs are called {twice[0]}, expected different names")

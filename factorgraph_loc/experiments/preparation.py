@@ -1,4 +1,4 @@
-"""Preparation of a run: its start (of the user, the log or the reference), its sensors, and the preparation by their packages."""
+"""Preparation of a run: the prior of its start pose, its sensors, and checks by the packages of the sensors."""
 
 from collections.abc import Collection, Iterable, Sequence
 
@@ -15,20 +15,25 @@ from factorgraph_loc.sensors.interfaces import Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
 from factorgraph_loc.text import Notice, listed, notice, quoted
 
-# of a start taken from the reference
+# standard deviations of a start pose that is a pose of the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
 
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
-    """The Gaussian prior of the start of a run, and the name of its source.
+    """Return the Gaussian prior of the start pose of a run, and the name of its source. The prior of an unknown start is None.
 
-    ``prior``: ``reference`` (the first reference pose at or after the first odometry, 0.02 m and 0.01 rad), ``log`` (the start
-    stated by the log), ``X,Y,HEADING`` [m, m, rad] (at the first odometry, 0.05 m and 0.05 rad), ``X,Y`` with unknown heading, or
-    ``unknown``. None: the log's start, else the reference, else unknown. An unknown start is returned as None. For a reference
-    without headings, the heading is unknown too.
+    ``prior`` is one of these:
 
-    Raises InputError if the log lacks what is requested, or ``prior`` is none of these.
+    - "reference": the first pose of the reference at or after the first odometry, with standard deviations of 0.02 m and 0.01 rad.
+      If the reference has no headings, the heading is unknown.
+    - "log": the start pose in the log.
+    - "X,Y,HEADING" [m, m, rad]: a pose at the first odometry, with standard deviations of 0.05 m and 0.05 rad.
+    - "X,Y" [m]: a position at the first odometry, with unknown heading.
+    - "unknown": an unknown start.
+    - None: the log's start, or the reference if the log has none, or an unknown start if there is no reference.
+
+    Raises InputError if the log has no such start, or ``prior`` is none of these.
     """
     if prior is None:
         prior = "log" if log.start is not None else "unknown" if log.reference is None else "reference"
@@ -47,12 +52,15 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
 
 
 def at_origin(log: Log) -> PosePrior:
-    """The start (0, 0, 0) of a log without other information, at the first odometry: exact, as it defines the frame."""
+    """Return the prior of a start pose (0, 0, 0) at the first odometry. It is exact, because it defines the frame."""
     return PosePrior(first_odometry(log), np.zeros(3), _covariance(EXACT_SIGMA, EXACT_SIGMA))
 
 
 def first_odometry(log: Log) -> float:
-    """Stamp of the first odometry [s], clock offset applied; of the first measurement if there is no odometry."""
+    """Return the time [s] of the first odometry, or of the first measurement if there is no odometry.
+
+    The offset of the sensor's clock is applied.
+    """
     starts = [
         float(t.min()) + log.rig.time_offset(name) for name in moving(log.streams) if len(t := log.streams[name].t)
     ]
@@ -60,6 +68,7 @@ def first_odometry(log: Log) -> float:
 
 
 def _from_reference(log: Log) -> PosePrior:
+    """Return a prior at the first pose of the reference at or after the first odometry. Raises InputError without such a pose."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference to start from, expected a prior {PRIORS}")
     start = first_odometry(log)
@@ -76,17 +85,22 @@ def _from_reference(log: Log) -> PosePrior:
 
 
 def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArray[np.float64]:
+    """Return the covariance (3, 3) of a pose from standard deviations [m, rad]."""
     return np.diag(np.square((position_sigma, position_sigma, heading_sigma)))
 
 
 def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
-    """The channels that are columns of ``streams``."""
+    """Return the names of the sensors that are optional columns of ``streams``, such as the signal strength of RFID reads."""
     available = set(streams)
     return tuple(name for name in channels() if parent_of(name) in available)
 
 
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The sensors to use: those of the rig that the log has, or ``asked``, which must be available."""
+    """Return the names of the sensors that a run uses.
+
+    ``asked``: the requested sensors, None for those of the rig that the log has. Raises InputError if a requested sensor is not
+    available, or no sensor is.
+    """
     available = (*log.streams, *_filled_columns(log))
     asked = None if asked is None else log.rig.expanded(asked)
     for sensor in asked or ():
@@ -112,7 +126,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
-    """Warnings about unusable sensors of the rig, and about missing odometry."""
+    """Return warnings about sensors of the rig that cannot be used, and about missing odometry. ``sensors``: the used ones."""
     available = (*log.streams, *_filled_columns(log))
     sentence = "{log}: the rig lists the sensor {sensor}, the log has none"
     doubts = [notice("no_stream", sentence, log.name, s) for s in log.rig.sensors if s not in available]
@@ -129,20 +143,23 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
 
 
 def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel, given: Collection[str] = ()) -> Use:
-    """The description of a run for the sensors' packages; ``given``: the settings that the user has set."""
+    """Return a description of a run, which the packages of the sensors check. ``given``: settings that the user has set."""
     kind = registry.estimator_type(estimator)
     modalities = getattr(kind, "modalities", frozenset[str]())
     return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False), given)
 
 
 def checked_use(use: Use) -> Use:
-    """The run with the settings that its sensors require of it; InputError if log and settings do not fit."""
+    """Check a run by the packages of its sensors. Return it with settings that they may have changed.
+
+    Raises InputError if the settings do not fit the log.
+    """
     for _, check in functions("check"):
         use = check(use)
     return use
 
 
 def _filled_columns(log: Log) -> tuple[str, ...]:
-    """The columns that have a value in any row of the log."""
+    """Return the names of optional columns (:func:`columns_of`) that have a value in any row of the log."""
     names = columns_of(log.streams)
     return tuple(n for n in names if np.any(np.isfinite(getattr(log.streams[parent_of(n)], n, np.nan))))

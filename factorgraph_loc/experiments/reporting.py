@@ -1,4 +1,4 @@
-"""The report of an experiment."""
+"""Writing of the report of an experiment as an HTML page."""
 
 import json
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ PAGE = "report.html"
 
 @dataclass(frozen=True)
 class Report:
-    """The ``page`` that was written, and descriptions of the ``damaged`` runs that it excludes."""
+    """A written report. ``page``: its path. ``damaged``: descriptions of runs with damaged results, which it excludes."""
 
     page: Path
     damaged: list[str]
@@ -38,8 +38,9 @@ def report(
     out: str | Path | None = None,
     data_root: str | Path | None = None,
 ) -> Report:
-    """Write the results of an experiment as an HTML page into its folder; for the arguments see
-    :func:`~factorgraph_loc.experiments.experiment.prepare`. Damaged results are listed on the page and left out.
+    """Write the results of an experiment as an HTML page into its folder. Damaged results are listed there, but not used.
+
+    For the arguments see :func:`~factorgraph_loc.experiments.experiment.prepare`.
     """
     return report_experiment(*prepare(file, changes, out=out, data_root=data_root))
 
@@ -47,8 +48,8 @@ def report(
 def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) -> Report:
     """Write the report of all existing results of an experiment into its folder.
 
-    All results are compared with their checksums; damaged ones are named and excluded. Scenes of the logs are kept in the store.
-    Raises InputError without any results, or if the page cannot be written.
+    All results are compared with their checksums. Damaged results are listed and excluded. Maps and references of the logs are
+    cached in the store. Raises InputError if there are no results, or if the page cannot be written.
     """
     prepared = Prepared.of(prepared.folder, prepared.runs, prepared.limits)
     damaged = [run.shown for run in prepared.damaged()]
@@ -80,14 +81,14 @@ def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) ->
 
 
 def _scene(run: PlannedRun, kept: Path) -> Scene | None:
-    """The scene of a run's log; None if the log has disappeared."""
+    """Return the map and reference of a run's log. ``kept``: file in which they are cached. None if the log cannot be read."""
     with suppress(OSError, ValueError):
         return Scene.model_validate_json(kept.read_bytes())
     try:
         scene = Scene.of(run.source.load())
     except InputError:
         return None
-    with suppress(OSError):  # results may be read-only
+    with suppress(OSError):  # the folder of the results may be read-only
         kept.parent.mkdir(parents=True, exist_ok=True)
         write_text(kept, scene.model_dump_json())
     return scene

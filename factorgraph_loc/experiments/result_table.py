@@ -1,4 +1,4 @@
-"""The table of all results of an experiment, with a row per run."""
+"""The table of all results of an experiment, with a row for each run."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +18,7 @@ TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "rea
 
 
 def collect(runs: Iterable[Planned], store: Store) -> pl.DataFrame:
-    """The rows of those runs whose results are stored; see :func:`load_results`. Raises DamagedError for a damaged one."""
+    """Return the table of runs whose results are stored; see :func:`load_results`. Raises DamagedError if a result is damaged."""
     rows = [run.columns | store.row(run.key) for run in runs]
     keys = dict.fromkeys(key for row in rows for key in row) or dict.fromkeys(sorted(TEXTS))
     table = pl.DataFrame(rows, schema=list(keys), infer_schema_length=None)
@@ -29,7 +29,7 @@ def collect(runs: Iterable[Planned], store: Store) -> pl.DataFrame:
 
 
 def write_index(table: pl.DataFrame, folder: Path) -> None:
-    """Write the table into ``folder``, atomically. Raises StoreError if it cannot be written."""
+    """Write the table of results into ``folder``, atomically. Raises StoreError if it cannot be written."""
     try:
         write_parquet(table, folder / INDEX)
     except OSError as error:
@@ -37,13 +37,17 @@ def write_index(table: pl.DataFrame, folder: Path) -> None:
 
 
 def load_results(path: str | Path) -> pl.DataFrame:
-    """Load the results of an experiment from the folder ``path``, with a row per run.
+    """Load the results of an experiment from the folder ``path``, as a table with a row for each run.
 
-    Columns: ``label``, ``log``, ``estimator``, ``sensors`` (comma-separated; null for those of the rig), ``prior``, ``seed``,
-    ``sweep.KEY`` of each swept setting (null if it does not apply to the run), ``status`` (ok, failed), ``kind`` (error, timeout,
-    memory, killed, vanished) and ``reason`` of a failure, ``key`` in the store, ``duration`` [s] of the log, ``warnings`` (one
-    per line), and the scores of :func:`~factorgraph_loc.evaluation.metrics.score` (null in failed runs). Raises InputError if
-    there are no results.
+    The columns are:
+
+    - ``label``, ``log``, ``estimator``, ``prior``, ``seed``. ``sensors``: separated by commas, null for those of the rig.
+    - ``sweep.KEY``: value of each swept setting, null if it does not apply to the run.
+    - ``status``: ok or failed. Of a failure, ``kind`` (error, timeout, memory, killed, vanished) and ``reason``.
+    - ``key``: key of the results in the store. ``duration`` [s]: of the log. ``warnings``: one on each line.
+    - the scores of :func:`~factorgraph_loc.evaluation.metrics.score`, null for failed runs.
+
+    Raises InputError if there are no results.
     """
     file = Path(path) / INDEX if kind(Path(path)) == "a folder" else Path(path)
     try:

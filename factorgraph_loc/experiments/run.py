@@ -1,4 +1,4 @@
-"""One run of an estimator on a log: process measurements in the order of arrival, and store and time the estimates."""
+"""A run of an estimator on a log: preparation, the main loop over the measurements, and the final trajectory."""
 
 import importlib.metadata
 import math
@@ -40,8 +40,8 @@ from factorgraph_loc.sensors.registry import detecting, functions, moving
 from factorgraph_loc.text import Notice, notice
 from factorgraph_loc.version import __version__
 
-_REHEARSAL = 2.0  # s from the first observation
-_REHEARSED: set[tuple[str, tuple[str, ...]]] = set()  # estimators with their sensors, in this process
+_REHEARSAL = 2.0  # s; duration of a rehearsal, see _rehearse, after the first observation
+_REHEARSED: set[tuple[str, tuple[str, ...]]] = set()  # estimators and sensors that this process has rehearsed
 
 
 def run(
@@ -52,13 +52,16 @@ def run(
 ) -> RunResult:
     """Run an estimator on a log.
 
-    The ticks are at 10 Hz from the prior's time on, except inside long gaps between measurements (``tick_gap``). A tick comes
-    after all measurements that arrived up to its time; the estimate after it is the causal one. Odometry older than the prior is
-    processed before the estimator is initialized, because its velocity is held; other measurements older than the prior are
-    counted as ignored. With an unknown start the ticks begin at the first measurement, and the final trajectory begins at the
-    first belief and may be empty. A log with neither start nor reference, and without a map that its sensors observe, begins at
-    (0, 0, 0). ``progress`` is called with the fraction done; if features are extracted, this is the first half. ``watch``
-    is called with the time and the estimator after each tick, to inspect its belief.
+    ``progress``: called with the fraction done. If features are extracted from images, this is the first half.
+    ``watch``: called with the time and the estimator after each tick, for instance to inspect its belief.
+
+    Causal estimates are recorded at ticks, which are at 10 Hz from the time of the prior on, except inside long gaps between
+    measurements (``config.tick_gap``). The estimator processes all measurements that arrive up to a tick before the estimate is
+    recorded. Odometry older than the prior is processed before the estimator is initialized, because it determines the initial
+    velocity. Other measurements older than the prior are counted as ignored.
+
+    With an unknown start, ticks begin at the first measurement. The final trajectory begins at the first estimate and may be empty.
+    A log with neither start nor reference, and without a map that its sensors observe, starts at the pose (0, 0, 0).
 
     Raises InputError if the configuration does not fit the log. Raises RunFailedError, with the time and the measurement, if the
     estimator fails, or if a pose is not finite or a covariance not positive definite; see :mod:`factorgraph_loc.fusion.guarded`.
@@ -94,10 +97,10 @@ def run(
 
 
 def _use(log: Log, config: RunConfig) -> Use:
-    """The sensors and settings of a run. Raises InputError if the log or the configuration is out of bounds."""
+    """Return the sensors and settings of a run. Raises InputError if values of the log or the configuration are out of bounds."""
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
-    require_bounds(log)  # the log may have been made by a program
+    require_bounds(log)  # a log that a program has made was not checked by a reader
     require_one_span(log)
     sensors = used_sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)
@@ -105,7 +108,7 @@ def _use(log: Log, config: RunConfig) -> Use:
 
 
 class _Start(NamedTuple):
-    """The prior of a run, None if the start is unknown, the name of its source, and warnings."""
+    """The start of a run: its ``prior``, None if the start is unknown, the name of its ``source``, and warnings."""
 
     prior: PosePrior | None
     source: str
@@ -113,10 +116,13 @@ class _Start(NamedTuple):
 
 
 def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior | None, source: str) -> _Start:
-    """The start of a run with the stated ``prior``; InputError if the estimator cannot start there."""
+    """Return the start of a run. ``prior``, ``source``: the requested prior and its source.
+
+    Raises InputError if the estimator cannot start from an unknown pose or an unknown heading.
+    """
     log = use.log
     if prior is None and config.prior is None and not detecting(log.world, log.streams):
-        sentence = "{log}: has neither a start nor a reference: begins at (0, 0, 0); --prior says where else"
+        sentence = "{log}: has neither a start nor a reference: begins at (0, 0, 0); set --prior for another start"
         return _Start(at_origin(log), "origin", (notice("no_start", sentence, log.name),))
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
@@ -133,7 +139,7 @@ def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior |
 
 
 def _ended(guard: Guard, estimator: Estimator, frame: MapFrame) -> tuple[Ending, float]:
-    """The end of a run, and the seconds that the final trajectory took."""
+    """Return the final results of an estimator, and the computing time [s] of the final trajectory."""
     started = perf_counter()
     with guard.computing("the final trajectory"):
         final = frame.trajectory(sound_trajectory(estimator.trajectory()))
@@ -153,6 +159,7 @@ def _result(
     end: Ending,
     final_seconds: float,
 ) -> RunResult:
+    """Collect the result of a run, with its effective configuration and all warnings."""
     log = use.log
     reviews = {name: review(use, end) for name, review in functions("review")}
     reliability = {name: result.reliability for name, result in reviews.items() if result.reliability is not None}
@@ -202,7 +209,7 @@ def _rehearse(
 ) -> None:
     """Run an estimator on the first seconds with observations, so that compiled functions are loaded before times are measured.
 
-    This is done once in a process for each estimator and its sensors. Errors are ignored, as the run repeats them.
+    A process does this once for each estimator and set of sensors. Errors are ignored, because the run itself repeats them.
     """
     kind = config.estimator, setup.sensors
     if kind in _REHEARSED:
@@ -223,7 +230,7 @@ def _rehearse(
 
 
 def _begin(log: Log, sensors: tuple[str, ...], prior: PosePrior | None) -> float:
-    """The time of the first tick. Raises InputError if there are no measurements from then on."""
+    """Return the time [s] of the first tick. Raises InputError if it is after the last measurement."""
     first, last = span_of(log, sensors)
     begin = first if prior is None else prior.t
     if not begin <= last:
@@ -232,6 +239,7 @@ def _begin(log: Log, sensors: tuple[str, ...], prior: PosePrior | None) -> float
 
 
 def _versions() -> dict[str, str]:
+    """Return the versions of this package, of Python, and of two libraries, by name."""
     return {
         "factorgraph-loc": __version__,
         "gtsam": importlib.metadata.version("gtsam"),

@@ -1,8 +1,8 @@
-"""Store of run results on disk: a folder per key, which is complete or missing.
+"""Store of the results of runs on disk. Each run has a folder, named by its key, which is either complete or missing.
 
-A run's files are written to a temporary folder, synced, and moved into place by one rename. Its ``manifest.json`` contains the
-sha256 of each file except for timings. The process that computes a run has a lock on a file named by the key. The system releases
-this lock when the process ends in any way, so that no claim outlives its owner.
+The files of a run are written to a temporary folder, synced, and moved into place by a single rename. Its ``manifest.json`` has the
+sha256 of each file except for timings. A process claims a run by a lock on a file with the name of the key. The operating system
+releases the lock when the process ends in any way, so that no claim outlives its owner.
 """
 
 from __future__ import annotations
@@ -27,41 +27,44 @@ from factorgraph_loc.files.temporary import sweep
 from factorgraph_loc.model.scoring import Alignment
 from factorgraph_loc.text import Notice
 
-Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # as in tables
+Whole = Annotated[int, Field(strict=True, ge=-(2**63), lt=2**63)]  # integers that fit into a column of a table
 Figure = bool | Whole | Annotated[float, Field(strict=True, allow_inf_nan=False)] | None
-FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]  # of a file within the run's folder
+FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]  # name of a file in the folder of a run
 MANIFEST, METRICS, TIMINGS, FAILURE = "manifest.json", "metrics.json", "timings.json", "failure.json"
-TIMING = "timing."  # prefix of timings
+TIMING = "timing."  # start of the names of computing times
 State = Literal["ok", "failed", "missing", "damaged"]
-_AGAIN = "; `fgloc experiment run` makes it again"
+_AGAIN = "; `fgloc experiment run` repeats the run"
 
 
 class DamagedError(InputError):
-    """A stored file is missing, or differs from what was written."""
+    """A stored file is missing, or its content has changed since it was written."""
 
 
 class StoredFile(BaseModel):
-    """Base of the store's JSON files."""
+    """Base class of the content of JSON files in the store."""
 
     model_config = ConfigDict(frozen=True, strict=True)
 
 
 class RunManifest(StoredFile):
-    """The ``key`` of a run, and the sha256 of its ``files`` by name."""
+    """The content of ``manifest.json``: the ``key`` of a run, and the sha256 of its ``files`` by name."""
 
     key: str
     files: dict[FileName, str]
 
 
 class Failure(StoredFile):
-    """Why a run gave no results."""
+    """The content of ``failure.json``: why a run failed. ``kind``: kind of the failure, such as "timeout"."""
 
     kind: str
     reason: str
 
 
 class Figures(StoredFile):
-    """Scores or times of a run: numbers, None, and lists of these, besides the alignment and the ``warnings``."""
+    """The content of ``metrics.json`` and ``timings.json``: scores or times of a run by name, and ``warnings``.
+
+    A value is a number, None, a list of these, or the name of an alignment.
+    """
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Figure | list[Figure] | Alignment] = Field(init=False)
@@ -72,7 +75,7 @@ Kind = TypeVar("Kind", bound=StoredFile)
 
 
 def parse_stored(kind: type[Kind], content: bytes, path: Path) -> Kind:
-    """Parse the JSON ``content`` of the file ``path``. Raises DamagedError if it is not of that ``kind``."""
+    """Parse the JSON ``content`` of the file ``path`` as a model of class ``kind``. Raises DamagedError if it is invalid."""
     try:
         return kind.model_validate_json(content)
     except ValidationError as error:
@@ -82,17 +85,17 @@ def parse_stored(kind: type[Kind], content: bytes, path: Path) -> Kind:
 
 
 class StoreError(RunFailedError):
-    """The store cannot be read or written: the disk is full, or permissions are missing."""
+    """The store cannot be written, because the disk is full or permissions are missing."""
 
 
 class Store:
-    """The results below ``folder``/store. Raises StoreError if it cannot be written."""
+    """The store of results in the folder ``folder/store``. Methods raise StoreError if it cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "store"
 
     def create(self) -> None:
-        """Create the folders, and clean up after processes that died."""
+        """Create the folders of the store, and remove files of processes that died."""
         with self._writing():
             for name in ("claims", "tmp"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
@@ -101,7 +104,7 @@ class Store:
         self.sweep()
 
     def sweep(self) -> None:
-        """Remove claims and partial results of processes that died."""
+        """Remove the claims and the partial results of processes that died."""
         with self._writing():
             keys = {path.name for name in ("claims", "tmp") for path in (self.folder / name).iterdir()}
         for key in keys:
@@ -110,11 +113,11 @@ class Store:
                     _remove(self.folder / "tmp" / key)
 
     def path(self, key: str) -> Path:
-        """The folder of a run."""
+        """Return the folder of a run by its key."""
         return self.folder / key[:2] / key
 
     def state(self, key: str) -> State:
-        """The state of a run's results. All files are compared with their checksums."""
+        """Return the state of a run's results: ok, failed, missing or damaged. All files are compared with their checksums."""
         try:
             manifest = self._manifest(key)
             for name in manifest.files:
@@ -125,12 +128,15 @@ class Store:
         return "failed" if FAILURE in manifest.files else "ok"
 
     def read(self, key: str, name: str) -> bytes:
-        """Read a file of a run, verified by its checksum. Raises DamagedError if it is missing or damaged."""
+        """Read a file of a run, and compare it with its checksum. Raises DamagedError if it is missing or damaged."""
         return self._read(self._manifest(key), name)
 
     def row(self, key: str) -> dict[str, Any]:
-        """``status`` (ok, failed), ``kind`` and ``reason`` of a failure, the scalar scores of a run including timings, and its
-        ``warnings``, one per line. Raises DamagedError as :meth:`read` does."""
+        """Return the columns of a run for the table of results.
+
+        They are ``status`` (ok, failed), the ``kind`` and ``reason`` of a failure, scores and times that are single numbers, and
+        ``warnings``, one on each line. Raises DamagedError as :meth:`read`.
+        """
         return self._row(self._manifest(key))
 
     def _row(self, manifest: RunManifest) -> dict[str, Any]:
@@ -148,12 +154,13 @@ class Store:
         return row_of(state | {name: value for name, value in scores.items() if name not in state})
 
     def _read(self, manifest: RunManifest, name: str) -> bytes:
+        """Read a file of a run, and compare it with the checksum in the manifest."""
         path = self.path(manifest.key) / name
-        said = manifest.files.get(name)
+        expected = manifest.files.get(name)
         content = self._content(path)
-        if said is None and name != TIMINGS:
+        if expected is None and name != TIMINGS:
             raise DamagedError(f"{path}: is not in {MANIFEST}{_AGAIN}")
-        if said is not None and said != _sha256(content):
+        if expected is not None and expected != _sha256(content):
             raise DamagedError(f"{path}: is damaged (its sha256 differs){_AGAIN}")
         return content
 
@@ -161,7 +168,7 @@ class Store:
         path = self.path(key) / MANIFEST
         manifest = parse_stored(RunManifest, self._content(path), path)
         if manifest.key != key:
-            raise DamagedError(f"{path}: is that of another run{_AGAIN}")
+            raise DamagedError(f"{path}: is the manifest of another run{_AGAIN}")
         return manifest
 
     def _content(self, path: Path) -> bytes:
@@ -171,9 +178,12 @@ class Store:
             raise DamagedError(f"{error}{_AGAIN}") from error
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
-        """Write the files of a run atomically, replacing existing ones; its claim must be held."""
-        said = {name: _sha256(content) for name, content in files.items() if name != TIMINGS}
-        manifest = json.dumps({"key": key, "files": said}, indent=1).encode()
+        """Write the files of a run atomically, and replace existing ones. The caller must hold a claim of the run.
+
+        ``files``: the content of each file by name.
+        """
+        checksums = {name: _sha256(content) for name, content in files.items() if name != TIMINGS}
+        manifest = json.dumps({"key": key, "files": checksums}, indent=1).encode()
         temporary = self.folder / "tmp" / key
         with self._writing():
             _remove(temporary)
@@ -194,7 +204,7 @@ class Store:
 
     @contextmanager
     def claim(self, key: str) -> Iterator[bool]:
-        """Context that claims a run; yields False if another live process has claimed it."""
+        """Claim a run in this block, so that no other process computes it. Yields False if another process has claimed it."""
         path = self.folder / "claims" / key
         with self._writing():
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -214,6 +224,7 @@ class Store:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
+        """Convert an OSError in this block to a StoreError."""
         try:
             yield
         except OSError as error:
@@ -223,14 +234,14 @@ class Store:
 
 
 def _remove(path: Path) -> None:
-    """Remove a folder, or a file in its place, as far as possible."""
+    """Remove a folder with its content, or a file. Errors are ignored."""
     shutil.rmtree(path, ignore_errors=True)
     with suppress(OSError):
         path.unlink()
 
 
 def _lock(handle: int, path: Path) -> bool:
-    """Lock a file; False if another process has locked or just removed it."""
+    """Lock an open file without waiting. Return False if another process has locked it, or has removed it in the meantime."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -246,6 +257,7 @@ def _sha256(content: bytes) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
+    """Write a file, and wait until it is on the disk."""
     with path.open("wb") as file:
         file.write(content)
         file.flush()
@@ -253,6 +265,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _sync(folder: Path) -> None:
+    """Wait until the entries of a folder are on the disk."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -103,15 +103,15 @@ def test_the_picture_of_a_run_shows_what_was_proposed_chosen_and_believed():
     figure = run_picture(seeking(9))
     maps = [axis for axis in figure.axes if axis.get_title().startswith("after")]
     assert [axis.get_title() for axis in maps[:-1]] == [f"after {i}.0 m" for i in (0, 2, 3, 5, 6)]
-    assert maps[-1].get_title() == "after 8.0 m, way to the end at 9.0 m"
+    assert maps[-1].get_title() == "after 8.0 m, path to the end at 9.0 m"
     drawn = {line.get_label(): line for line in maps[1].lines}
     assert {"walls", "tags", "belief", "candidates", "chosen", "robot (true)"} <= set(drawn)
     np.testing.assert_allclose(drawn["chosen"].get_xydata(), ((3.0, 1.5), (4.0, 1.5)))
     assert "chosen" not in {line.get_label() for line in maps[0].lines}  # nothing was taken
-    ways = [next(line for line in axis.lines if line.get_label() == "way (true)") for axis in maps]
+    ways = [next(line for line in axis.lines if line.get_label() == "path (true)") for axis in maps]
     np.testing.assert_allclose([way.get_xdata()[-1] for way in ways], (1.0, 3.0, 4.0, 6.0, 7.0, 10.0), atol=0.2)
-    assert {"chosen", "way (true)"} <= labels(figure)
-    (belief,) = [axis for axis in figure.axes if axis.get_ylabel() == "spread of the belief [m]"]
+    assert {"chosen", "path (true)"} <= labels(figure)
+    (belief,) = [axis for axis in figure.axes if axis.get_ylabel() == "standard deviation of the belief [m]"]
     spread = belief.lines[0].get_ydata()
     assert len(spread) == 9
     # of 200 particles: farther off than 20 % in one of 2,000 draws

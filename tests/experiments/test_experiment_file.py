@@ -53,7 +53,7 @@ def test_changes_reach_keys_estimators_and_simulated_logs(read):
     [
         ("sedes = 1", ["sedes", "did you mean seeds?"]),
         ("[sweep]\n'smother.lag' = [1]", ["smother.lag", "did you mean smoother?"]),
-        ("[sweep]\nmode = 'list'\n'short.lag' = [1]\n'ekf.max_delay' = [1, 2]", ["as many values"]),
+        ("[sweep]\nmode = 'list'\n'short.lag' = [1]\n'ekf.max_delay' = [1, 2]", ["equal numbers of values"]),
         ("seeds = '5:2'", ["seeds", "5:2", "0:10"]),
         ("logs = [{simulate = 'office', rig = 'a.rig.toml'}]", ["rig", "simulate"]),
         ("seeds = '0:1000000000'", ["seeds", "10,000 seeds"]),
