@@ -97,7 +97,7 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
     """The motion between two states of the integrated odometry, with its covariance.
 
     The heading error is a random walk along the path, so it also displaces the end of the motion. Let v be the variance of the
-    heading, and r the lever, the distance from start to end. For a uniform walk along a straight line, the variance of the
+    heading, and r the distance from start to end. For a uniform walk along a straight line, the variance of the
     displacement is v r^2 / 3. Its covariance with the heading is v r / 2.
     """
     return Increment(*relative(np.array(model.noise()), start, end))

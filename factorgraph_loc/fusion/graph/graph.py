@@ -98,7 +98,7 @@ class Addition:
     values: Values = field(default_factory=dict)
 
     def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
-        """Add factors, which belong to a keyframe."""
+        """Add factors to this addition and to the factors of ``keyframe``."""
         keyframe.nodes += nodes
         self.nodes += nodes
 

@@ -353,7 +353,7 @@ class LinearFactors:
 
 @dataclass(slots=True, eq=False)
 class _Linear:
-    """The factor of a measurement, and its slot in the solver."""
+    """The factor of a measurement, and its slot, the index in the solver's factor graph."""
 
     node: Node
     slot: int = -1
