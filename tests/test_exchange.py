@@ -92,7 +92,7 @@ def test_evo_takes_and_gives_a_trajectory(trajectory):
     alone = evo.PosePath3D(made.positions_xyz, made.orientations_quat_wxyz)
     with pytest.raises(fgloc.InputError, match="the trajectory of evo: has poses without times"):
         of(type(trajectory), fgloc.from_evo(alone))
-    with pytest.raises(fgloc.InputError, match="expected one of evo"):
+    with pytest.raises(fgloc.InputError, match="expected a trajectory of evo"):
         fgloc.from_evo([1, 2])
 
 

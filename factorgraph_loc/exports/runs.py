@@ -111,7 +111,7 @@ def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
 
 def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
     if folder.log != log.name:
-        raise InputError(f"{folder.path}: is a run of the log {folder.log}, expected one of {log.name}")
+        raise InputError(f"{folder.path}: is a run on the log {folder.log}, expected a run on the log {log.name}")
     files = results.ResultFiles(lambda file: read_bytes(folder.path / file, DATA), log.t0_ns, folder.path)
     causal, final = (
         estimates.rows(np.asarray(np.isfinite(estimates.trajectory.poses).all(axis=1)))

@@ -46,7 +46,7 @@ MAPS = ("tags", "landmarks")
 WINDOW = 1.0  # s: the resolution in time at which distances are summed
 TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m per encoder count, m, m: examples of sizes that no file states
 SIGMA = 0.1  # m: an example of the noise of a range or a position
-APART = 5.0  # s by which tables may miss each other in time before a clock offset is proposed
+APART = 5.0  # s: a clock offset is proposed for a table that begins later after the end of the others, or ends earlier before them
 
 
 @dataclass
@@ -337,7 +337,7 @@ def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
 def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
     """Add clock offsets to tables whose time does not overlap that of most other tables.
 
-    The offset makes both show the same turns. If no offset is clear, it makes both begin at the same time.
+    The offset aligns the turns of the robot in both tables. If no alignment is clear, it makes both begin at the same time.
     """
     starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}

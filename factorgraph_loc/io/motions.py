@@ -19,12 +19,10 @@ from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array, Integers
 
-# a jump is FASTER times as fast as all motion before; slower motion than SPEED [m/s] and TURN [rad/s] counts as if it had that rate
+# a motion is a jump if its rate exceeds FASTER times the largest rate before it; that rate is at least SPEED [m/s] or TURN [rad/s]
 SPEED, TURN, FASTER = 1.0, 2.0, 3.0
-RESET_DISTANCE, ZERO = (
-    0.05,
-    1e-6,
-)  # m: maximum distance from the origin after a reset; magnitude below which a value is zero
+RESET_DISTANCE = 0.05  # m: maximum distance from the origin after a reset of the odometry
+ZERO = 1e-6  # m and rad: magnitude below which a value is zero
 HOLD_TIME = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # numbers of counts after which encoders wrap to 0
 TURNS = ("left_angle", "left_rate")  # columns with angles or angular rates of wheels, which need a radius
@@ -54,7 +52,7 @@ class WheelSizes(FileModel):
         """
         if self.track is None or (turns and self.radius is None):
             lacking = "track" if self.track is None else "radius"
-            raise InputError(f"{source}: {what} needs {lacking} [m], here or in [odometry.wheels] of the rig")
+            raise InputError(f"{source}: {what} needs {lacking} [m]: set it here or in [odometry.wheels] of the rig")
         return self.radius if turns and self.radius else 1.0
 
     def twists(self, source: object, wheels: Array, warnings: list[Notice]) -> Array:

@@ -82,7 +82,7 @@ class ResultFiles:
         try:
             return {kind: Estimates.of(rows, t0_ns) for kind, rows in by_kind.items()}  # type: ignore[arg-type] # an integer
         except ValueError as error:
-            raise InputError(f"{source}: holds no trajectory: {error_text(error)}") from error
+            raise InputError(f"{source}: contains no valid trajectory: {error_text(error)}") from error
 
     def innovations(self) -> dict[str, Array]:
         """Return the innovations of each sensor: rows (K, 3) of time [s], normalised innovation squared and degrees of freedom."""

@@ -100,7 +100,7 @@ def to_evo(trajectory: Trajectory | PosePath, t0_ns: int = 0) -> Any:
     try:
         from evo.core.trajectory import PoseTrajectory3D  # type: ignore[import-untyped] # noqa: PLC0415
     except ImportError as error:
-        raise InputError("trajectories of evo need evo: pip install evo") from error
+        raise InputError("conversion to evo needs the library evo: pip install evo") from error
     path = _posed(trajectory, t0_ns)
     return PoseTrajectory3D(path.positions, np.roll(path.quaternions(), 1, axis=1), path.seconds())  # evo has w first
 
@@ -116,7 +116,7 @@ def from_evo(trajectory: Any) -> PosePath:
         seconds = getattr(trajectory, "timestamps", None)
         times = None if seconds is None else np.asarray(seconds, dtype=float)
     except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"the trajectory is {quoted(trajectory)}, expected one of evo") from error
+        raise InputError(f"the trajectory is {quoted(trajectory)}, expected a trajectory of evo") from error
     name = "the trajectory of evo"
     return _path(name, table, None if times is None else checks.stamps(name, np.arange(1, len(times) + 1), times))
 

@@ -118,11 +118,15 @@ class Localizer:
         A late measurement is processed at its own time if it is late by at most the estimator's setting ``max_delay``. Otherwise it
         is counted and dropped. Features of an image are detected in the calling thread while other measurements are processed.
 
-        Raises InputError, drops the measurement and changes nothing else in these cases:
-        a value is invalid, such as NaN; :meth:`initialize` was not called; a timestamp is an hour ahead of all others; increments
-        of odometry go back in time. Raises RunFailedError if the estimator fails. Every call except :meth:`diagnostics` then raises
-        this error until :meth:`initialize` is called. Unknown tags, antennas and landmarks are not errors. They are counted, see
-        :meth:`diagnostics`.
+        Raises InputError in these cases. The measurement is then dropped and nothing else changes.
+
+        - A value is invalid, such as NaN.
+        - :meth:`initialize` was not called.
+        - A timestamp is an hour ahead of all others.
+        - Increments of odometry go back in time.
+
+        Raises RunFailedError if the estimator fails. Every call except :meth:`diagnostics` then raises this error until
+        :meth:`initialize` is called. Unknown tags, antennas and landmarks are counted, see :meth:`diagnostics`.
         """
         own = checked(measurement)
         intake = self._intakes.get(own.sensor) if own.modality in self._modalities else None

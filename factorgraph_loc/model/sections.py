@@ -89,7 +89,7 @@ def kind_of(name: str) -> str:
 
 
 def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
-    """Return the ``names`` of sensors without the others of the kind of ``chosen``. The keys are their new names.
+    """Return the ``names`` of sensors, by their new names, without the other sensors of the same kind as ``chosen``.
 
     The new name of ``chosen`` is the name of its kind. Other names do not change.
     """

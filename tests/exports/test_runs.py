@@ -45,7 +45,7 @@ def test_bad_folders(log, results, tmp_path):
     assert not is_results(tmp_path)
     with pytest.raises(InputError, match="contains no results, expected a folder that `fgloc run`"):
         find_runs(tmp_path)
-    with pytest.raises(InputError, match="is a run of the log arc, expected one of hall"):
+    with pytest.raises(InputError, match="is a run on the log arc, expected a run on the log hall"):
         read_runs(find_runs(results), replace(log, name="hall"))
     with pytest.raises(InputError, match="is it a run of another log named arc"):
         read_runs(find_runs(results), replace(log, t0_ns=0))

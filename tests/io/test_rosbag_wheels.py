@@ -79,7 +79,9 @@ def test_what_is_wrong_with_wheels(maker, refuse_drive, refused):
     add_topics(maker, [1.0, 1.0], [1.0, 1.0])
     topic = {"topic": "/left_wheel/speed"}
     refuse_drive(
-        maker, "odometry.wheels needs radius [m], here or in [odometry.wheels]", odometry=topic | {"wheels": PAIR}
+        maker,
+        "odometry.wheels needs radius [m]: set it here or in [odometry.wheels]",
+        odometry=topic | {"wheels": PAIR},
     )
     for wheels, message in (
         (PAIR | {"track": None, "unit": "m"}, "odometry.wheels needs track [m]"),

@@ -30,7 +30,7 @@ RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
-LOCK = ".lock"  # held while a folder of images is moved into place
+LOCK = ".lock"  # file that a process locks while it moves a folder of images into the cache
 Pixels = NDArray[Any]
 # number of a message, timestamp of its header [ns], time of receipt [ns], name of the image file
 _Row = tuple[int, int, int, str]

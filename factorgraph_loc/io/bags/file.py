@@ -301,7 +301,7 @@ def _bag_errors(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except PermissionError as error:
-        raise InputError(f"{path}: may not be read") from error
+        raise InputError(f"{path}: there is no permission to read it") from error
     except Exception as error:
         text = error_text(error)
         hint = next((hint for words, hint in HINTS.items() if words in text), "")

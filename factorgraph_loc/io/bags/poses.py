@@ -323,7 +323,7 @@ def tree_of(bag: Bag, remarks: list[str]) -> Tree:
             remarks.append(str(error))
         except (AttributeError, TypeError, ValueError) as error:
             remarks.append(
-                f"{bag.path}: topic {candidate.name} is defined in the bag unlike in ROS: {error_text(error)}"
+                f"{bag.path}: topic {candidate.name}: the definition of its type differs from that of ROS: {error_text(error)}"
             )
         parents |= edges
         if candidate.name != STATIC:

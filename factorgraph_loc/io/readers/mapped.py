@@ -393,5 +393,5 @@ def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turne
     heading = columns.get("heading", np.zeros(len(rows)))
     around = np.abs(np.diff(heading, prepend=heading[0]))
     valid = ~((around > LEAST_AROUND) & (around < 360.0))
-    require(valid, path, rows, "heading", heading, 'radians; it seems to wrap at 360: units.heading = "deg"')
+    require(valid, path, rows, "heading", heading, 'radians; it wraps at 360 as degrees do: set units.heading = "deg"')
     return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))

@@ -250,7 +250,7 @@ def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: lis
         count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)
         several &= count > 1.0
         if more := int(np.sum(np.maximum(count - np.where(several, 2.0, 1.0), 0.0))):
-            sentence = "{source}: {reads} reads between the first and the last of their row are skipped"
+            sentence = "{source}: {reads} reads are skipped: a row with several reads has only the times of the first and the last"
             warnings.append(notice("summarized_reads", sentence, table.path, more))
     repeated = table.rows_at(np.flatnonzero(several))
     unknown = {name: np.full(len(repeated.rows), np.nan) for name in repeated.numbers}

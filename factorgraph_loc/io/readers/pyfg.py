@@ -157,7 +157,8 @@ def _require_chain(moves: TableRows, poses: Sequence[str]) -> None:
             wanted = f"{following}: motions from each pose to the next, without loop closures"
             raise bad_field(moves.path, "EDGE_SE2", " ".join(pair), wanted, row=row)
     if len(moves.rows) < len(expected):
-        raise InputError(f"{moves.path}: has no EDGE_SE2 {' '.join(expected[len(moves.rows)])}, expected all motions")
+        lacking = " ".join(expected[len(moves.rows)])
+        raise InputError(f"{moves.path}: has no EDGE_SE2 {lacking}, expected a motion from each pose to the next")
 
 
 def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, Landmark], t_ns: Integers) -> TableRows:
