@@ -30,19 +30,11 @@ class Walled(Protocol):
 
 def crosses(world: Walled, a: Array, b: Array) -> NDArray[np.bool_]:
     """Return a mask (N,) that is True where the segment from ``a`` (N, 2) to ``b`` (N, 2) crosses a wall."""
-    out = np.zeros(len(a), dtype=bool)
-    d = b - a
-    for x1, y1, x2, y2 in world.walls:
-        wall = np.array((x2 - x1, y2 - y1))
-        start = np.array((x1, y1))
-        side_a, side_b = _cross(wall, a - start), _cross(wall, b - start)
-        side_1, side_2 = _cross(d, start - a), _cross(d, start + wall - a)
-        out |= (side_a * side_b < 0.0) & (side_1 * side_2 <= 0.0)
-    return out
+    return np.asarray(_crosses(_segments(world), np.ascontiguousarray(a), np.ascontiguousarray(b)))
 
 
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+def _segments(world: Walled) -> Array:
+    return np.array(world.walls, dtype=float).reshape(-1, 4)
 
 
 @dataclass(frozen=True)
@@ -113,12 +105,14 @@ def free_space(world: Walled, clearance: float) -> FreeSpace:
 
 def distance_to_walls(world: Walled, points: Array) -> Array:
     """Return the distances (N,) [m] from ``points`` (N, 2) to the nearest wall."""
-    out = np.full(len(points), np.inf)
-    for x1, y1, x2, y2 in world.walls:
-        start, along = np.array((x1, y1)), np.array((x2 - x1, y2 - y1))
-        share = np.clip((points - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-        out = np.minimum(out, np.hypot(*(points - start - share[:, None] * along).T))
-    return out
+    return nearest_walls(world, points)[0]
+
+
+def nearest_walls(world: Walled, points: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return the distances (N,) [m] from ``points`` (N, 2) to the nearest wall, and the indices (N,) of these walls. Without walls
+    the distances are infinite and the indices are -1."""
+    distances, indices = _nearest(_segments(world), np.ascontiguousarray(points))
+    return np.asarray(distances), np.asarray(indices)
 
 
 def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
@@ -196,3 +190,34 @@ def _is_clear(index: NDArray[np.int64], origin: Array, a: Array, b: Array) -> bo
         if i < 0 or j < 0 or i >= index.shape[0] or j >= index.shape[1] or index[i, j] < 0:
             return False
     return True
+
+
+@compiled
+def _nearest(walls: Array, points: Array) -> tuple[Array, NDArray[np.int64]]:
+    squares, indices = np.full(len(points), np.inf), np.full(len(points), -1)
+    for n in range(len(points)):
+        for w in range(len(walls)):
+            x, y = walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]
+            px, py = points[n, 0] - walls[w, 0], points[n, 1] - walls[w, 1]
+            share = min(max((px * x + py * y) / max(x * x + y * y, 1e-12), 0.0), 1.0)
+            square = (px - share * x) ** 2 + (py - share * y) ** 2
+            if square < squares[n]:
+                squares[n], indices[n] = square, w
+    return np.sqrt(squares), indices
+
+
+@compiled
+def _crosses(walls: Array, a: Array, b: Array) -> NDArray[np.bool_]:
+    out = np.zeros(len(a), dtype=np.bool_)
+    for n in range(len(a)):
+        dx, dy = b[n, 0] - a[n, 0], b[n, 1] - a[n, 1]
+        for w in range(len(walls)):
+            x, y = walls[w, 2] - walls[w, 0], walls[w, 3] - walls[w, 1]
+            ax, ay = a[n, 0] - walls[w, 0], a[n, 1] - walls[w, 1]
+            bx, by = b[n, 0] - walls[w, 0], b[n, 1] - walls[w, 1]
+            if (x * ay - y * ax) * (x * by - y * bx) < 0.0:
+                at_start, at_end = dy * ax - dx * ay, dx * (y - ay) - dy * (x - ax)
+                if at_start * at_end <= 0.0:
+                    out[n] = True
+                    break
+    return out

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from function_calls import calls_of
 from mapped_hall import MANIFEST, READS, WHEELS
 from recorded_logs import recorded_log
 
@@ -145,6 +146,17 @@ def test_strengths_in_columns(hall, with_options, one, refused, head, columns, m
     (hall.parent / "run" / "wide.csv").write_text(text.replace(last, first))
     twice = with_options(WHEELS + WIDE.format(columns=columns, more=more))
     refused(twice, f"wide.csv:1: has the column '{first}' more than once")
+
+
+def test_columns_of_a_wide_table_are_found_once_and_not_in_each_row(hall, with_options, one):
+    def searches(rows):
+        head = ";".join(f"tag{i}" for i in range(100))
+        lines = [f"1,{k:04d};{'-60;' * 99}-60" for k in range(rows)]
+        (hall.parent / "run" / "wide.csv").write_text("\n".join([f"t;{head}", *lines]))
+        manifest = with_options(WHEELS + WIDE.format(columns='rssi = "tag*"', more='antenna = "l"'))
+        return calls_of(lambda: one(manifest))["index"]
+
+    assert searches(60) == searches(20)
 
 
 def test_reports_of_sllurp_with_several_reads_in_a_row(hall, with_options, one):

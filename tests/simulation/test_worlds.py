@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from function_calls import calls_of
 
 from factorgraph_loc import InputError, World
 from factorgraph_loc.maps.free_space import CELL, SPACING, crosses, distance_to_walls, free_space, shortest_path
@@ -149,6 +150,20 @@ def test_cells_are_found_again_and_keep_clear_of_walls(office):
     np.testing.assert_array_equal(space.cells(outside), -1)
     i, j = np.nonzero(space.index >= 0)
     np.testing.assert_allclose(space.distance[i, j], distance_to_walls(world, space.centres)[space.index[i, j]])
+
+
+def test_the_python_calls_of_free_space_do_not_grow_with_the_walls():
+    edge = [(0.0, 0.0, 20.0, 0.0), (20.0, 0.0, 20.0, 20.0), (20.0, 20.0, 0.0, 20.0), (0.0, 20.0, 0.0, 0.0)]
+
+    def calls(walls):
+        world = World(name="hall", walls=walls)
+        return sum(
+            calls_of(lambda: (free_space(world, 0.3), crosses(world, np.zeros((9, 2)), np.ones((9, 2))))).values()
+        )
+
+    calls(edge)  # compiles
+    cut = [(x, 0.0, x + 0.01, 0.0) for x in np.arange(0.0, 20.0, 0.02).tolist()]  # the lower wall in a thousand pieces
+    assert calls([*edge[1:], *cut]) < 1.1 * calls(edge)
 
 
 def test_a_line_is_clear_where_all_its_cells_are_free(office):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_loc.maps.free_space import crosses
+from factorgraph_loc.maps.free_space import crosses, nearest_walls
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.measurement import SightingStream
 from factorgraph_loc.sensors.camera.settings import CameraSettings, PixelSettings
@@ -72,19 +72,14 @@ def pixel_stream(
 
 def surface_normals(world: World, places: Array) -> Array:
     """Return the unit normal (K, 2) of the wall nearest to each position in ``places`` (K, 2). It points to the side of the
-    position."""
-    best = np.full(len(places), np.inf)
-    out = np.zeros((len(places), 2))
-    for x1, y1, x2, y2 in world.walls:
-        start, along = np.array((x1, y1)), np.array((x2 - x1, y2 - y1))
-        share = np.clip((places - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
-        away = places - start - share[:, None] * along
-        distance = np.hypot(*away.T)
-        normal = np.array((-along[1], along[0])) / max(math.hypot(*along), 1e-12)
-        nearer = distance < best
-        best[nearer] = distance[nearer]
-        out[nearer] = np.where((away @ normal < 0.0)[:, None], -normal, normal)[nearer]
-    return out
+    position. Without walls it is 0."""
+    if not world.walls:
+        return np.zeros((len(places), 2))
+    walls = np.array(world.walls, dtype=float).reshape(-1, 2, 2)[nearest_walls(world, places)[1]]
+    along = walls[:, 1] - walls[:, 0]
+    normals = np.column_stack((-along[:, 1], along[:, 0])) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
+    behind = np.sum((places - walls[:, 0]) * normals, axis=1) < 0.0
+    return np.asarray(np.where(behind[:, None], -normals, normals))
 
 
 def _at_most(count: int, frames: Array, rng: np.random.Generator) -> Array:
