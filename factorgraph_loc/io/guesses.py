@@ -49,7 +49,7 @@ POSE = {
 }
 MOTION = {
     "v": ("v", "vx", "speed", "velocity", "vel", "linear", "linearx", "linearvelocity", "forward"),
-    "w": ("w", "wz", "omega", "yawrate", "turnrate", "angular", "angularz", "angularvelocity", "gyroz", "rotz"),
+    "w": ("w", "wz", "omega", "yawrate", "turnrate", "turn", "angular", "angularz", "angularvelocity", "gyroz", "rotz"),
 }
 OTHERS = {
     "landmark": ("landmark", "anchor", "beacon", "marker", *LANDMARK[:-1], "name", "id"),

@@ -20,7 +20,7 @@ ESTIMATORS = (
     *(("smoother", {}), ("smoother", {"lag": 1.0}), ("smoother", {"landmarks": "unknown"}), ("batch", {})),
     *(("particle_filter", {"particles": 30}), ("switching", {"particles": 30}), ("monoslam", {})),
 )
-SENSORS = ("odometry", "imu", "rfid", "bearing_range", "sightings", "rssi", "phase", "camera")
+SENSORS = ("odometry", "imu", "rfid", "bearing_range", "sightings", "rssi", "phase", "camera", "position")
 ABSURD = (
     math.nan,
     math.inf,
@@ -47,6 +47,17 @@ def value(*usual):
     return st.sampled_from(usual * 12) | st.floats() | st.sampled_from(ABSURD)
 
 
+def array(values):
+    """An array of the values; of any objects if their shapes differ."""
+    try:
+        return np.array(values)
+    except ValueError:
+        objects = np.empty(len(values), dtype=object)
+        for i, each in enumerate(values):
+            objects[i] = each
+        return objects
+
+
 @cache
 def calls():
     """Strategy of a call: a method, and its arguments."""
@@ -54,7 +65,7 @@ def calls():
     t, count = value(*np.linspace(0.0, 3.0, 31).tolist()), st.integers(0, 3)
     names = st.lists(st.sampled_from((*log.world.landmarks, *log.world.points.names[:5], "stranger")), max_size=3)
     tags = st.lists(st.sampled_from((*log.world.tags, "stranger")), max_size=3)
-    many = st.lists(value(2.0, 0.3), max_size=3).map(np.array) | value(None)
+    many = st.lists(value(2.0, 0.3), max_size=3).map(array) | value(None)
     pixels = count.flatmap(lambda n: value(*(size * np.ones((n, 2)) for size in (100.0, 200.0, -9.0))))
     looks = count.flatmap(lambda n: value(np.zeros((n, 64), np.float32), np.zeros((n, 32), np.uint8)))
     covariance = value(None, np.eye(3), np.zeros((3, 3)), -np.eye(3), 1e18 * np.eye(3))
@@ -68,6 +79,7 @@ def calls():
         st.builds(fgloc.PixelSightings, t, names.map(tuple) | value(()), pixels),
         st.builds(fgloc.RfidScan, t, antennas, value(np.zeros(2, int)), tags.map(tuple), many, many, many, many),
         st.builds(fgloc.CameraFrame, t, value("colour", "orb"), pixels, many, looks, value(np.arange(2))),
+        st.builds(fgloc.Position, t, value(10.0), value(6.0), *(value(v) for v in (0.01, 0.0, 0.01))),
         value(None),
     )
     pose = st.tuples(value(10.0), value(6.0), value(0.5)) | value(log.start.pose)
@@ -82,7 +94,8 @@ def calls():
 def play(estimator, settings, calls, *, ask):
     """The last estimate after these calls, and those that were taken; without ``ask`` no queries."""
     log, taken = sound_files.drive(), []
-    localizer = fgloc.Localizer(log.rig, log.world, estimator, settings=settings, history=1.0, sensors=SENSORS)
+    rig = log.rig.model_copy(update={"position": fgloc.Rig.model_validate({"position": {}}).section("position")})
+    localizer = fgloc.Localizer(rig, log.world, estimator, settings=settings, history=1.0, sensors=SENSORS)
     for method, arguments in calls:
         if method in QUERIES and not ask:
             continue

@@ -63,6 +63,15 @@ def use_experiment(folder, _):
     prepare(folder / "e.toml", out=folder / "out")
 
 
+def use_proposal(folder, draw):
+    """Propose a manifest for tables, and read the log with it."""
+    proposal = fgloc.manifest(folder / "run")
+    for remark in proposal.remarks:
+        require_line(remark, 600)
+    (folder / "made.toml").write_text(proposal.text)
+    use_log(folder, draw, path="made.toml")
+
+
 def use_poses(folder, draw):
     suffix = draw(st.sampled_from((".tum", ".csv", ".kitti")))
     files = [folder / f"{name}{suffix}" for name in ("estimate", "reference")]
@@ -85,6 +94,9 @@ FORMATS = {
     "csv": Format(sound_files.csv, use_log),
     "toml": Format(sound_files.csv, use_log, (".toml",)),
     "parquet": Format(sound_files.parquet, use_log, (".parquet",)),
+    "several": Format(sound_files.several, use_log, (".csv",)),
+    "pyfg": Format(sound_files.pyfg, partial(use_log, path="p.pyfg")),
+    "proposal": Format(sound_files.tables, use_proposal, (".csv",)),
     "images": Format(sound_files.images, use_images, ("png", "jpg", "camera.csv", "rig.toml")),
     "grid": Format(sound_files.grid, use_rig),
     "world": Format(sound_files.world, use_world),

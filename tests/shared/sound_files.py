@@ -42,6 +42,16 @@ estimators = ["dead_reckoning", { name = "particle_filter", label = "pf", settin
 sweep = { "pf.particles" = [20, 30] }
 report = { baseline = "dead_reckoning" }
 """
+PYFG = """
+VERTEX_SE2 10.0 A0 1.0 2.0 0.0
+VERTEX_SE2 10.5 A1 2.0 2.0 0.0
+VERTEX_SE2 11.0 A2 2.0 2.0 0.5
+VERTEX_XY L0 5.0 2.0
+EDGE_SE2 10.5 A0 A1 1.0 0.0 0.0 0.02 0.0 0.0 0.005 0.0 0.0008
+EDGE_SE2 11.0 A1 A2 0.0 0.0 0.5 0.02 0.0 0.0 0.005 0.0 0.0008
+EDGE_RANGE 10.5 A1 L0 3.1 0.09
+EDGE_RANGE 10.0 A0 L0 3.9 0.09
+"""
 
 
 @cache
@@ -57,6 +67,28 @@ def drive():
 
 def csv(folder):
     fgloc.write_native(drive(), folder)
+
+
+def several(folder):
+    """A log with two radios and with measured positions."""
+    log = drive()
+    t, x, y = log.reference.t[::5], log.reference.poses[::5, 0], log.reference.poses[::5, 1]
+    unknown = np.full(len(t), np.nan)
+    ranges = log.streams["bearing_range"]
+    streams = {name: stream for name, stream in log.streams.items() if name in ("odometry", "imu")}
+    streams |= {f"bearing_range.{name}": ranges for name in ("front", "rear")}
+    streams["position"] = fgloc.PositionStream(t, x, y, unknown, unknown, unknown)
+    radio = log.rig.bearing_range.model_dump(exclude_unset=True)
+    rig = fgloc.Rig.model_validate(
+        {"name": "sim", "bearing_range": {"front": {**radio, "x": 0.2}, "rear": radio}, "position": {"sigma": 0.1}}
+    )
+    fgloc.write_native(replace(log, rig=rig, streams=streams), folder)
+
+
+def pyfg(folder):
+    """A drive of three poses with two ranges to one landmark."""
+    folder.mkdir()
+    (folder / "p.pyfg").write_text(PYFG)
 
 
 def parquet(folder):
