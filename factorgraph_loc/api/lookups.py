@@ -133,11 +133,12 @@ def new_rig(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Rig:
-    """A first rig of a robot with some sensors, written with comments to ``out`` if it is given.
+    """Return a first rig of a robot with some sensors. If ``out`` is given, the rig is also written to this file, with comments.
 
-    ``landmarks``: standard deviation of ranges to landmarks [m], or a mapping from the names of several sensors to it.
-    ``antennas``: number or names of RFID antennas. ``camera``: width and height of its images [px]. ``position``: standard
-    deviation of measured positions [m]. InputError if a value is out of bounds, or the file exists.
+    ``odometry``: the drive. ``imu``: True if the robot has a gyro. ``landmarks``: standard deviation of ranges to landmarks [m], or
+    that of each of several sensors by name. ``antennas``: number or names of RFID antennas. ``camera``: width and height of its
+    images [px]. ``position``: standard deviation of measured positions [m]. Raises InputError if a value is out of bounds, or if
+    the file exists and ``overwrite`` is false.
     """
     names = tuple(map(str, range(1, antennas + 1))) if isinstance(antennas, int) else tuple(antennas)
     rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, names, camera, position))

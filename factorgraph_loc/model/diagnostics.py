@@ -101,7 +101,7 @@ class Diagnostics:
         del self.events[:-rows]
 
     def copy(self) -> Diagnostics:
-        """A deep copy."""
+        """Return a deep copy of the counts, figures and events, without recorded additions."""
         return Diagnostics(
             {name: list(rows) for name, rows in self.nis.items()},
             {name: list(values) for name, values in self.residuals.items()},

@@ -52,7 +52,7 @@ class Mounting(FileModel):
     """rotation about the z axis; left is positive"""
 
     def rotation(self) -> Array:
-        """The rotation matrix (3, 3) from the sensor frame to the robot frame."""
+        """Return the rotation matrix (3, 3) from the sensor frame to the robot frame."""
         (cr, cp, cy), (sr, sp, sy) = (f((self.roll, self.pitch, self.yaw)) for f in (np.cos, np.sin))
         return np.array(
             [

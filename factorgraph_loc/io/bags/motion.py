@@ -124,8 +124,8 @@ class OdometryTopic(PoseTopic):
     """A topic of odometry, of tf with two frames, or of wheel joints."""
 
     use: Literal["pose", "twist"] = "pose"
-    """what odometry messages are read for: pose, whose motion between messages is used, or twist, the velocity; for wheels, pose
-    reads their angles and twist their angular rates"""
+    """part of odometry messages to use: pose, for the motion between messages, or twist, for the velocity; for wheels, pose means
+    their angles and twist their angular rates"""
     wheels: WheelSettings | None = None
     """wheels of a topic of joints; or of two topics, where topic is that of the left wheel"""
 

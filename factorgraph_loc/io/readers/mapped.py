@@ -117,7 +117,7 @@ class Options(FileModel):
     rfid: RfidFile | None = None
     readers: dict[str, RfidFile] = Field(default_factory=dict)
     inventories: TimedMapping | None = None
-    """table of inventory rounds: t (the end of a round), antenna, duration; antennas are named as in rfid"""
+    """table of inventory rounds: t (the end of a round), antenna, duration; names of antennas are translated as in rfid"""
     camera: ImageFile | None = None
     reference: ReferenceFile | None = None
     world: dict[str, Any] = Field(default_factory=dict)
