@@ -34,7 +34,7 @@ def calibrate(
 ) -> calibration.Calibration:
     """Calibrate a rig from logs, and write it to ``out`` (``NAME.rig.toml``), with a report ``NAME.report.html`` next to it.
 
-    All logs must have a reference, or all must have none. ``progress`` is called with the work done and the whole work.
+    All logs must have a reference, or all must have none. ``progress`` is called with the numbers of done and of all steps.
     """
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = load_all(logs, rig, world)
@@ -95,7 +95,7 @@ def features(
     """Evaluate point features on ``images`` of planar scenes, and write the scores to the folder ``out``.
 
     ``images``: folders of image sequences, or photographs, which are warped. ``features``: names of the features to compare.
-    ``count``: maximum number of features in an image. ``progress`` is called with the work done and the whole work.
+    ``count``: maximum number of features in an image. ``progress`` is called with the numbers of done and of all images.
     """
     require_free(Path(out), feature_scores.FILES, overwrite=overwrite)
     chosen = [Feature(name, extractor(name, count).detectAndCompute) for name in features]

@@ -167,8 +167,8 @@ def score(
 
     ``estimate``, ``reference``: trajectories with times of the same clock, or texts that name trajectories as in ``fgloc score``.
     ``out``: a folder in which to write the files of ``fgloc score``. For the other arguments see
-    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. Raises InputError if a trajectory cannot be read, or if the
-    two have no times in common.
+    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. Raises InputError if a trajectory cannot be read, or if no
+    poses of the two can be paired.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)
