@@ -2,12 +2,14 @@
 
 __all__ = [
     "bounded",
+    "cells",
     "checks",
     "column_mapping",
     "columns",
     "data_root",
     "images",
     "models",
+    "row_rules",
     "settings",
     "several",
     "shipped",

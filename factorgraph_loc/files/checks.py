@@ -8,8 +8,9 @@ from collections.abc import Hashable, Iterable, Sequence
 
 import numpy as np
 
-from factorgraph_loc.errors import bad_field, require
+from factorgraph_loc.errors import bad_field
 from factorgraph_loc.files.columns import SECONDS
+from factorgraph_loc.files.row_rules import Fault, RowRules, require_none
 from factorgraph_loc.text import Notice, listed, notice
 from factors.odometry.model import composed
 from factors.se2 import Array, Integers
@@ -20,16 +21,26 @@ ROUNDING = 1e-6  # s; tolerance of comparisons of time differences
 
 def require_finite(source: object, rows: Integers, names: Sequence[str], table: Array) -> None:
     """Raise InputError at the first number of ``table`` (N, K) that is NaN or infinite. ``names``: the names of the K columns."""
-    for name, values in zip(names, table.T, strict=True):
-        require(np.isfinite(values), source, rows, name, values, "a finite number")
+    require_none(source, rows, not_finite(names, table))
 
 
-def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
+def not_finite(names: Sequence[str], table: Array) -> list[Fault]:
+    """Return for each column of ``table`` (N, K) the fault of its numbers that are NaN or infinite. ``names``: the names of the
+    K columns.
+    """
+    columns = zip(names, table.T, strict=True)
+    return [Fault(name, values, ~np.isfinite(values), "a finite number") for name, values in columns]
+
+
+def in_order(
+    source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], rules: RowRules | None = None
+) -> Integers:
     """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last one.
 
-    Raises InputError if a timestamp is older than the one before it.
+    ``rules``: what a manifest says about the rows, None without a manifest. Raises InputError if a timestamp is older than the one
+    before it.
     """
-    _require_order(source, rows, t_ns)
+    _require_order(source, rows, t_ns, rules)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
     if dropped := len(t_ns) - len(keep):
         skipped = "{source}: {rows} rows have the timestamp of the row after them and are skipped"
@@ -38,32 +49,54 @@ def in_order(source: object, rows: Integers, t_ns: Integers, warnings: list[Noti
 
 
 def increments_in_order(
-    source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[Notice]
+    source: object,
+    rows: Integers,
+    t_ns: Integers,
+    moves: Array,
+    warnings: list[Notice],
+    rules: RowRules | None = None,
 ) -> tuple[Integers, Array]:
     """Merge the odometry increments that have equal timestamps ``t_ns`` (N,), by composition of their motions.
 
-    ``moves`` (N, 3): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there. Returns distinct timestamps
-    (M,) and the motion (M, 3) since the timestamp before. Raises InputError if a timestamp is older than the one before it.
+    ``moves`` (N, 3): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there. A fourth column, the
+    time [s] in which the motion is unknown, is summed. Returns distinct timestamps (M,) and the motion (M, 3 or 4) since the
+    timestamp before. ``rules``: what a manifest says about the rows, None without a manifest. Raises InputError if a timestamp
+    is older than the one before it.
     """
-    _require_order(source, rows, t_ns)
-    last, out = composed(t_ns, moves)
+    _require_order(source, rows, t_ns, rules)
+    last, out = composed(t_ns, moves[:, :3])
+    sums = [
+        np.bincount(np.searchsorted(t_ns[last], t_ns), weights=column, minlength=len(last)) for column in moves.T[3:]
+    ]
+    out = np.column_stack((out, *sums))
     if joined := len(t_ns) - len(last):
         sentence = "{source}: {rows} increments have the timestamp of the row before them and are composed with it"
         warnings.append(notice("composed_increments", sentence, source, joined))
     return t_ns[last], out
 
 
-def _require_order(source: object, rows: Integers, t_ns: Integers) -> None:
+def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRules | None) -> None:
     """Raise InputError at the first row whose timestamp is older than that of the row before it."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
-        expected = f"a timestamp not before that of the row before, {int(t_ns[i - 1])} ns"
+        expected = f"a timestamp not before that of the row before, {int(t_ns[i - 1])} ns{_remedy(rules)}"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
+def _remedy(rules: RowRules | None) -> str:
+    """Return the end of an error, which says how to sort the rows; "" without a manifest."""
+    return "" if rules is None else rules.sorting
+
+
 def arrivals(
-    source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], *, max_late_ns: int | None = MAX_LATE_NS
+    source: object,
+    rows: Integers,
+    t_ns: Integers,
+    warnings: list[Notice],
+    rules: RowRules | None = None,
+    *,
+    max_late_ns: int | None = MAX_LATE_NS,
 ) -> None:
     """Check the delays of timestamps ``t_ns`` (N,) in order of arrival. A timestamp older than a previous one is late.
 
@@ -74,7 +107,7 @@ def arrivals(
     late = newest - t_ns
     if max_late_ns is not None and np.any(late > max_late_ns):
         i = int(np.argmax(late > max_late_ns))
-        expected = f"a timestamp at most 0.5 s older than the newest before it, {int(newest[i])} ns"
+        expected = f"a timestamp at most 0.5 s older than the newest before it, {int(newest[i])} ns{_remedy(rules)}"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
     if count := int(np.count_nonzero(late)):
         sentence = "{source}: {rows} rows are late, by at most {delay:.3f} s"
@@ -87,14 +120,19 @@ def unread_columns(source: object, names: Iterable[str]) -> Notice:
 
 
 def last_in_order(
-    source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], names: Sequence[str] | None = None
+    source: object,
+    rows: Integers,
+    t_ns: Integers,
+    warnings: list[Notice],
+    names: Sequence[str] | None = None,
+    rules: RowRules | None = None,
 ) -> Integers:
     """Return the indices (M,) of the rows to keep, in order of arrival: of rows with equal timestamps only the last one.
 
     ``t_ns`` (N,): timestamps, which are checked by :func:`arrivals`. ``names``: N landmarks; if given, only rows with equal
     timestamp and landmark count as equal.
     """
-    arrivals(source, rows, t_ns, warnings)
+    arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)
     last = {key: i for i, key in enumerate(keys)}
     if dropped := len(t_ns) - len(last):

@@ -12,9 +12,12 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.checks import unread_columns
+from factorgraph_loc.files.columns import STAMP, Column
 from factorgraph_loc.files.models import FileModel, InUnit, flattened, inside, nearest, parse_json, read_text
-from factorgraph_loc.files.tables import Cells, csv_rows, rows_of_length
+from factorgraph_loc.files.row_rules import Fault, RowRules, require_read
+from factorgraph_loc.files.tables import csv_rows, rows_of_length
 from factorgraph_loc.text import Notice, listed, notice, quoted, well_formed
 from factors.se2 import Integers
 
@@ -64,7 +67,7 @@ class ColumnMapping(FileModel):
         }
 
 
-class TimedMapping(ColumnMapping):
+class TimedMapping(ColumnMapping, RowRules):
     """How a table of another program with timestamps is read."""
 
     clock_offset: Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")] = 0.0
@@ -116,6 +119,7 @@ def _mapped(
     *,
     unwanted: int,
     passed: int = 0,
+    unread: tuple[tuple[int, str], ...] = (),
 ) -> Cells:
     """Return the cells of a file by field.
 
@@ -126,7 +130,13 @@ def _mapped(
     read = {*mapping.columns.values(), *mapping.where}
     left_out = tuple(name for name in available if name not in read)
     labels, units = mapping.columns, mapping.units
-    return Cells(path, rows, fields, labels, units, mapping.decimal, left_out, passed, unwanted)
+    rules = _rules(mapping)
+    return Cells(path, rows, fields, labels, units, mapping.decimal, left_out, passed, unwanted, rules, unread)
+
+
+def _rules(mapping: ColumnMapping) -> RowRules | None:
+    """What to do with invalid rows of a table; None for tables of names and maps, whose rows must be valid."""
+    return mapping if isinstance(mapping, TimedMapping) else None
 
 
 class TableFolder:
@@ -145,17 +155,25 @@ class TableFolder:
         """Return the path of a file in the folder. Raises InputError if the path leads out of the folder."""
         return inside(self.path, name, self.path)
 
-    def read(self, mapping: ColumnMapping, shapes: Sequence[Collection[str]]) -> Cells:
-        """Read the file of a mapping by :func:`read_mapped`, and record what was read by :meth:`noted`."""
-        return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping)
+    def read(self, mapping: TimedMapping, shapes: Sequence[Collection[str]], columns: Mapping[str, Column]) -> Cells:
+        """Read the file of a mapping by :func:`read_mapped`, and record what was read by :meth:`noted`. ``columns``: the
+        description of each field.
+        """
+        return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
 
-    def noted(self, cells: Cells, mapping: ColumnMapping) -> Cells:
-        """Record the rows and columns from which ``cells`` were read. Return ``cells`` unchanged."""
+    def noted(
+        self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
+    ) -> Cells:
+        """Record the rows and columns from which ``cells`` were read. Return the cells without the rows that the mapping skips.
+
+        ``columns``: the description of each field. ``more``: further faults of the cells.
+        """
         if cells.passed:
             sentence = "{source}: {objects} objects that lack mapped columns are skipped"
             self.warnings.append(notice("incomplete_objects", sentence, cells.path, cells.passed))
         self._read.setdefault(cells.path, []).append((cells, mapping))
-        return cells
+        own = {"t": STAMP} | {name: columns[name] for name in cells.columns if name in columns}
+        return cells.usable(own, self.warnings, offset=mapping.clock_offset, more=more)
 
     def left_out(self) -> list[Notice]:
         """Return warnings about data that no mapping reads: one for each file with such rows, and one for all files that have the
@@ -164,9 +182,9 @@ class TableFolder:
         columns: dict[tuple[str, ...], list[str]] = {}
         for path, tables in self._read.items():
             read: set[int] = set()
-            count = tables[0][0].unwanted + len(tables[0][0].rows)
+            count = tables[0][0].unwanted + len(tables[0][0].rows) + len(tables[0][0].unread)
             unchosen = count if all(cells.unwanted for cells, _ in tables) else 0
-            for rows in (cells.rows.tolist() for cells, _ in tables):
+            for rows in ([*cells.rows.tolist(), *(row for row, _ in cells.unread)] for cells, _ in tables):
                 unchosen -= sum(row not in read for row in rows)  # several rows of one JSON line have the same number
                 read.update(rows)
             if unchosen > 0:
@@ -225,10 +243,15 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         chosen = ((row, parts) for row, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
         first_row, first = next(chosen, body[0])
         header = _numbers(len(first))
+        if (
+            rules := _rules(mapping)
+        ) is not None and rules.bad_rows == "skip":  # a row that was cut off does not define the columns
+            lengths = Counter(len(parts) for _, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
+            header = _numbers(lengths.most_common(1)[0][0] if lengths else len(first))
     _require_columns(path, mapping, needed, header, first_row)
     kept = [(row, parts) for row, parts in body if _is_chosen(parts, header, where)] if where else body
-    rows, columns = rows_of_length(path, header, kept)
-    return _mapped(path, rows, columns, mapping, header, unwanted=len(body) - len(kept))
+    rows, columns, unread = rows_of_length(path, header, kept, _rules(mapping))
+    return _mapped(path, rows, columns, mapping, header, unwanted=len(body) - len(kept), unread=unread)
 
 
 def _numbers(count: int) -> list[str]:
@@ -286,7 +309,8 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
 
     Only objects are read that ``where`` selects and that have all ``needed`` columns. Raises InputError if none has such a column.
     """
-    objects = list(_objects(path))
+    unread: list[tuple[int, str]] = []
+    objects = list(_objects(path, unread))
     where = mapping.chosen()
     chosen = [(row, o) for row, o in objects if all(_text(o.get(name)) in values for name, values in where.items())]
     filled = [{name for name, value in o.items() if value is not None} for _, o in chosen]
@@ -296,18 +320,28 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
         if len(whole) < len(chosen) and not known.intersection(alternatives):
             first = listed(sorted(chosen[0][1]))
             raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {first}")
-    columns: dict[str, list[str]] = {}
+    passed, fields = len(chosen) - len(whole), sorted(known.intersection(mapping.columns.values()))
     texts = {column for field, column in mapping.columns.items() if field in TEXT_FIELDS}
-    for name in known.intersection(mapping.columns.values()):
-        for row, o in whole:
-            value = o.get(name)
-            if isinstance(value, list | bool) or (name in texts and not isinstance(value, str | None)):
-                raise bad_field(path, name, value, "a text" if name in texts else "a number or a text", row=row)
-        columns[name] = [_text(o.get(name)) for _, o in whole]
+    errors = [_wrong_value(path, row, o, fields, texts) for row, o in whole]
+    unread += [(row, error) for (row, _), error in zip(whole, errors, strict=True) if error]
+    require_read(sorted(unread), len(whole) + len(unread), _rules(mapping))
+    whole = [entry for entry, error in zip(whole, errors, strict=True) if not error]
+    columns = {name: [_text(o.get(name)) for _, o in whole] for name in fields}
     names = dict.fromkeys(name for _, o in whole for name in o)
     rows = np.array([row for row, _ in whole], dtype=np.int64)
-    unwanted, passed = len(objects) - len(chosen), len(chosen) - len(whole)
-    return _mapped(path, rows, columns, mapping, names, unwanted=unwanted, passed=passed)
+    unwanted = len(objects) - len(chosen)
+    return _mapped(path, rows, columns, mapping, names, unwanted=unwanted, passed=passed, unread=tuple(unread))
+
+
+def _wrong_value(path: Path, row: int, entry: Mapping[str, Any], fields: Sequence[str], texts: Collection[str]) -> str:
+    """The error about the first of the ``fields`` of an object whose value has a wrong type, "" if there is none. ``texts``: the
+    fields that must be texts."""
+    for name in fields:
+        value = entry.get(name)
+        if isinstance(value, list | bool) or (name in texts and not isinstance(value, str | None)):
+            expected = "a text" if name in texts else "a number or a text"
+            return str(bad_field(path, name, value, expected, row=row))
+    return ""
 
 
 def _text(value: Any) -> str:
@@ -317,16 +351,23 @@ def _text(value: Any) -> str:
     return "" if value is None else well_formed(str(value))
 
 
-def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+def _objects(path: Path, unread: list[tuple[int, str]]) -> Iterator[tuple[int, dict[str, Any]]]:
     """Return the line number and the content of each object of JSON lines. The key of a nested value is the path of keys to it,
-    joined by dots."""
+    joined by dots.
+
+    The number and the error of each invalid line are appended to ``unread``.
+    """
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
-        content = parse_json(line, f"{path}:{row}")
-        entries = content if isinstance(content, list) else [content]
-        if not all(isinstance(entry, dict) for entry in entries):
-            raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
+        try:
+            content = parse_json(line, f"{path}:{row}")
+            entries = content if isinstance(content, list) else [content]
+            if not all(isinstance(entry, dict) for entry in entries):
+                raise bad_field(path, "line", line.strip()[:80], "an object, or a list of objects", row=row)
+        except InputError as error:
+            unread.append((row, str(error)))
+            continue
         # old versions of sllurp write each number as a list of one
         yield from ((row, {name: _alone(value) for name, value in flattened(entry)}) for entry in entries)
 

@@ -1,4 +1,4 @@
-"""Conversion of cells of tables to numbers, names and timestamps, and reading and writing of tables of the native format.
+"""Reading and writing of tables of the native format, and their typed rows.
 
 A table of the native format is a CSV file with a header, or a Parquet file with the same columns.
 """
@@ -6,14 +6,10 @@ A table of the native format is a CSV file with a header, or a Parquet file with
 import csv
 import io
 import math
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
-from decimal import Decimal
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import polars as pl
@@ -21,158 +17,14 @@ from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files.bounded import CELLS, DATA, foreign, limited_memory, quiet, read_bytes, require_size
-from factorgraph_loc.files.columns import LATEST, STAMP, Column, Table, require_span
+from factorgraph_loc.files.cells import NAMES, NUMBERS, Cells
+from factorgraph_loc.files.columns import Column, Table
 from factorgraph_loc.files.models import Model, nearest, parse_model, read_text, write_bytes, write_text
-from factorgraph_loc.text import error_text, quoted
+from factorgraph_loc.files.row_rules import RowRules, require_read
+from factorgraph_loc.text import Notice, error_text
 from factors.se2 import Array, Integers
 
-SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # units of time, as powers of ten of a nanosecond
-ISO = "iso"
-MOST_DIGITS = 20  # of a timestamp before its decimal point
-NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
 KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.String, "file": pl.String}
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Cells:
-    """The unparsed cells of N rows of a file.
-
-    ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file.
-    ``columns``: for each field N texts, or numbers (N,) with NaN for empty cells.
-    ``labels``: by field, the name of the column in the file, if it differs from the field.
-    ``units``: by field, the name of the unit in the file, or the factor to the unit of streams. ``decimal``: the decimal mark.
-    ``left_out``: columns of the file that are not read. ``passed``: number of JSON objects that lack needed columns.
-    ``unwanted``: number of rows that the mapping excludes.
-    """
-
-    path: Path
-    rows: Integers
-    columns: Mapping[str, Sequence[str] | Array]
-    labels: Mapping[str, str] = field(default_factory=dict)
-    units: Mapping[str, str | float] = field(default_factory=dict)
-    decimal: str = "."
-    left_out: tuple[str, ...] = ()
-    passed: int = 0
-    unwanted: int = 0
-
-    def texts(self, name: str) -> list[str]:
-        """Return the N cells of a field as texts."""
-        return [str(cell) for cell in self.columns[name]]
-
-    def names(self, name: str, column: Column) -> list[str]:
-        """Return the N names in a field. Raises InputError at the first empty cell, with the description of ``column``."""
-        texts = self.texts(name)
-        if "" in texts:
-            raise self.invalid(name, texts.index(""), column.doc)
-        return texts
-
-    def numbers(self, name: str, column: Column) -> Array:
-        """Return the numbers (N,) in a field, converted to the unit of streams of ``column``. Empty cells become NaN.
-
-        Raises InputError at the first cell that is no finite number, is out of bounds, or is empty although ``column`` forbids it.
-        """
-        cells = self.columns[name]
-        if isinstance(cells, np.ndarray):
-            values, is_empty = cells, np.isnan(cells)
-        else:
-            values, is_empty = self._floats(name, cells)
-        in_file, factor = column.in_unit(self.units.get(name, 1.0), self.path)
-        for i in np.flatnonzero(~(np.isfinite(values) | is_empty)).tolist():
-            raise self.invalid(name, i, "a finite number")
-        if not column.may_lack and is_empty.any():
-            raise self.invalid(name, int(is_empty.argmax()), in_file.expected)
-        in_file.require(self.path, self.rows, values, self.labels.get(name, name))
-        return values if factor == 1.0 else values * factor
-
-    def nanoseconds(self) -> Integers:
-        """Return the timestamps (N,) [ns] of a table of the native format. Raises InputError if one is no whole number."""
-        stamps = self._converted(STAMP.name, lambda cell: _limited(int(cell)), STAMP.expected)
-        return np.array(stamps, dtype=np.int64)
-
-    def stamps(self, name: str, offset: float = 0.0) -> Integers:
-        """Return the timestamps (N,) [ns] in a field, plus ``offset`` [s].
-
-        The unit of the field is s, ms, us, ns or iso: a date and time, which is UTC if it has no time zone. Raises InputError for
-        other units, invalid cells, and timestamps that are too far apart.
-        """
-        unit = self.units.get(name)
-        if unit not in {*SECONDS, ISO}:
-            expected = f"one of {', '.join(SECONDS)} or {ISO}"
-            raise InputError(f"{self.path}: the unit of {name} is {quoted(unit)}, expected {expected}: units.{name}")
-        power, shift = SECONDS.get(str(unit), 0), round(offset * 1e9)
-        expected = f"a number of {unit} in {-LATEST / 10**power:g} to {LATEST / 10**power:g}"
-        if unit == ISO:
-            expected = "a date and time, 2026-01-31T12:00:00.5Z"
-
-        def stamp(text: str) -> int:
-            return _limited(shift + (iso_nanoseconds(text) if unit == ISO else self._scaled(text, power)))
-
-        out = np.array(self._converted(name, stamp, expected), dtype=np.int64)
-        require_span([(self.path, self.rows, out)])
-        return out
-
-    def invalid(self, name: str, i: int, expected: str) -> InputError:
-        """Return the error for the invalid cell ``i`` of a field. ``expected``: a description of valid cells."""
-        return bad_field(self.path, self.labels.get(name, name), self.columns[name][i], expected, row=int(self.rows[i]))
-
-    def _converted(self, name: str, convert: Callable[[Any], T], expected: str) -> list[T]:
-        """Convert the cells of a field by the function ``convert``. Raises InputError at the first cell for which it fails."""
-        out: list[T] = []
-        try:
-            for cell in self.columns[name]:
-                out.append(convert(cell))
-        except (ArithmeticError, TypeError, ValueError):
-            raise self.invalid(name, len(out), expected) from None
-        return out
-
-    def _floats(self, name: str, texts: Sequence[str]) -> tuple[Array, NDArray[np.bool_]]:
-        """Convert N texts of a field to numbers (N,), with NaN for empty texts. Also return a mask (N,) of the empty texts."""
-        if self.decimal == ".":
-            with suppress(ValueError):  # several times as fast, if no text is empty or invalid
-                return np.array(list(map(float, texts)), dtype=float), np.zeros(len(texts), dtype=bool)
-
-        def number(text: str) -> float:
-            return float(text.replace(self.decimal, ".")) if text else np.nan
-
-        values = np.array(self._converted(name, number, "a number"), dtype=float)
-        return values, np.array([not text for text in texts], dtype=bool)
-
-    def _scaled(self, text: str, power: int) -> int:
-        """Return a decimal number times 10**power, rounded to an integer without floating-point errors.
-
-        Raises ArithmeticError if the text is no finite number or has more than :data:`MOST_DIGITS` digits before the decimal mark.
-        """
-        text = text.replace(self.decimal, ".")
-        whole, _, fraction = text.partition(".")
-        if len(whole) <= MOST_DIGITS and len(fraction) <= power and (whole + fraction).isdecimal():
-            return int(whole + fraction + "0" * (power - len(fraction)))  # several times as fast as Decimal
-        number = Decimal(text)
-        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # checked before the digits are expanded
-            raise OverflowError
-        return round(number.scaleb(power))
-
-
-def _limited(stamp: int) -> int:
-    """Return a timestamp [ns]. Raises OverflowError if it exceeds :data:`LATEST`."""
-    if abs(stamp) > LATEST:
-        raise OverflowError
-    return stamp
-
-
-def iso_nanoseconds(text: str) -> int:
-    """Convert an ISO 8601 date and time to nanoseconds since 1970. A time without a time zone is UTC.
-
-    Raises ValueError if the text is invalid.
-    """
-    # the fraction of a second is parsed separately, because datetime has microseconds only
-    fraction = re.search(r"[.,](\d+)", text)
-    whole = text.replace(fraction.group(0), "", 1) if fraction else text
-    moment = datetime.fromisoformat(whole.strip())
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    digits = fraction.group(1) if fraction else ""
-    return int(moment.timestamp()) * 10**9 + int((digits + "0" * 9)[:9])
 
 
 def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Iterator[tuple[int, list[str]]]:
@@ -189,25 +41,29 @@ def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Itera
 
 
 def rows_of_length(
-    path: Path, header: Sequence[str], rows: Iterable[tuple[int, list[str]]]
-) -> tuple[Integers, dict[str, list[str]]]:
+    path: Path, header: Sequence[str], rows: Iterable[tuple[int, list[str]]], rules: RowRules | None = None
+) -> tuple[Integers, dict[str, list[str]], tuple[tuple[int, str], ...]]:
     """Collect the rows of a CSV file by column. ``rows``: line number and cells of each row.
 
-    Returns the line numbers (N,), and by name in ``header`` the N cells of a column. Raises InputError at a row that has not as
-    many cells as the header.
+    Returns the line numbers (N,), by name in ``header`` the N cells of a column, and line number and error of each row that has
+    not as many cells as the header. Raises InputError at the first such row, unless ``rules`` skip them and they are few.
     """
     numbers: list[int] = []
     table: list[list[str]] = []
+    unread: list[tuple[int, str]] = []
+    expected = f"{len(header)} values: {','.join(header)}"
     for row, parts in rows:
-        if len(parts) != len(header):
-            raise bad_field(path, "row", ",".join(parts), f"{len(header)} values: {','.join(header)}", row=row)
-        numbers.append(row)
-        table.append(parts)
+        if len(parts) == len(header):
+            numbers.append(row)
+            table.append(parts)
+        else:
+            unread.append((row, str(bad_field(path, "row", ",".join(parts), expected, row=row))))
+    require_read(unread, len(table) + len(unread), rules)
     columns = {name: [parts[i] for parts in table] for i, name in enumerate(header)}
-    return np.array(numbers, dtype=np.int64), columns
+    return np.array(numbers, dtype=np.int64), columns, tuple(unread)
 
 
-def read_cells(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column, ...]]:
+def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = None) -> tuple[Cells, tuple[Column, ...]]:
     """Read a CSV file that contains one of several possible ``tables``.
 
     Returns the cells and the columns of the table that the header of the file fits best. Raises InputError with file and row if the
@@ -220,8 +76,8 @@ def read_cells(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column
         raise InputError(f"{path}: is empty, expected a header {' or '.join(table.header for table in tables)}")
     columns = columns_in(path, header, tables)
     filled = ((row, parts) for row, parts in parsed if len(parts) > 1 or "".join(parts).strip())
-    rows, cells = rows_of_length(path, header, filled)
-    return Cells(path, rows, cells, left_out=_unread(header, columns)), columns
+    rows, cells, unread = rows_of_length(path, header, filled, rules)
+    return Cells(path, rows, cells, left_out=_unread(header, columns), rules=rules, unread=unread), columns
 
 
 def columns_in(path: Path, header: Sequence[str], tables: Sequence[Table]) -> tuple[Column, ...]:
@@ -309,6 +165,8 @@ class TableRows:
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps [ns].
     ``numbers``: by column, numbers (N,) in the unit of streams, NaN for empty cells. ``names``: by column, N texts.
     ``left_out``: columns of the file that are not read.
+    ``rules``: what a manifest says about invalid and late rows, None without a manifest.
+    ``resumed`` (N,): True for each row that follows a skipped row.
     """
 
     path: Path
@@ -317,6 +175,12 @@ class TableRows:
     numbers: dict[str, Array]
     names: dict[str, list[str]]
     left_out: tuple[str, ...] = ()
+    rules: RowRules | None = None
+    resumed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def __post_init__(self) -> None:
+        if len(self.resumed) != len(self.rows):
+            object.__setattr__(self, "resumed", np.zeros(len(self.rows), dtype=bool))
 
     @classmethod
     def of(cls, cells: Cells, columns: Iterable[Column], t_ns: Integers) -> Self:
@@ -324,7 +188,7 @@ class TableRows:
         described = list(columns)
         numbers = {column.name: cells.numbers(column.name, column) for column in described if column.kind in NUMBERS}
         names = {column.name: cells.names(column.name, column) for column in described if column.kind in NAMES}
-        return cls(cells.path, cells.rows, t_ns, numbers, names, cells.left_out)
+        return cls(cells.path, cells.rows, t_ns, numbers, names, cells.left_out, cells.rules, cells.resumed)
 
     def rows_at(self, which: Integers) -> Self:
         """Return the rows with the indices ``which`` (M,), in the order of ``which``."""
@@ -334,20 +198,24 @@ class TableRows:
             self.t_ns[which],
             {name: values[which] for name, values in self.numbers.items()},
             {name: [texts[i] for i in which.tolist()] for name, texts in self.names.items()},
+            rules=self.rules,
+            resumed=self.resumed[which],
         )
 
 
-def read_table(path: Path, tables: Sequence[Table]) -> TableRows:
+def read_table(path: Path, tables: Sequence[Table], rules: RowRules, warnings: list[Notice]) -> TableRows:
     """Read a CSV or Parquet file that contains one of several possible ``tables``. Other columns of the file are ignored.
 
-    Raises InputError with file, row and column if a value is missing, is not a number, or is out of bounds.
+    Raises InputError with file, row and column if a value is missing, is not a number, or is out of bounds, unless ``rules``
+    skip such rows. Skipped and sorted rows are counted in ``warnings``.
     """
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
-        cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables)
+        cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables, rules)
+        cells = cells.usable({column.name: column for column in columns}, warnings)
         return TableRows.of(cells, columns, cells.nanoseconds())
 
 
-def _cells_of_parquet(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple[Column, ...]]:
+def _cells_of_parquet(path: Path, tables: Sequence[Table], rules: RowRules | None) -> tuple[Cells, tuple[Column, ...]]:
     """Read a Parquet file that contains one of ``tables``. Return its cells and the columns of that table."""
     frame = read_parquet(path)
     columns = columns_in(path, frame.columns, tables)
@@ -365,7 +233,7 @@ def _cells_of_parquet(path: Path, tables: Sequence[Table]) -> tuple[Cells, tuple
         else:
             cells[name] = frame[name].to_list()
     rows = np.arange(1, frame.height + 1, dtype=np.int64)
-    return Cells(path, rows, cells, left_out=_unread(frame.columns, columns)), columns
+    return Cells(path, rows, cells, left_out=_unread(frame.columns, columns), rules=rules), columns
 
 
 def write_parquet(frame: pl.DataFrame, path: Path) -> None:

@@ -21,7 +21,7 @@ from factorgraph_loc.files.models import parse_model, read_text
 from factorgraph_loc.io.guesses import TRUTH, Guess, guess
 from factorgraph_loc.io.motions import wheel_steps
 from factorgraph_loc.io.proposals import Proposal, distinct, proposal_of, toml_of
-from factorgraph_loc.io.readers.mapped import ReferenceFile, read_reference
+from factorgraph_loc.io.readers.mapped_motion import ReferenceFile, read_reference
 from factorgraph_loc.io.turns import Turns, match
 from factorgraph_loc.model.sections import kind_of, several
 from factorgraph_loc.model.trajectory import Trajectory

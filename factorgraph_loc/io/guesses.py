@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_loc.files.cells import iso_nanoseconds
 from factorgraph_loc.files.column_mapping import parsed, split_comments
 from factorgraph_loc.files.columns import LENGTH, RATE, SPEED, STAMPS, unit_since_1970
 from factorgraph_loc.files.models import read_text
-from factorgraph_loc.files.tables import iso_nanoseconds
 from factorgraph_loc.text import quoted
 from factors.se2 import Array
 

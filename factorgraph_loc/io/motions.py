@@ -4,6 +4,7 @@ Odometry may be reset during a log. The sizes of wheels come from the manifest o
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel, InUnit
+from factorgraph_loc.files.row_rules import RowRules
 from factorgraph_loc.model.rig import Rig
+from factorgraph_loc.sensors.odometry.jumps import without_jumps
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.odometry.settings import DifferentialDrive, OdometrySettings
 from factorgraph_loc.text import Notice, notice
@@ -23,6 +26,7 @@ from factors.se2 import Array, Integers
 SPEED, TURN, FASTER = 1.0, 2.0, 3.0
 RESET_DISTANCE = 0.05  # m: maximum distance from the origin after a reset of the odometry
 ZERO = 1e-6  # m and rad: magnitude below which a value is zero
+NO_STAMPS = np.zeros(0, dtype=np.int64)
 HOLD_TIME = 1.0  # s for which the previous motion is continued across a reset
 COUNTERS = (2**8, 2**16, 2**32)  # numbers of counts after which encoders wrap to 0
 TURNS = ("left_angle", "left_rate")  # columns with angles or angular rates of wheels, which need a radius
@@ -82,11 +86,13 @@ def wheels_of(left: str, count: int) -> tuple[str, ...]:
     return pair if count == 2 else (*pair, *(f"rear_{name}" for name in pair))
 
 
-def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[Notice]) -> Array:
+def between_poses(
+    source: object, t_ns: Integers, poses: Array, warnings: list[Notice], lost_ns: Integers = NO_STAMPS
+) -> Array:
     """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
-    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause. At a reset, the
-    previous motion is continued, with a warning.
+    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause or after a null
+    pose. At a reset, the previous motion is continued, with a warning. ``lost_ns``: the timestamps of null poses.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -94,10 +100,46 @@ def between_poses(source: object, t_ns: Integers, poses: Array, warnings: list[N
     fastest = _largest_before(speeds, SPEED)
     home = np.hypot(poses[1:, 0], poses[1:, 1]) <= RESET_DISTANCE + fastest * durations
     jumps = (speeds > FASTER * fastest) | (turns > FASTER * _largest_before(turns, TURN))
-    zeros = np.all(np.abs(poses[1:]) < ZERO, axis=1) & (speeds * durations > RESET_DISTANCE) & (durations > HOLD_TIME)
+    zeros = np.all(np.abs(poses[1:]) < ZERO, axis=1) & (speeds * durations > RESET_DISTANCE)
+    zeros &= (durations > HOLD_TIME) | (np.diff(np.searchsorted(np.sort(lost_ns), t_ns)) > 0)
     anew = np.flatnonzero((home & jumps) | zeros)
     moves[anew] = se2.exp(_continued(source, t_ns, se2.log(moves), anew, warnings)[anew])
     return moves
+
+
+def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Integers, Array]:
+    """Return timestamps (M,) and increments (M, 4) of odometry with null poses. The last column is the time [s] in which the motion
+    is unknown.
+
+    ``moves`` (N - 1, 3): the motion between poses at N timestamps [ns]. ``lost_ns``: the timestamps of the null poses. The
+    previous motion is continued until the last null pose, and it is unknown until the next pose. Without null poses the
+    increments are (N, 3).
+    """
+    lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
+    if not len(lost):
+        return t_ns, after_rest(moves)
+    every = np.union1d(t_ns, lost)
+    at, durations = np.searchsorted(every, t_ns), np.append(0.0, np.diff(every) / 1e9)
+    out, before = np.zeros((len(every), 4)), np.zeros(3)
+    for i, (first, last) in enumerate(pairwise([*at.tolist(), len(every)])):
+        elapsed = np.cumsum(durations[first + 1 : last])
+        ways = se2.exp(np.vstack((np.zeros(3), np.minimum(elapsed, HOLD_TIME)[:, None] * before)))
+        out[first + 1 : last, :3] = se2.between(ways[:-1], ways[1:])
+        if last < len(every):
+            out[last, :3] = se2.between(ways[-1], moves[i])
+            before = se2.log(moves[i]) / max(float(durations[first + 1 : last + 1].sum()), 1e-3)
+        if last > first + 1:
+            out[first + 1 : last + 1, 3] = durations[first + 1 : last + 1]
+    return every, out
+
+
+def held(t_ns: Integers, velocities: Array) -> Array:
+    """Return the motions (N - 1, 3) between N timestamps [ns] of velocities (N, 2), forward and about the vertical.
+
+    A velocity is held until the next one, for at most :data:`HOLD_TIME`.
+    """
+    twists = np.column_stack((velocities[:-1, 0], np.zeros(len(velocities) - 1), velocities[:-1, 1]))
+    return np.asarray(se2.exp(twists * np.minimum(np.diff(t_ns) / 1e9, HOLD_TIME)[:, None]))
 
 
 def after_rest(moves: Array) -> Array:
@@ -141,10 +183,16 @@ def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, 
     return after_rest(se2.exp(twists[:-1] * (np.diff(t_ns) / 1e9)[:, None]))
 
 
-def odometry_stream(t_ns: Integers, values: Array, t0_ns: int) -> IncrementStream | VelocityStream:
-    """Return the odometry stream of ``values``: velocities (N, 2) or increments (N, 3), at N timestamps [ns]."""
-    t = checks.seconds(t_ns, t0_ns)
-    return IncrementStream(t, *values.T) if values.shape[1] == 3 else VelocityStream(t, *np.ascontiguousarray(values.T))
+def odometry_stream(
+    t_ns: Integers, values: Array, t0_ns: int, rules: RowRules, warnings: list[Notice]
+) -> IncrementStream | VelocityStream:
+    """Return the odometry stream of ``values``: velocities (N, 2) or increments (N, 3 or 4), at N timestamps [ns].
+
+    Rows that jump are skipped if the ``rules`` say so; ``warnings`` then has their number.
+    """
+    t, columns = checks.seconds(t_ns, t0_ns), np.ascontiguousarray(values.T)
+    stream = VelocityStream(t, *columns) if len(columns) == 2 else IncrementStream(t, *columns)
+    return without_jumps(stream, rules, warnings)
 
 
 def wheel_steps(distances: Array, scale: float) -> Array:

@@ -5,17 +5,21 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from factorgraph_loc.errors import InputError, require
 from factorgraph_loc.files.models import FileModel, InUnit
-from factorgraph_loc.text import Notice
+from factorgraph_loc.files.row_rules import Fault, require_none
+from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
 RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a warning and for an error
 TILT = math.radians(10.0)  # angle between the z axes of the robot and the world: limit for a warning
 NEGLIGIBLE = 1e-9  # component of a unit vector below which an axis does not contribute
 UNIT = 0.01  # tolerance of the norm of a quaternion
+# m^2: variance of a placeholder; and its least ratio to the median, as the variance of odometry grows
+HUGE, ABOVE_USUAL = 1000.0, 100.0
 NAMED = {"body": "x y z", "optical": "z -x -y"}  # axes that point forward, left and up, by name
 
 Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")]
@@ -87,15 +91,41 @@ class Turned(FileModel):
 AS_IT_IS = Turned()
 
 
+def not_unit(quaternions: Array) -> Fault:
+    """Return the fault of the quaternions (N, 4) that are not unit quaternions."""
+    with np.errstate(over="ignore"):
+        length = np.sqrt(np.sum(quaternions**2, axis=1))
+    return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")
+
+
+def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.bool_]:
+    """Return a mask (N,) of null poses, which programs publish while they have lost track.
+
+    The quaternion (N, 4) of a null pose is zero, or a variance of x or y (N, 2) [m^2] is at least :data:`HUGE` and far above the
+    median. If more than half of the poses are of this kind, none is a null pose.
+    """
+    null = np.asarray(~quaternions.any(axis=1))
+    if variances is not None and len(variances):
+        usual = np.median(np.nan_to_num(variances, nan=0.0, posinf=HUGE), axis=0)
+        null = null | (variances >= np.maximum(HUGE, ABOVE_USUAL * usual)).any(axis=1)
+    return null if 2 * np.count_nonzero(null) <= len(null) else np.zeros(len(null), dtype=bool)
+
+
+def null_poses(source: object, row: int, count: int) -> Notice:
+    """Return the warning about ``count`` null poses, the first in ``row`` of ``source``."""
+    sentence = (
+        "{source}:{row}: the pose is null, the first of {poses}: they are skipped, and the motion is unknown until the next "
+        "pose"
+    )
+    return notice("null_poses", sentence, source, row, count)
+
+
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
     """Return the rotation matrices (N, 3, 3) of ``quaternions`` (N, 4), in the order x, y, z, w.
 
     ``source``, ``rows`` (N,): the file and the row numbers for errors. Raises InputError if a quaternion has not length 1.
     """
-    with np.errstate(over="ignore"):
-        length = np.sqrt(np.sum(quaternions**2, axis=1))
-    valid = np.abs(length - 1.0) <= UNIT
-    require(valid, source, rows, "length of the quaternion", length, "1, a unit quaternion")
+    require_none(source, rows, [not_unit(quaternions)])
     x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     matrix = [  # computed here, because importing scipy is slow
         [w * w + x * x - y * y - z * z, 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -107,7 +107,7 @@ class PosePath(Exchange):
 
     ``name``: the name in errors. ``positions`` (N, 3) [m]. ``rotations`` (N, 3, 3). ``t_ns`` (N,): absolute times [ns], strictly
     increasing, or None if only the order of the poses is known. ``has_rotations``: False if the rotations are meaningless.
-    ``warnings``: problems that a reader corrected.
+    ``warnings``: problems that a reader corrected. ``lost_ns``: times [ns] of null poses, which are not in the sequence.
     """
 
     name: str
@@ -116,6 +116,7 @@ class PosePath(Exchange):
     t_ns: Integers | None
     has_rotations: bool = True
     warnings: tuple[Notice, ...] = ()
+    lost_ns: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.positions)

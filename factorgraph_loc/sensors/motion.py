@@ -103,7 +103,7 @@ class Motion(OdometryChain):
             case VelocityOdometry() if self._use_wheels:
                 kept = self.add_velocity(m.t, m.v, m.w)
             case IncrementOdometry() if self._use_wheels:
-                kept = self.add_increment(m.t, m.dx, m.dy, m.dtheta)
+                kept = self.add_increment(m.t, m.dx, m.dy, m.dtheta, m.unknown)
             case _:
                 self._diagnostics.ignore("yaw rate" if isinstance(m, YawRate) else m.sensor, m.count)
                 return
@@ -174,5 +174,5 @@ def integrated(log: Log, model: OdometryModel) -> OdometryChain:
     if isinstance(stream, VelocityStream):
         chain.add_velocities(t, stream.v, stream.w)
     else:
-        chain.add_increments(t, stream.dx, stream.dy, stream.dtheta)
+        chain.add_increments(t, stream.dx, stream.dy, stream.dtheta, stream.unknown)
     return chain

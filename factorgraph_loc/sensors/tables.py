@@ -120,10 +120,10 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice])
     for column in measured:
         values[column.name] = _without_small(column, rows, warnings)
     if not table.is_scan:
-        keep = checks.in_order(rows.path, rows.rows, rows.t_ns, warnings)
+        keep = checks.in_order(rows.path, rows.rows, rows.t_ns, warnings, rows.rules)
     else:
         names = next(iter(rows.names.values()), None) or [str(row) for row in rows.rows]
-        keep = checks.last_in_order(rows.path, rows.rows, rows.t_ns, warnings, names)
+        keep = checks.last_in_order(rows.path, rows.rows, rows.t_ns, warnings, names, rows.rules)
         if measured:
             keep = keep[~_all_empty([values[column.name][keep] for column in measured])]
     kept = {

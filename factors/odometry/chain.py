@@ -92,27 +92,29 @@ class OdometryChain:
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """Add a row with forward velocity [m/s] and turn rate [rad/s], valid from ``t`` until the next row. Returns False if the
         row is too old and is ignored."""
-        return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0)
+        return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0, 0.0)
 
-    def add_increment(self, t: float, dx: float, dy: float, dtheta: float) -> bool:
+    def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
         """Add the motion (dx, dy, dtheta) from the previous row until ``t``, in the robot frame at the previous row.
 
-        If there is already a motion until ``t``, the new motion is composed with it. Returns False if the row is too old and is
-        ignored.
+        ``unknown`` [s]: the part of the time since the previous row in which the motion is unknown. If there is already a
+        motion until ``t``, the new motion is composed with it. Returns False if the row is too old and is ignored.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
             last -= 1
         if last >= 0 and self._rows[last, 0] == t:
-            self._rows[last, 2:] = se2.log(se2.compose(se2.exp(self._rows[last, 2:]), move))
+            self._rows[last, 2:5] = se2.log(se2.compose(se2.exp(self._rows[last, 2:5]), move))
+            self._rows[last, 5] += unknown
             integrate(self._rows, self._knots, last, self._count, self._constants)
             return True
-        return self._insert(t, INCREMENT, *se2.log(move).tolist())
+        x, y, turned = se2.log(move).tolist()
+        return self._insert(t, INCREMENT, x, y, turned, unknown)
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
         """Add a gyro row with turn rate ``w`` [rad/s], valid from ``t`` until the next gyro row. It replaces the rotation of the
         wheels. Returns False if the row is too old and is ignored."""
-        return self._insert(t, GYRO, w, 0.0, 0.0)
+        return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
         """Add N rows as :meth:`add_velocity` does, in order of time. Returns the number of rows that are not too old."""
@@ -126,15 +128,18 @@ class OdometryChain:
         self._now_has(count, forgets=count < n + len(t))
         return len(t)
 
-    def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array) -> None:
+    def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array, unknown: Array | None = None) -> None:
         """Add N motions as :meth:`add_increment` does, in order of time and after all existing rows. Motions with equal timestamps
-        are composed."""
+        are composed.
+        """
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
             return
         self._reserve(len(last))
         n, end = self._count, self._count + len(last)
-        self._rows[n:end, 0], self._rows[n:end, 1], self._rows[n:end, 2:] = t[last], INCREMENT, se2.log(moves)
+        self._rows[n:end, 0], self._rows[n:end, 1], self._rows[n:end, 2:5] = t[last], INCREMENT, se2.log(moves)
+        lost = np.zeros(len(t)) if unknown is None else unknown
+        self._rows[n:end, 5] = np.bincount(np.searchsorted(t[last], t), weights=lost, minlength=len(last))
         integrate(self._rows, self._knots, n, end, self._constants)
         count = without_old(self._rows, self._knots, end, self.horizon)
         self._now_has(count, forgets=count < end)
@@ -260,11 +265,11 @@ class OdometryChain:
         """An increment as a factor on two poses only, with the odometry constants of the model."""
         return OdometryFactor(increment)
 
-    def _insert(self, t: float, kind: float, a: float, b: float, c: float) -> bool:
+    def _insert(self, t: float, kind: float, a: float, b: float, c: float, unknown: float) -> bool:
         if t < self.begin:
             return False
         self._reserve(1)
-        count = insert(self._rows, self._knots, self._count, t, kind, a, b, c, self._constants, self.horizon)
+        count = insert(self._rows, self._knots, self._count, t, kind, a, b, c, unknown, self._constants, self.horizon)
         self._now_has(count, forgets=count <= self._count)
         return True
 

@@ -11,8 +11,9 @@ import numpy as np
 from factors.compiled import compiled
 from factors.se2 import Array, arc_coefficients
 
-ROW = 5  # the number of columns of a row: time, kind, and three values
-# Kinds of rows. The values are (v, w, 0) of a velocity, the twist of an increment, and (w, 0, 0) of a gyro.
+ROW = 6  # the number of columns of a row: time, kind, and four values
+# Kinds of rows. The values are (v, w, 0, 0) of a velocity, the twist of an increment and the time in which its motion is
+# unknown, and (w, 0, 0, 0) of a gyro.
 VELOCITY, INCREMENT, GYRO = 0.0, 1.0, 2.0
 # Columns of a knot: the integrated state (8), the velocity in the robot frame (3), the target velocity that it converges to (3),
 # whether the wheels are at rest, and the time of the last gyro row.
@@ -72,7 +73,7 @@ def append(
         return -1
     for i in range(len(t)):
         row = rows[count + i]
-        row[0], row[1], row[2], row[3], row[4] = t[i] + delay, VELOCITY, v[i], w[i], 0.0
+        row[0], row[1], row[2], row[3], row[4], row[5] = t[i] + delay, VELOCITY, v[i], w[i], 0.0, 0.0
     integrate(rows, knots, count, count + len(t), constants)
     return without_old(rows, knots, count + len(t), horizon)
 
@@ -87,6 +88,7 @@ def insert(
     a: float,
     b: float,
     c: float,
+    unknown: float,
     constants: Array,
     horizon: float,
 ) -> int:
@@ -100,7 +102,7 @@ def insert(
         i = int(np.searchsorted(knots[:count, T], t, side="right"))
         for k in range(count, i, -1):
             copy(rows[k - 1], rows[k])
-    rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4] = t, kind, a, b, c
+    rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4], rows[i, 5] = t, kind, a, b, c, unknown
     integrate(rows, knots, i, count + 1, constants)
     return without_old(rows, knots, count + 1, horizon) if i == count else count + 1
 
@@ -134,7 +136,7 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
                 speed = math.hypot(previous[_UX], previous[_UY])
                 previous[_UW] = scale_rotation * turn + heading_drift * speed
             move(previous, duration, 0.0, duration, slipping, knot)
-            knot[UNKNOWN] += max(0.0, duration - hold)
+            knot[UNKNOWN] += max(0.0, duration - hold, min(rows[i, 5], duration))
         else:
             previous = knots[i - 1]
             move(previous, t - previous[T], lag, hold, slipping, knot)
@@ -196,7 +198,7 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
         move(knot, step, 0.0, step, constants[SLIPPING], following)
         if rows[k + 1, 1] == GYRO:
             _take_gyro(following, rows[k + 1, 0], rows[k + 1, 2] - gyro_bias)
-    knots[i, UNKNOWN] += max(0.0, duration - hold)
+    knots[i, UNKNOWN] += max(0.0, duration - hold, min(rows[i, 5], duration))
 
 
 @compiled

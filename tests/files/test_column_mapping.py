@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from refusal import refusal
 
 from factorgraph_loc.errors import InputError
+from factorgraph_loc.files.cells import SECONDS, Cells, iso_nanoseconds
 from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
 from factorgraph_loc.files.columns import POINTS, POSES
-from factorgraph_loc.files.tables import SECONDS, Cells, iso_nanoseconds
 from factorgraph_loc.sensors.landmarks.measurement import BEARING_RANGE
 from factorgraph_loc.sensors.odometry.measurement import VELOCITIES
 from factorgraph_loc.sensors.rfid.map import TAGS

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mapped_hall import MANIFEST, ODOMETRY, READS, WHEELS
 
-from factorgraph_loc.files.tables import iso_nanoseconds
+from factorgraph_loc.files.cells import iso_nanoseconds
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 
 

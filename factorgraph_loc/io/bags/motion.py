@@ -15,11 +15,12 @@ from pydantic import Field
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
+from factorgraph_loc.files.row_rules import RowRules
 from factorgraph_loc.io import motions
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import POSES, PoseTopic, StaticFrames, poses_of_topic
-from factorgraph_loc.io.bags.topics import LIST, TF, Listeners, TopicRows, TopicSettings, check_path
-from factorgraph_loc.model.planar import Turned, about_z
+from factorgraph_loc.io.bags.topics import LIST, TF, Listeners, RowTopic, TopicRows, check_path
+from factorgraph_loc.model.planar import NEGLIGIBLE, Turned, about_z, are_null, null_poses
 from factorgraph_loc.sensors.odometry.measurement import YawRateStream
 from factorgraph_loc.text import Notice, notice, quoted
 from factors.se2 import Array, Integers
@@ -65,9 +66,9 @@ class JointRows:
     ``column``: the field of the message to read, ``position`` or ``velocity``.
     """
 
-    def __init__(self, bag: Bag, topic: str, wheels: WheelSettings, column: str) -> None:
+    def __init__(self, bag: Bag, topic: str, wheels: WheelSettings, column: str, rules: RowRules) -> None:
         self._wheels, self._column = wheels, column
-        self.rows = TopicRows(f"{bag.path} {topic}", len(wheels.joints))
+        self.rows = TopicRows(f"{bag.path} {topic}", len(wheels.joints), rules=rules)
         self._seen: set[str] = set()
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -130,7 +131,7 @@ class OdometryTopic(PoseTopic):
     """wheels of a topic of joints; or of two topics, where topic is that of the left wheel"""
 
 
-class ImuTopic(TopicSettings, Turned):
+class ImuTopic(RowTopic, Turned):
     """A topic of an IMU: its turn rate about the robot's z axis."""
 
     frame: str | None = None
@@ -148,7 +149,7 @@ class YawRates:
             )
         self._options, self._frames = options, frames
         paths = [f"angular_velocity.{axis}" for axis in "xyz"]
-        self._rows = TopicRows(f"{bag.path} {options.topic}", 3, paths)
+        self._rows = TopicRows(f"{bag.path} {options.topic}", 3, paths, options)
         self.add = self._rows.add
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> YawRateStream:
@@ -156,10 +157,12 @@ class YawRates:
         turned = self._options.turned()
         if self._options.frame is not None:
             turned = self._frames.known(self._rows.source, self._options.frame)[:3, :3]
-        rows, t_ns = self._rows.rows, self._rows.t_ns
-        w = about_z(self._rows.source, rows, self._rows.values, turned)
-        keep = checks.in_order(self._rows.source, rows, t_ns, warnings)
-        return YawRateStream(checks.seconds(t_ns[keep], t0_ns), w[keep])
+        needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
+        names = [f"turn rate about {axis}" for axis in "xyz"]
+        values = self._rows.values
+        keep = self._rows.kept([checks.not_finite(names, values)[i] for i in needed.tolist()], warnings)
+        w = about_z(self._rows.source, self._rows.rows[keep], values[keep], turned)
+        return YawRateStream(checks.seconds(self._rows.t_ns[keep], t0_ns), w)
 
 
 def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
@@ -186,8 +189,29 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
     if poses:
         return _of_poses(listeners, options, static)
     twist = TWISTS.get(kind, "twist.twist.")
-    rows = listeners.listen(options, TopicRows(source, 2, (f"{twist}linear.x", f"{twist}angular.z")))
-    return lambda warnings: rows.in_order(("v", "w"), warnings)
+    paths = [f"{twist}linear.x", f"{twist}angular.z"]
+    if kind == ODOMETRY:
+        paths += [
+            *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
+            *(f"{part}.covariance[0]" for part in ("pose", "twist")),
+        ]
+    return partial(_velocities, listeners.listen(options, TopicRows(source, len(paths), paths, options)))
+
+
+def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
+    """Return the timestamps (N,) and velocities (N, 2) of rows, which may also have a quaternion and two variances.
+
+    If these show null poses, the motion is returned as increments (N, 4), and it is unknown at the null poses.
+    """
+    values = rows.values
+    null = are_null(values[:, 2:6], values[:, 6:]) if values.shape[1] > 2 else np.zeros(len(rows), dtype=bool)
+    known = np.flatnonzero(~null)
+    keep = rows.kept(checks.not_finite(("v", "w"), values[known, :2]), warnings, known)
+    t_ns, velocities = rows.t_ns[keep], values[keep, :2]
+    if not null.any():
+        return t_ns, velocities
+    warnings.append(null_poses(rows.source, int(rows.rows[null.argmax()]), int(np.count_nonzero(null))))
+    return motions.through_losses(t_ns, motions.held(t_ns, velocities), np.sort(rows.t_ns[null]))
 
 
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
@@ -197,8 +221,8 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
         path = made(warnings)
         t_ns = path.stamps()
-        moves = motions.between_poses(path.name, t_ns, path.on_floor(warnings, options), warnings)
-        return t_ns, motions.after_rest(moves)
+        moves = motions.between_poses(path.name, t_ns, path.on_floor(warnings, options), warnings, path.lost_ns)
+        return motions.through_losses(t_ns, moves, path.lost_ns)
 
     return motion
 
@@ -217,12 +241,12 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
     are_speeds = options.use == "twist"
     rows: Motion
     if wheels.right_topic is None:
-        collector = JointRows(bag, options.topic, wheels, "velocity" if are_speeds else "position")
+        collector = JointRows(bag, options.topic, wheels, "velocity" if are_speeds else "position", options)
         rows = listeners.listen(options, collector).pairs
     else:
         of_right = options.model_copy(update={"topic": wheels.right_topic})
-        left = listeners.listen(options, _wheel(bag, options.topic, wheels.left))
-        rows = partial(paired, left, listeners.listen(of_right, _wheel(bag, wheels.right_topic, wheels.right)))
+        left = listeners.listen(options, _wheel(bag, options.topic, wheels.left, options))
+        rows = partial(paired, left, listeners.listen(of_right, _wheel(bag, wheels.right_topic, wheels.right, options)))
 
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
         source = f"{bag.path} {options.topic}"
@@ -239,11 +263,11 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
     return motion
 
 
-def _wheel(bag: Bag, topic: str, path: str) -> TopicRows:
+def _wheel(bag: Bag, topic: str, path: str, rules: RowRules) -> TopicRows:
     """Return a collector of the value of one wheel, the field ``path`` in each message of a topic."""
     source = f"{bag.path} {topic}"
     known = bag.topic(topic)
     check_path(bag.store(topic), known, path, f"{bag.path}: topic {topic}: wheel")
     if LIST in path:
         raise InputError(f"{source}: odometry.wheels has the list {quoted(path)}, expected a field with one number")
-    return TopicRows(source, 1, (path,))
+    return TopicRows(source, 1, (path,), rules)

@@ -18,9 +18,9 @@ from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import nearest
 from factorgraph_loc.io.bags.file import Bag, Stamped
-from factorgraph_loc.io.bags.topics import TF, Listeners, Stamper, TopicRows, TopicSettings, as_nanoseconds
+from factorgraph_loc.io.bags.topics import TF, Listeners, RowTopic, Stamper, TopicRows, TopicSettings, as_nanoseconds
 from factorgraph_loc.model.log import StartPose
-from factorgraph_loc.model.planar import Turned, rotations_of
+from factorgraph_loc.model.planar import Turned, are_null, not_unit, null_poses, rotations_of
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.text import Notice, error_text, listed, quoted
 from factors.se2 import Array, Integers
@@ -42,7 +42,7 @@ ODOMETRY = ("odom", "odom_combined", "odometry")
 WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # frames of measured poses first, then frames of estimates
 
 
-class PoseTopic(TopicSettings, Turned):
+class PoseTopic(RowTopic, Turned):
     """A topic of poses, or of tf with two frames."""
 
     parent: str | None = None
@@ -108,14 +108,20 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
 def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
     """Return the poses of collected rows: x, y, z and quaternion, or x, y, z if ``has_rotations`` is false.
 
-    Of rows with equal timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
+    Behind the quaternion a row may have the variances of x and y. Null poses are skipped with a warning. Of rows with equal
+    timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:
         values = np.column_stack((values, np.tile((0.0, 0.0, 0.0, 1.0), (len(values), 1))))
-    rotations = checked_rotations(source, rows.rows, values)
-    path = PosePath(source, values[:, :3], rotations, rows.t_ns, has_rotations)
-    return path.rows(checks.in_order(source, rows.rows, rows.t_ns, warnings))
+    known = np.flatnonzero(~(null := are_null(values[:, 3:7], values[:, 7:9] if values.shape[1] > 7 else None)))
+    if null.any():
+        warnings.append(null_poses(source, int(rows.rows[null.argmax()]), int(np.count_nonzero(null))))
+    faults = [*checks.not_finite(SEVEN, values[known, :7]), not_unit(values[known, 3:7])]
+    keep = rows.kept(faults, warnings, known)
+    rotations = rotations_of(source, rows.rows[keep], values[keep, 3:7])
+    t_ns = rows.t_ns
+    return PosePath(source, values[keep, :3], rotations, t_ns[keep], has_rotations, lost_ns=np.sort(t_ns[null]))
 
 
 def upward(parents: Mapping[str, str], frame: str) -> list[str]:
@@ -181,7 +187,7 @@ class FrameReference:
         if topic.parent is None or topic.child is None:
             raise InputError(f"{self._source}: parent or child is missing: give two frames, such as map and base_link")
         self._parent, self._child = plain(topic.parent), plain(topic.child)
-        self._stamper, self._static = stamper, static
+        self._stamper, self._static, self._rules = stamper, static, topic
         self._edges: dict[str, TopicRows] = {}  # by frame: its poses in its parent, in order of arrival
         self._parents: dict[str, str] = {}
 
@@ -189,7 +195,7 @@ class FrameReference:
         for transform in item.message.transforms:
             child, parent = plain(transform.child_frame_id), plain(transform.header.frame_id)
             self._parents[child] = parent
-            edge = self._edges.setdefault(child, TopicRows(f"{self._source} {parent} to {child}", 7))
+            edge = self._edges.setdefault(child, TopicRows(f"{self._source} {parent} to {child}", 7, rules=self._rules))
             stamp = self._stamper.choose(as_nanoseconds(transform.header.stamp, 1), t_ns)
             edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
 
@@ -220,7 +226,8 @@ class FrameReference:
                 poses = matrices(at.positions, at.rotations) @ poses
             else:
                 poses = edge @ poses
-        return PosePath(self._source, poses[:, :3, 3], poses[:, :3, :3], t_ns)
+        lost_ns = np.unique(np.concatenate([edge.lost_ns for edge in moving]))
+        return PosePath(self._source, poses[:, :3, 3], poses[:, :3, :3], t_ns, lost_ns=lost_ns)
 
     def _chain(self) -> list[str]:
         """Return the frames from the child up to the parent, without the parent. Raises InputError if they are not connected."""
@@ -265,7 +272,9 @@ def poses_of_topic(
     paths = [f"{pose}.{position}.{axis}" for axis in "xyz"] + [f"{pose}.{rotation}.{axis}" for axis in "xyzw"]
     if kind == POINT:
         paths = [f"{pose}.{axis}" for axis in "xyz"]
-    rows = TopicRows(f"{bag.path} {options.topic}", len(paths), paths)
+    if pose == "pose.pose":
+        paths += [f"pose.covariance[{i}]" for i in (0, 7)]
+    rows = TopicRows(f"{bag.path} {options.topic}", len(paths), paths, options)
     listeners.add(options.topic, rows, stamper)
     return partial(path_of, rows, has_rotations=kind != POINT)
 

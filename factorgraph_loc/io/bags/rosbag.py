@@ -149,7 +149,7 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     clock, warnings = report(listeners.stampers, options.clock)
     t_ns, moves = motion(warnings)
     t0_ns = int(t_ns[0])
-    streams: dict[str, Stream] = {"odometry": odometry_stream(t_ns, moves, t0_ns)}
+    streams: dict[str, Stream] = {"odometry": odometry_stream(t_ns, moves, t0_ns, options.odometry, warnings)}
     streams |= {name: of_sensor(sensor.stream(t0_ns, warnings), name) for name, sensor in sensors.items()}
     reference = None
     if poses and of_reference:

@@ -15,13 +15,15 @@ from pydantic import Field
 
 from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
+from factorgraph_loc.files.cells import NAMES, NUMBERS, Cells
 from factorgraph_loc.files.column_mapping import ReadNames, in_case
 from factorgraph_loc.files.columns import LATEST, POSES, STAMP, Column, Table
 from factorgraph_loc.files.models import InUnit
-from factorgraph_loc.files.tables import NAMES, NUMBERS, Cells, TableRows
+from factorgraph_loc.files.row_rules import Fault, RowRules
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import StaticFrames
-from factorgraph_loc.io.bags.topics import LIST, Fields, TopicRows, TopicSettings, as_nanoseconds, as_text, leaves
+from factorgraph_loc.io.bags.topics import LIST, Fields, RowTopic, TopicRows, as_nanoseconds, as_text, leaves
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.measurement import Stream
@@ -32,6 +34,7 @@ from factorgraph_loc.sensors.rfid import tables as native_rfid
 from factorgraph_loc.sensors.rfid.stream import RFID, RfidStream
 from factorgraph_loc.sensors.tables import Reading, assemble, native_tables, stream_of
 from factorgraph_loc.text import Notice, listed
+from factors.se2 import Integers
 
 LandmarkField = Literal["landmark", "range", "bearing", "x", "y", "z"]
 CORNERS = "apriltag_msgs/msg/AprilTagDetectionArray"  # detections as pixels: centre and four corners
@@ -50,10 +53,11 @@ DETECTIONS: dict[str, tuple[str, str]] = {
 PLACES = tuple(replace(POSES[axis], may_lack=True) for axis in "xyz")  # in the sensor frame
 ReadField = Literal["epc", "antenna", "rssi", "phase", "frequency", "stamp"]
 READ = [RFID[name] for name in ("epc", "antenna", *native_rfid.SIGNALS)]
+INDEX = "number of the row"
 STAMP_OF_READ = replace(STAMP, name="stamp")
 
 
-class TableTopic(TopicSettings):
+class TableTopic(RowTopic):
     """A topic with the rows of a sensor's table."""
 
     fields: dict[str, str] = Field(default_factory=dict)
@@ -69,6 +73,7 @@ class RowsOfTopic:
     ``table``: the description of the table's columns.
     ``columns``: the columns to collect, by default all columns except the first, which is the time.
     ``units``: the unit of a column, or a factor that converts its values to the default unit.
+    ``rules``: what the manifest says about invalid and late rows.
     A missing number becomes NaN. An empty name raises InputError.
     """
 
@@ -80,8 +85,10 @@ class RowsOfTopic:
         table: Table,
         columns: Sequence[Column] | None = None,
         units: Mapping[Any, str | float] | None = None,
+        rules: RowRules | None = None,
     ) -> None:
-        self._fields = Fields(bag, bag.topic(topic), fields)
+        self._fields, self._rules = Fields(bag, bag.topic(topic), fields), rules or RowRules()
+        self._unread: list[tuple[int, str]] = []
         self._table, self._columns, self._units = table, columns or table.columns[1:], units or {}
         self._named = [column for column in self._columns if column.kind in NAMES]
         self._numbered = [column.name for column in self._columns if column.kind in NUMBERS]
@@ -92,9 +99,16 @@ class RowsOfTopic:
         """Add the rows of a message, whose timestamp is ``t_ns``."""
         for values in self._fields.rows(item.message, item.row):
             row = dict(zip(self._fields.names, values, strict=True))
-            stamp = self._stamp(row, t_ns, item.row)
-            for column in self._named:
-                self._names[column.name].append(self._name(column, row, item.row))
+            try:
+                stamp = self._stamp(row, t_ns, item.row)
+                names = {column.name: self._name(column, row, item.row) for column in self._named}
+            except InputError as error:
+                if self._rules.bad_rows == "refuse":
+                    raise InputError(f"{error}{self._rules.skipping}") from error
+                self._unread.append((item.row, str(error)))
+                continue
+            for name, text in names.items():
+                self._names[name].append(text)
             self._rows.append(item, stamp, [row.get(name, math.nan) for name in self._numbered])
 
     def _stamp(self, values: Mapping[Any, Any], t_ns: int, row: int) -> int:
@@ -110,21 +124,32 @@ class RowsOfTopic:
             return text
         raise bad_field(self._rows.source, column.name, text, column.doc, row=row)
 
-    def rows_of(self) -> TableRows:
-        """Return the collected rows. Raises InputError at a number that is missing or out of bounds."""
+    def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
+        """Return the M collected rows that the rules keep, and their indices (M,) among all collected rows.
+
+        ``faults``: further faults of the rows. Raises InputError at a number that is missing or out of bounds, unless the rules
+        skip such rows.
+        """
         cells = {**self._names, **dict(zip(self._numbered, self._rows.values.T, strict=True))}
-        read = Cells(Path(self._rows.source), self._rows.rows, cells, units=self._units)
-        return TableRows.of(read, self._columns, self._rows.t_ns)
+        cells |= {STAMP.name: self._rows.t_ns, INDEX: np.arange(len(self._rows))}
+        source, unread = Path(self._rows.source), tuple(self._unread)
+        read = Cells(source, self._rows.rows, cells, units=self._units, rules=self._rules, unread=unread)
+        columns = {column.name: column for column in (STAMP, *self._columns)}
+        if self._rules.bad_rows == "refuse":
+            read.require(faults)
+        read = read.usable(columns, warnings, more=faults)
+        return TableRows.of(read, self._columns, read.nanoseconds()), np.asarray(read.columns[INDEX])
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> Stream:
         """Return the rows as a stream, with times after ``t0_ns`` [ns]. An invalid row raises InputError or adds a warning."""
         channel, _ = native_tables()[self._table.name]
         if channel.assemble:
-            return assemble(channel, {self._table.name: self.rows_of()}, Reading(DEFAULT_RIG, t0_ns, warnings))
-        return stream_of(self._table, self.rows_of(), t0_ns, warnings)
+            rows = {self._table.name: self.rows_of(warnings)[0]}
+            return assemble(channel, rows, Reading(DEFAULT_RIG, t0_ns, warnings))
+        return stream_of(self._table, self.rows_of(warnings)[0], t0_ns, warnings)
 
 
-class RfidTopic(TopicSettings, ReadNames):
+class RfidTopic(RowTopic, ReadNames):
     """A topic of RFID reads."""
 
     fields: dict[ReadField, str]
@@ -151,7 +176,7 @@ class Reads(RowsOfTopic):
             raise InputError(
                 f"{source}: needs either fields.antenna, or antenna, the name of the only antenna: set one of the two"
             )
-        super().__init__(bag, options.topic, options.fields, RFID, READ, options.units)
+        super().__init__(bag, options.topic, options.fields, RFID, READ, options.units, options)
         self._stamp_unit = round(STAMP_OF_READ.in_unit(options.units.get("stamp", "us"), source)[1])
         self._antenna_of_message = None  # the field of the antenna, which names the antenna of a message without reads
         if options.antenna is None and LIST not in options.fields["antenna"]:
@@ -184,12 +209,14 @@ class Reads(RowsOfTopic):
 
     def stream(self, t0_ns: int, warnings: list[Notice]) -> RfidStream:
         """Return all reads, grouped into inventory rounds. Raises InputError with the number of an invalid message."""
-        table = self.rows_of()
+        all_ns = self._rows.t_ns
+        table, which = self.rows_of(warnings)
         table = replace(table, names=table.names | {"epc": in_case(table.names["epc"], self._options.epc_case)})
         if self._options.rounds == "gaps":
             return native_rfid.read_rounds(table, None, self._options.round_gap, warnings).stream(t0_ns)
-        ends = [max([t_ns, *table.t_ns[reads].tolist()]) for t_ns, reads, _ in self._rounds]
+        ends = [max([t_ns, *all_ns[reads].tolist()]) for t_ns, reads, _ in self._rounds]
         number, end_ns = (np.array(column, dtype=np.int64) for column in (self._number, ends))
+        number = number[which]
         signals = (table.numbers["rssi"], table.numbers["phase"], table.numbers["frequency"])
         antennas = [antenna for *_, antenna in self._rounds]
         reads = native_rfid.ReadsByRound(table.t_ns, number, table.names["epc"], signals, end_ns, antennas)
@@ -215,7 +242,7 @@ class Reads(RowsOfTopic):
         return self._options.antennas.get(name, name)
 
 
-class LandmarkTopic(TopicSettings, Turned):
+class LandmarkTopic(RowTopic, Turned):
     """A topic of landmarks, such as the messages of a marker detector."""
 
     fields: dict[LandmarkField, str] | None = None
@@ -248,25 +275,26 @@ class Landmarks(RowsOfTopic):
             expected = "landmark with x, y and z, or with range, bearing or both"
             raise InputError(f"{bag.path} {topic.name}: fields are {listed(fields)}, expected {expected}")
         columns = (BEARING_RANGE["landmark"], *PLACES) if self._places else None
-        super().__init__(bag, options.topic, fields, BEARING_RANGE, columns)
+        super().__init__(bag, options.topic, fields, BEARING_RANGE, columns, rules=options)
 
-    def rows_of(self) -> TableRows:
+    def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
         """Return the ranges along the floor [m] and the bearings [rad] of landmarks.
 
         Ranges and bearings that are computed from positions are in the robot frame if tf_static has the frame of the sensor.
         """
-        rows = super().rows_of()
-        if not self._places:
-            return rows
         places = self._rows.values
-        checks.require_finite(self._rows.source, self._rows.rows, "xyz", places)
+        more = checks.not_finite("xyz", places) if self._places else ()
+        rows, which = super().rows_of(warnings, [*faults, *more])
+        if not self._places:
+            return rows, which
+        places = places[which]
         pose = np.eye(4)
         if self._options.frame is not None:
             pose = self._frames.known(self._rows.source, self._options.frame)
         else:
             pose[:3, :3] = self._options.turned()
         x, y, _ = (places @ pose[:3, :3].T + pose[:3, 3]).T
-        return replace(rows, numbers={"range": np.hypot(x, y), "bearing": np.arctan2(y, x)})
+        return replace(rows, numbers={"range": np.hypot(x, y), "bearing": np.arctan2(y, x)}), which
 
 
 class Corners(RowsOfTopic):
@@ -275,12 +303,13 @@ class Corners(RowsOfTopic):
     The names are ``FAMILY-NUMBER/0`` to ``FAMILY-NUMBER/3``, see :func:`factorgraph_loc.maps.markers.corner_names`.
     """
 
-    def __init__(self, bag: Bag, name: str) -> None:
+    def __init__(self, bag: Bag, options: TableTopic) -> None:
+        name = options.topic
         topic = bag.topic(name, CORNERS)
         known = leaves(bag.store(name), topic.type)
         if lacking := [path for path in CORNER_FIELDS if path not in known]:
             raise InputError(f"{bag.path}: topic {name} ({topic.type}) lacks {listed(lacking)}")
-        super().__init__(bag, name, {}, SIGHTINGS)
+        super().__init__(bag, name, {}, SIGHTINGS, rules=options)
 
     def add(self, item: Stamped, t_ns: int) -> None:
         """Add the four corners of each detection of a message."""
@@ -300,11 +329,11 @@ def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> Row
     """
     kind = bag.topic(options.topic).type
     if tables[0].name == SIGHTINGS.name and not options.fields and kind == CORNERS:
-        return Corners(bag, options.topic)
+        return Corners(bag, options)
     table = next((table for table in tables if kind in table.messages), tables[0])
     columns = {column.name: column for column in table.columns[1:]}
     fields = options.fields or table.messages.get(kind) or {name: name for name in columns}
     needed = {name for name, column in columns.items() if not column.may_lack}
     if not needed <= set(fields) <= set(columns):
         raise InputError(f"{bag.path} {options.topic}: fields are {listed(fields)}, expected {listed(columns)}")
-    return RowsOfTopic(bag, options.topic, fields, table, units=options.units)
+    return RowsOfTopic(bag, options.topic, fields, table, units=options.units, rules=options)

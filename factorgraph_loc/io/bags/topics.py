@@ -19,6 +19,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.models import FileModel
+from factorgraph_loc.files.row_rules import Fault, RowRules
 from factorgraph_loc.io.bags.file import Bag, Stamped, Topic
 from factorgraph_loc.text import Notice, error_text, listed, notice, quoted
 from factors.se2 import Array, Integers
@@ -46,6 +47,10 @@ class TopicSettings(FileModel):
     """name of the topic"""
     clock: Clock | None = None
     """timestamps to use: header for those of message headers, receive for the time of receipt; by default as for the bag"""
+
+
+class RowTopic(TopicSettings, RowRules):
+    """The settings of topics whose messages may be skipped or sorted."""
 
 
 class Fields:
@@ -171,17 +176,27 @@ def _getter(path: str) -> Callable[[Any], Any]:
     return lambda message: [within(element) for element in get(message)]
 
 
+def _getter_of(paths: Sequence[str]) -> Callable[[Any], Any]:
+    """Return a function that gets the values of several fields of a message, or the value of the only field."""
+    if any(ELEMENT.search(path) for path in paths):
+        getters = [_getter(path) for path in paths]
+        return lambda message: [get(message) for get in getters]
+    return attrgetter(*paths)
+
+
 class TopicRows:
     """Collects rows of numbers, each with a timestamp and the number of its message within the topic, counted from 1.
 
-    ``source``: the bag and the topic, for errors. ``width``: how many numbers a row has. ``paths``: the fields that form the row of
-    a message. Without paths, the caller appends rows. A value that is not a number becomes NaN.
+    ``source``: the bag and the topic, for errors. ``width``: how many numbers a row has. ``paths``: the fields that form the
+    row of a message. Without paths, the caller appends rows. A value that is not a number becomes NaN. ``rules``: what the
+    manifest says about invalid and late rows.
     """
 
-    def __init__(self, source: str, width: int, paths: Sequence[str] = ()) -> None:
+    def __init__(self, source: str, width: int, paths: Sequence[str] = (), rules: RowRules | None = None) -> None:
         self.source = source
+        self.rules = rules or RowRules()
         self._width = width
-        self._get = attrgetter(*paths) if paths else None
+        self._get = _getter_of(paths) if paths else None
         self._row, self._t_ns, self._values = array("q"), array("q"), array("d")
 
     def add(self, item: Stamped, t_ns: int) -> None:
@@ -216,9 +231,20 @@ class TopicRows:
 
         ``names``: the names of the columns. Raises InputError, with the number of the message, at a number that is not finite.
         """
-        checks.require_finite(self.source, self.rows, names, self.values)
-        keep = checks.in_order(self.source, self.rows, self.t_ns, warnings)
+        keep = self.kept(checks.not_finite(names, self.values), warnings)
         return self.t_ns[keep], self.values[keep]
+
+    def kept(self, faults: Sequence[Fault], warnings: list[Notice], among: Integers | None = None) -> Integers:
+        """Return the indices of the rows without ``faults``, in order of time. Of rows with equal timestamps, the last is kept.
+
+        ``among``: indices of the rows that the faults describe, by default all. Raises InputError at a fault, or at a row that
+        is out of order, unless the rules skip or sort such rows.
+        """
+        rows, t_ns = self.rows, self.t_ns
+        keep = np.arange(len(rows)) if among is None else among
+        keep = keep[self.rules.usable(self.source, rows[keep], faults, warnings)]
+        keep = keep[self.rules.in_time(self.source, rows[keep], t_ns[keep], warnings)]
+        return keep[checks.in_order(self.source, rows[keep], t_ns[keep], warnings, self.rules)]
 
 
 class Gatherer(Protocol):

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -12,6 +12,7 @@ from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import require_span
 from factorgraph_loc.files.data_root import RUN_FILE
 from factorgraph_loc.files.models import FileModel, file_name, inside, parse_model, read_toml, write_toml
+from factorgraph_loc.files.row_rules import RowRules
 from factorgraph_loc.files.tables import TableRows, read_table, write_table
 from factorgraph_loc.files.temporary import sweep, temporary_folder, writing
 from factorgraph_loc.io.native.rig_file import default_rig, read_rig, write_rig
@@ -25,6 +26,8 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.sections import kind_of, layers
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.world import World
+from factorgraph_loc.sensors.odometry.jumps import without_jumps
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
 from factorgraph_loc.sensors.registry import channel
 from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_table, native_tables
 from factorgraph_loc.text import Notice, listed, notice
@@ -39,13 +42,14 @@ class Options(FileModel):
     """The native format has no options."""
 
 
-class RunFile(FileModel):
+class RunFile(RowRules):
     """The content of ``run.toml``.
 
     ``rig``, ``world``: a table, or a file name relative to the folder. ``has_heading``: False if the headings of the reference are
     meaningless.
     """
 
+    PLACE: ClassVar[str] = RUN_FILE
     name: str | None = None
     rig: dict[str, Any] | str | None = None
     world: dict[str, Any] | str | None = None
@@ -64,7 +68,7 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     run_path = path / RUN_FILE
     run = parse_model(RunFile, read_toml(run_path), run_path)
     warnings: list[Notice] = []
-    tables = read_tables(path, warnings)
+    tables = read_tables(path, warnings, run)
     if "odometry" not in tables:
         if not run_path.read_text(encoding="utf-8").strip():
             raise InputError(f"{run_path}: is empty, expected a manifest, or odometry.csv in its folder")
@@ -72,12 +76,15 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     rig = rig_of(run, run_path, tables)
     require_span([(rows.path, rows.rows, rows.t_ns) for rows in tables.values()])
     t0_ns = min(int(rows.t_ns.min()) for rows in tables.values())
+    streams = streams_of(tables, Reading(rig, t0_ns, warnings))
+    if isinstance(odometry := streams["odometry"], VelocityStream | IncrementStream):
+        streams["odometry"] = without_jumps(odometry, run, warnings)
     return Log(
         name=run.name or path.resolve().name,
         rig=rig,
         world=world_of(run, run_path),
-        streams=streams_of(tables, Reading(rig, t0_ns, warnings)),
-        reference=read_reference(path / REFERENCE, t0_ns, run.has_heading, warnings),
+        streams=streams,
+        reference=read_reference(path / REFERENCE, t0_ns, run, warnings),
         start=run.start.pose(t0_ns) if run.start else None,
         t0_ns=t0_ns,
         warnings=tuple(warnings),
@@ -101,8 +108,10 @@ def world_of(run: RunFile, source: Path) -> World:
     return parse_world(run.world, f"{source} [world]", source.parent)
 
 
-def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
-    """Return the non-empty tables in a folder by name. A table of an unknown sensor is skipped with a warning."""
+def read_tables(folder: Path, warnings: list[Notice], rules: RowRules) -> dict[str, TableRows]:
+    """Return the non-empty tables in a folder by name, without the rows that ``rules`` skip. A table of an unknown sensor is
+    skipped with a warning.
+    """
     tables = {}
     stems = sorted(file.stem for file in folder.iterdir() if file.suffix in SUFFIXES)
     for name in dict.fromkeys((*native_tables(), *stems)):
@@ -112,7 +121,7 @@ def read_tables(folder: Path, warnings: list[Notice]) -> dict[str, TableRows]:
         if len(files) > 1:
             raise InputError(f"{folder}: holds both {files[0].name} and {files[1].name}, expected one of them")
         for file in files:
-            rows = read_table(inside(folder, file.name, folder), known[1])
+            rows = read_table(inside(folder, file.name, folder), known[1], rules, warnings)
             if rows.left_out:
                 warnings.append(checks.unread_columns(file, rows.left_out))
             if len(rows.rows):
@@ -139,12 +148,12 @@ def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, S
     return {name: of_sensor(assemble(channel(name), table, reading), name) for name, table in rows.items()}
 
 
-def read_reference(path: Path, t0_ns: int, has_heading: bool, warnings: list[Notice]) -> Trajectory | None:
+def read_reference(path: Path, t0_ns: int, run: RunFile, warnings: list[Notice]) -> Trajectory | None:
     if not path.is_file():
         return None
-    poses = read_pose_file(inside(path.parent, path.name, path.parent), "tum")
+    poses = read_pose_file(inside(path.parent, path.name, path.parent), "tum", run)
     warnings += poses.warnings
-    return Trajectory(checks.seconds(poses.stamps(), t0_ns), poses.on_floor(warnings), has_heading=has_heading)
+    return Trajectory(checks.seconds(poses.stamps(), t0_ns), poses.on_floor(warnings), has_heading=run.has_heading)
 
 
 def write_native(

@@ -16,6 +16,7 @@ __all__ = [
     "load_all",
     "manifests",
     "mapped",
+    "mapped_motion",
     "mrclam",
     "plaza",
     "pose_file",

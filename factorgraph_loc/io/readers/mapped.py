@@ -3,85 +3,39 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.errors import InputError, require
-from factorgraph_loc.files import checks
+from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.column_mapping import ColumnMapping, TableFolder, TimedMapping, read_mapped
 from factorgraph_loc.files.columns import ANGLE, STAMPS, Table, named
-from factorgraph_loc.files.columns import POSES as POSE_COLUMNS
 from factorgraph_loc.files.models import FileModel, add_fields
 from factorgraph_loc.files.several import by_name, one_or_several
-from factorgraph_loc.files.tables import Cells, TableRows
-from factorgraph_loc.io import motions
-from factorgraph_loc.io.motions import TURNS, WHEELS, odometry_stream
+from factorgraph_loc.files.tables import TableRows
+from factorgraph_loc.io.motions import odometry_stream
 from factorgraph_loc.io.native import native
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, default_rig
 from factorgraph_loc.io.native.world_file import parse_world
+from factorgraph_loc.io.readers.mapped_motion import OdometryFile, ReferenceFile, read_odometry, read_reference
 from factorgraph_loc.io.readers.mapped_rfid import RfidFile, joined, read_all_reads
-from factorgraph_loc.io.readers.pose_file import read_kitti, read_pose_file
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.measurement import Stream
-from factorgraph_loc.model.planar import Turned, about_z, on_floor, rotations_of
+from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.model.sections import several
-from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.camera.measurement import make_images
-from factorgraph_loc.sensors.odometry.measurement import IMU, INCREMENTS, VELOCITIES, WAYS
-from factorgraph_loc.sensors.odometry.measurement import WHEELS as WHEEL_COLUMNS
+from factorgraph_loc.sensors.odometry.measurement import IMU
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, read_rounds
 from factorgraph_loc.sensors.tables import Reading, native_tables
-from factorgraph_loc.text import Notice, listed, notice
+from factorgraph_loc.text import listed, notice
 from factors import se2
-from factors.se2 import Array, Integers
+from factors.se2 import Array
 
-QUATERNION = ("qx", "qy", "qz", "qw")
-POSES = (("t", "x", "y", "heading"), ("t", "x", "y", *QUATERNION), ("t", "x", "y", "z", *QUATERNION))
-ODOMETRY = (
-    ("t", "v", "w"),
-    ("t", "dx", "dy", "dtheta"),
-    *(("t", *wheels) for left in WHEELS for wheels in (motions.wheels_of(left, 2), motions.wheels_of(left, 4))),
-    *POSES,
-)
-LEAST_AROUND = 300.0  # change of heading between rows above which the heading is assumed to wrap at 360, in degrees
-COLUMNS = {c.name: c for table in (VELOCITIES, INCREMENTS, WAYS, WHEEL_COLUMNS, POSE_COLUMNS) for c in table.columns}
-COLUMNS |= {f"rear_{name}": column for name, column in COLUMNS.items() if name.startswith(("left", "right"))}
 RATES = ("wx", "wy", "wz")
 FILE_NAME = named("file_name", "a name in the table of the sensor")
 MAP_NAME = named("name", "a name in the map")
 RATE = replace(IMU["w"], may_lack=True)  # turn rate about one of three axes, which may be missing in a row
-
-
-class PosesFile(TimedMapping, Turned):
-    """A file with poses."""
-
-    format: Literal["columns", "tum", "kitti", "euroc"] = "columns"
-    """format of the file: columns for a table with a mapping of columns, or a common format of trajectories"""
-    columns: dict[str, str] = Field(default_factory=dict)
-    """column of the file for each field, if the format is columns"""
-    times: str | None = None
-    """file with the timestamps of a KITTI file"""
-
-    def is_in_format(self) -> bool:
-        """True if the file is in TUM, KITTI or EuRoC format, not a table with mapped columns."""
-        return self.format != "columns" or self.times is not None
-
-
-class OdometryFile(PosesFile, motions.WheelSizes):
-    """The table of odometry. ``columns`` maps t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the previous
-    row); x, y, and heading or a quaternion (poses, of which only the relative motion is used); left, right (distances of the
-    wheels); left_speed, right_speed (speeds); left_angle, right_angle (angles); left_rate, right_rate (angular rates).
-    Four wheels also need rear_left, rear_right (rear_left_speed, ...). ``radius`` and ``track`` of the rig ([odometry.wheels]) have
-    precedence over these settings."""
-
-
-class ReferenceFile(PosesFile):
-    """The reference."""
-
-    has_heading: bool = True
-    """true if the reference measures the heading; false if its headings are meaningless"""
 
 
 class NamesFile(ColumnMapping):
@@ -157,7 +111,7 @@ def read(path: Path | None, options: Options) -> Log:
         )
     folder = TableFolder(path)
     warnings = folder.warnings
-    odometry_t_ns, moves = _odometry(folder, options.odometry)
+    odometry_t_ns, moves = read_odometry(folder, options.odometry)
     tables = {
         name: _table(folder, native_tables()[kind][1], mapping)
         for kind in ("imu", "camera", *OTHERS)
@@ -166,7 +120,7 @@ def read(path: Path | None, options: Options) -> Log:
     rounds = _rounds(folder, options)
     stamps = [odometry_t_ns, *(table.t_ns for table in tables.values()), *([rounds.end_ns] if rounds else [])]
     t0_ns = min(int(t_ns.min()) for t_ns in stamps)
-    streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, t0_ns)}
+    streams: dict[str, Stream] = {"odometry": odometry_stream(odometry_t_ns, moves, t0_ns, options.odometry, warnings)}
     if options.camera is not None:
         images = folder.file(options.camera.folder)
         streams["camera"] = make_images(tables.pop("camera"), t0_ns, warnings, images)
@@ -201,7 +155,7 @@ def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) 
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):
         shapes, columns = (*shapes, ("t", *RATES)), columns | {name: replace(RATE, name=name) for name in RATES}
-    cells = folder.read(mapping, shapes)
+    cells = folder.read(mapping, shapes, columns)
     known = [columns[name] for name in cells.columns if name != "t"]
     rows = TableRows.of(cells, known, cells.stamps("t", mapping.clock_offset))
     unknown = {name: np.full(len(rows.rows), np.nan) for name, column in columns.items() if column.may_lack}
@@ -291,107 +245,3 @@ def _rounds(folder: TableFolder, options: Options) -> ReadsByRound | None:
             f"{path}: readers have round_gap {', '.join(f'{gap:g}' for gap in sorted(gaps))}, expected the same for all"
         )
     return read_rounds(reads, inventories, gaps.pop() if gaps else ROUND_GAP, folder.warnings)
-
-
-def _odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Array]:
-    """Return the timestamps (N,) [ns] of the odometry, and its velocities (N, 2) or increments (N, 3).
-
-    Raises InputError with the file and the row of an invalid value.
-    """
-    path, warnings = folder.file(options.file), folder.warnings
-    if options.is_in_format():
-        if options.has_sizes():
-            raise InputError(f"{path}: format {options.format} has no wheels: remove track, radius and base")
-        t_ns, poses = _in_format(folder, options)
-        return t_ns, motions.after_rest(motions.between_poses(path, t_ns, poses, warnings))
-    mapped = folder.read(options, ODOMETRY)
-    side = next((name for name in WHEELS if name in mapped.columns), None)
-    wheel_names = motions.wheels_of(side, 4 if f"rear_{side}" in mapped.columns else 2) if side else ()
-    if side is None and options.has_sizes():
-        raise InputError(
-            f"{path}: track, radius or base is given, but columns maps no wheels, such as left and right: map them, or remove "
-            "track, radius and base"
-        )
-    if options.base is not None and len(wheel_names) == 2:
-        raise InputError(f"{path}: base is given, but only two wheels are mapped: map rear_{side} too, or remove base")
-    size = options.metres(path, side, turns=side in TURNS) if side else 1.0
-    t_ns, columns = _columns(mapped, options.clock_offset)
-    if "dx" in columns:
-        moves = np.column_stack((columns["dx"], columns["dy"], columns["dtheta"]))
-        return checks.increments_in_order(path, mapped.rows, t_ns, moves, warnings)
-    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
-    t_ns = t_ns[keep]
-    kept = {name: values[keep] for name, values in columns.items()}
-    if "v" in kept:
-        return t_ns, np.column_stack((kept["v"], kept["w"]))
-    if side is not None:
-        wheels = size * np.column_stack([kept[name] for name in wheel_names])
-        if side in ("left_speed", "left_rate"):
-            return t_ns, motions.of_speeds(path, t_ns, wheels, options, warnings)
-        scales = size * np.array([COLUMNS[name].in_unit(options.units.get(name, 1.0))[1] for name in wheel_names])
-        moves = motions.between_wheels(path, t_ns, wheels, scales, options, warnings)
-    else:
-        poses = _planar(path, mapped.rows[keep], kept, options, warnings)
-        moves = motions.between_poses(path, t_ns, poses, warnings)
-    return t_ns, motions.after_rest(moves)
-
-
-def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
-    """Return the reference trajectory, with times in seconds after ``t0_ns`` [ns].
-
-    Raises InputError with the file and the row of an invalid value.
-    """
-    path, warnings = folder.file(options.file), folder.warnings
-    if options.is_in_format():
-        t_ns, poses = _in_format(folder, options)
-        return Trajectory(checks.seconds(t_ns, t0_ns), poses, has_heading=options.has_heading)
-    mapped = folder.read(options, (*POSES, ("t", "x", "y")))
-    if "heading" not in mapped.columns and "qw" not in mapped.columns and options.has_heading:
-        raise InputError(
-            f"{path}: columns in [options.reference] maps neither heading nor qx, qy, qz, qw: map one of them, or set "
-            "has_heading = false"
-        )
-    t_ns, columns = _columns(mapped, options.clock_offset)
-    poses = _planar(path, mapped.rows, columns, options, warnings)
-    keep = checks.in_order(path, mapped.rows, t_ns, warnings)
-    return Trajectory(checks.seconds(t_ns[keep], t0_ns), poses[keep], has_heading=options.has_heading)
-
-
-def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array]:
-    """Return the timestamps (N,) [ns] and the planar poses (N, 3) of a file in TUM, KITTI or EuRoC format."""
-    path = folder.file(options.file)
-    if options.columns or options.units:
-        raise InputError(f"{path}: format {options.format} names its own columns and units: remove columns and units")
-    if options.format == "kitti" and options.times is None:
-        raise InputError(f"{path}: format is kitti, but times is missing: set it to the file with the timestamps")
-    if options.format != "kitti" and options.times is not None:
-        raise InputError(f"{path}: times is given, but format is {options.format}, not kitti: remove times")
-    turned: Turned = options
-    if options.times is not None:
-        poses = read_kitti(path, folder.file(options.times))
-        if not options.axes:
-            turned = Turned(axes="body", mounting=options.mounting)  # the format defines the axes
-    else:
-        poses = read_pose_file(path, "euroc" if options.format == "euroc" else "tum")
-    folder.warnings += poses.warnings
-    return poses.stamps() + round(options.clock_offset * 1e9), poses.on_floor(folder.warnings, turned)
-
-
-def _columns(mapped: Cells, offset: float) -> tuple[Integers, dict[str, Array]]:
-    return mapped.stamps("t", offset), {n: mapped.numbers(n, COLUMNS[n]) for n in mapped.columns if n != "t"}
-
-
-def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turned, warnings: list[Notice]) -> Array:
-    if "qw" in columns:
-        rotations = rotations_of(path, rows, np.column_stack([columns[name] for name in QUATERNION]))
-        places = np.column_stack((columns["x"], columns["y"], columns.get("z", np.zeros(len(rows)))))
-        return on_floor(path, places, rotations, warnings, turned)
-    if turned.is_given():
-        raise InputError(
-            f"{path}: axes or mounting is given, but columns maps no qx, qy, qz, qw: map them, or remove it"
-        )
-    heading = columns.get("heading", np.zeros(len(rows)))
-    around = np.abs(np.diff(heading, prepend=heading[0]))
-    valid = ~((around > LEAST_AROUND) & (around < 360.0))
-    require(valid, path, rows, "heading", heading, 'radians; it wraps at 360 as degrees do: set units.heading = "deg"')
-    return np.column_stack((columns["x"], columns["y"], se2.wrap(heading)))

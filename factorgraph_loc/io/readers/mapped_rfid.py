@@ -16,18 +16,19 @@ from pydantic import Field, model_validator
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import bounded, shipped
+from factorgraph_loc.files.cells import Cells
 from factorgraph_loc.files.column_mapping import (
     ColumnMapping,
-    EpcCase,
     ReadNames,
     TableFolder,
     TimedMapping,
     in_case,
     read_mapped,
 )
-from factorgraph_loc.files.columns import PURE, Column
+from factorgraph_loc.files.columns import PURE, STAMP, Column
 from factorgraph_loc.files.models import FileModel, InUnit, read_toml
-from factorgraph_loc.files.tables import Cells, TableRows
+from factorgraph_loc.files.row_rules import Fault
+from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.stream import RFID
 from factorgraph_loc.sensors.rfid.tables import SIGNALS
 from factorgraph_loc.text import Notice, listed, notice, quoted
@@ -175,7 +176,9 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
         raise InputError(f"{path}: columns maps frequency and channel: remove one of them")
     shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
     cells = read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
-    mapped = folder.noted(cells, options)
+    mapped = folder.noted(cells, options, _columns_of(options), _epcs(cells)[1])
+    mapped.require(_epcs(mapped)[1])
+    mapped = _in_sequence(mapped, options, folder.warnings)
     t_ns = mapped.stamps("t", options.clock_offset)
     antennas = [options.antenna] * len(t_ns) if options.antenna else mapped.names("antenna", RFID["antenna"])
     numbers = {name: _signal(mapped, name) for name in SIGNALS}
@@ -186,7 +189,10 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
         mapped.rows,
         t_ns,
         numbers,
-        {"epc": _epcs(mapped, options.epc_case), "antenna": [options.antennas.get(str(a), str(a)) for a in antennas]},
+        {
+            "epc": in_case(_epcs(mapped)[0], options.epc_case),
+            "antenna": [options.antennas.get(str(a), str(a)) for a in antennas],
+        },
     )
     return joined(path, [_with_last(table, mapped, options, folder.warnings)])
 
@@ -195,28 +201,52 @@ def _signal(mapped: Cells, name: str) -> Array:
     return mapped.numbers(name, RFID[name]) if name in mapped.columns else np.full(len(mapped.rows), np.nan)
 
 
-def _epcs(mapped: Cells, case: EpcCase) -> list[str]:
-    """Return the EPC of each row in the notation of the map, hexadecimal digits in the letter case ``case``.
+def _columns_of(options: RfidFile) -> dict[str, Column]:
+    """Return the descriptions of the fields of reads. EPCs are not among them, because they may be in one of two columns."""
+    known = {name: RFID[name] for name in ("antenna", *SIGNALS)}
+    return known | {"channel": _channel(options.channels), "last": STAMP, "count": COUNT}
+
+
+def _channel(channels: tuple[float, ...] | Channels | None) -> Column:
+    return replace(CHANNEL, high=len(channels)) if isinstance(channels, tuple) else CHANNEL
+
+
+def _epcs(mapped: Cells) -> tuple[list[str], list[Fault]]:
+    """Return the EPC of each row as hexadecimal digits, and the faults of empty and invalid EPCs.
 
     Some versions of sllurp write EPCs as Python bytes, ``b'...'``. These marks are removed.
     """
-    texts = mapped.texts("epc") if "epc" in mapped.columns else [""] * len(mapped.rows)
+    texts, faults = [""] * len(mapped.rows), []
+    if "epc" in mapped.columns:
+        texts = mapped.texts("epc")
     if "epc_base64" in mapped.columns:
-        coded = mapped.texts("epc_base64")
-        texts = [text or _from_base64(mapped, i, coded[i]) for i, text in enumerate(texts)]
-    if "" in texts:
-        field = "epc" if "epc" in mapped.columns else "epc_base64"
-        raise mapped.invalid(field, texts.index(""), RFID["epc"].doc)
-    plain = [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts]
-    return in_case(plain, case)
+        coded = [
+            None if text else _from_base64(code) for text, code in zip(texts, mapped.texts("epc_base64"), strict=True)
+        ]
+        faults.append(
+            mapped.fault("epc_base64", np.array([code == "?" for code in coded], dtype=bool), "an EPC in base64")
+        )
+        texts = [text or str(code) for text, code in zip(texts, coded, strict=True)]
+    field = "epc" if "epc" in mapped.columns else "epc_base64"
+    if field in mapped.columns:
+        faults.append(mapped.fault(field, np.array([not text for text in texts], dtype=bool), RFID["epc"].doc))
+    return [text[2:-1] if text.startswith("b'") and text.endswith("'") else text for text in texts], faults
 
 
-def _from_base64(mapped: Cells, i: int, text: str) -> str:
-    """Return the EPC in row ``i`` as upper-case hexadecimal digits, the notation of Impinj's readers. ``text``: its base64 code."""
+def _from_base64(text: str) -> str:
+    """Return an EPC as upper-case hexadecimal digits, the notation of Impinj's readers; a question mark if it is not base64."""
     try:
         return base64.b64decode(text.translate(STANDARD) + "=" * (-len(text) % 4), validate=True).hex().upper()
     except ValueError:
-        raise mapped.invalid("epc_base64", i, "an EPC in base64") from None
+        return "?"
+
+
+def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
+    """Return the rows whose last read is not before the first one. Raises InputError at others, unless the mapping skips them."""
+    if "last" not in mapped.columns:
+        return mapped
+    wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)
+    return mapped.without([mapped.fault("last", wrong, "a time not before the first")], warnings)
 
 
 def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -> Array:
@@ -224,7 +254,7 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 
     ``channels``: the frequencies of the channels [MHz].
     """
-    number = mapped.numbers("channel", replace(CHANNEL, high=len(channels)) if isinstance(channels, tuple) else CHANNEL)
+    number = mapped.numbers("channel", _channel(channels))
     if isinstance(channels, Channels):
         return np.asarray((channels.first + (number - 1.0) * channels.step) * 1e6)
     table = np.array((*(channels or ()), np.nan)) * 1e6
@@ -242,9 +272,6 @@ def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: lis
             warnings.append(notice("summarized_reads", sentence, table.path, many))
         return table
     last_ns = mapped.stamps("last", options.clock_offset)
-    wrong = np.flatnonzero(last_ns < table.t_ns)
-    if len(wrong):
-        raise mapped.invalid("last", int(wrong[0]), "a time not before the first")
     several = last_ns > table.t_ns
     if "count" in mapped.columns:
         count = np.nan_to_num(mapped.numbers("count", COUNT), nan=1.0)

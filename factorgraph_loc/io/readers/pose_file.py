@@ -7,17 +7,18 @@ import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
 from factorgraph_loc.errors import InputError, bad_field, require
 from factorgraph_loc.files import checks
-from factorgraph_loc.files.column_mapping import ColumnMapping, read_mapped
-from factorgraph_loc.files.columns import POSES, PURE, unit_since_1970, within
+from factorgraph_loc.files.cells import Cells
+from factorgraph_loc.files.column_mapping import ColumnMapping, TimedMapping, read_mapped
+from factorgraph_loc.files.columns import POSES, PURE, STAMP, unit_since_1970, within
 from factorgraph_loc.files.models import FARTHEST, read_text
-from factorgraph_loc.files.tables import Cells
-from factorgraph_loc.model.planar import rotations_of
+from factorgraph_loc.files.row_rules import RowRules
+from factorgraph_loc.model.planar import are_null, not_unit, null_poses, rotations_of
 from factorgraph_loc.model.pose_path import PosePath
 from factorgraph_loc.text import Notice, notice
 from factors.camera import model as reprojection
@@ -77,19 +78,31 @@ def read_times(path: Path) -> Integers:
     return t_ns
 
 
-def _read(path: Path, columns: Sequence[str], separator: Literal[" ", ","], unit: str | None = None) -> Cells:
-    """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the timestamps."""
+def _read(
+    path: Path,
+    columns: Sequence[str],
+    separator: Literal[" ", ","],
+    unit: str | None = None,
+    rules: RowRules | None = None,
+) -> Cells:
+    """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the timestamps.
+    ``rules``: what a manifest says about invalid and late rows, None without a manifest.
+    """
     numbered = {name: str(i) for i, name in enumerate(columns, start=1)}
     units: dict[str, str | float] = {} if unit is None else {"t": unit}
-    mapping = ColumnMapping(file=path.name, columns=numbered, units=units, separator=separator, header=False)
-    return read_mapped(path, mapping, (columns,))
+    form: dict[str, Any] = {"columns": numbered, "units": units, "separator": separator, "header": False}
+    if rules is None:
+        return read_mapped(path, ColumnMapping(file=path.name, **form), (columns,))
+    mapping = TimedMapping(file=path.name, **form, bad_rows=rules.bad_rows, order=rules.order)
+    return replace(read_mapped(path, mapping, (columns,)), rules=rules)
 
 
-def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
+def read_pose_file(path: Path, kind: Format | None = None, rules: RowRules | None = None) -> PosePath:
     """Return the poses of a file in TUM, KITTI or EuRoC format.
 
-    ``kind``: the expected format, by default any. The first row determines the format. Of poses with equal timestamps, the last is
-    kept. Poses of a KITTI file have no timestamps. Raises InputError with file and row of an invalid value.
+    ``kind``: the expected format, by default any. The first row determines the format. Of poses with equal timestamps, the last
+    is kept. Null poses are skipped with a warning. Poses of a KITTI file have no timestamps. ``rules``: what a manifest says
+    about invalid and late rows, None without a manifest. Raises InputError with file and row of an invalid value.
     """
     row, first = _first_row(path)
     detected = _format(first)
@@ -104,13 +117,22 @@ def read_pose_file(path: Path, kind: Format | None = None) -> PosePath:
         unit = str(larger)
         sentence = "{source}: the timestamps are too large for seconds and are read in {unit}"
         warnings.append(notice("unit_of_stamps", sentence, path.name, unit))
-    cells = _read(path, TUM, " ", unit) if detected == "tum" else _read(path, EUROC, ",", unit)
+    columns, separator = (TUM, " ") if detected == "tum" else (EUROC, ",")
+    cells = _read(path, columns, cast(Literal[" ", ","], separator), unit, rules)
     cells = replace(cells, labels={})  # errors then name columns instead of numbering them
+    cells = cells.usable({"t": STAMP} | {name: POSES[name] for name in TUM[1:]}, warnings)
+    quaternions = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[4:]])
+    null = are_null(quaternions)
+    lost_ns = cells.stamps("t")[null]
+    if null.any():
+        warnings.append(null_poses(path, int(cells.rows[null.argmax()]), len(lost_ns)))
+    cells, quaternions = cells.rows_at(np.flatnonzero(~null)), quaternions[~null]
+    cells = cells.without([not_unit(quaternions)], warnings)
     table = np.column_stack([cells.numbers(name, POSES[name]) for name in TUM[1:]])
-    t_ns = cells.stamps("t")
-    rotations = rotations_of(path, cells.rows, table[:, 3:])
-    keep = checks.in_order(path, cells.rows, t_ns, warnings)
-    return replace(PosePath(str(path), table[:, :3], rotations, t_ns).rows(keep), warnings=tuple(warnings))
+    t_ns, rotations = cells.stamps("t"), rotations_of(path, cells.rows, table[:, 3:])
+    keep = checks.in_order(path, cells.rows, t_ns, warnings, rules)
+    path_of = PosePath(str(path), table[:, :3], rotations, t_ns, lost_ns=lost_ns)
+    return replace(path_of.rows(keep), warnings=tuple(warnings))
 
 
 def _unit(first: str) -> str | None:

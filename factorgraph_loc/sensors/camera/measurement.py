@@ -149,7 +149,7 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Pa
     ``folder``: the validated folder of the images, by default that of the native format. Raises InputError if a path leaves the
     folder or is no regular file, or if a timestamp is more than 0.5 s late.
     """
-    latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings).tolist()
+    latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings, rules=table.rules).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
     named = zip(table.rows.tolist(), table.names["file"], strict=True)
     paths = [_image(within, f"{table.path}:{row}", name) for row, name in named]

@@ -3,7 +3,7 @@
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
 
-__all__ = ["SENSOR", "measurement", "settings", "simulation"]
+__all__ = ["SENSOR", "jumps", "measurement", "settings", "simulation"]
 
 SENSOR = SensorType(
     "odometry",
@@ -19,6 +19,7 @@ SENSOR = SensorType(
                 "factorgraph_loc.sensors.odometry.measurement:WHEELS",
             ),
             assemble="factorgraph_loc.sensors.odometry.measurement:assemble",
+            disassemble="factorgraph_loc.sensors.odometry.measurement:disassemble",
             intake="factorgraph_loc.sensors.odometry.measurement:Increments",
             section="odometry",
         ),

@@ -4,29 +4,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.columns import (
     ANGLE,
+    DURATION,
     FASTEST,
     FASTEST_TURN,
     LENGTH,
     LONGEST_WAY,
+    MAX_SPAN,
     MOST_TURNED,
     RATE,
     SPEED,
     STAMP,
     Table,
+    number,
     within,
 )
-from factorgraph_loc.model.measurement import FLOOR, TURN, Measurement, Stream, named
-from factorgraph_loc.sensors.tables import Intake, Reading, stream_of
-from factors.se2 import Array
+from factorgraph_loc.model.measurement import FLOOR, TURN, Measurement, Stream, columns_of, named
+from factorgraph_loc.sensors.tables import Columns, Intake, Reading, Writing, stream_of
+from factors.se2 import Array, Integers
 
 if TYPE_CHECKING:
     from factorgraph_loc.files.tables import TableRows
@@ -50,7 +54,10 @@ class VelocityOdometry:
 
 @dataclass(frozen=True, slots=True)
 class IncrementOdometry:
-    """Motion since the previous measurement: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot frame at that measurement."""
+    """Motion since the previous measurement: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot frame at that measurement.
+
+    ``unknown`` [s]: the part of the time since the previous measurement in which the motion is unknown.
+    """
 
     sensor: ClassVar[str] = "odometry"
     modality: ClassVar[str] = "odometry"
@@ -61,6 +68,7 @@ class IncrementOdometry:
     dx: float
     dy: float
     dtheta: float
+    unknown: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,18 +98,28 @@ class VelocityStream(Stream):
 @dataclass(frozen=True)
 class IncrementStream(Stream):
     """All increments of a log: ``dx``, ``dy`` [m] and ``dtheta`` [rad], each (N,): motion since the previous row, in the robot
-    frame at the previous row."""
+    frame at the previous row.
+
+    ``unknown`` (N,) [s]: the part of the time since the previous row in which the motion is unknown, by default 0.
+    """
 
     rank: ClassVar[int] = FLOOR
     kind: ClassVar[type[Any]] = IncrementOdometry
     dx: Array
     dy: Array
     dtheta: Array
+    unknown: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.unknown):
+            object.__setattr__(self, "unknown", np.zeros(len(self.t)))
 
     def begun_anew(self) -> IncrementStream:
         """Return the stream with a first increment of zero. Use this for a log that begins after the robot was carried."""
         moves = np.arange(len(self.t)) > 0
-        return replace(self, dx=self.dx * moves, dy=self.dy * moves, dtheta=self.dtheta * moves)
+        return replace(
+            self, dx=self.dx * moves, dy=self.dy * moves, dtheta=self.dtheta * moves, unknown=self.unknown * moves
+        )
 
 
 @dataclass(frozen=True)
@@ -145,7 +163,11 @@ INCREMENTS = Table(
         within("dx", LENGTH, LONGEST_WAY, "forward motion since the row before"),
         within("dy", LENGTH, LONGEST_WAY, "motion to the left since the row before"),
         within("dtheta", ANGLE, MOST_TURNED, "rotation since the row before"),
+        number(
+            "unknown", DURATION, 0.0, MAX_SPAN, "part of the time since the row before in which the motion is unknown"
+        ),
     ),
+    optional=(("unknown",),),
     stream="factorgraph_loc.sensors.odometry.measurement:IncrementStream",
 )
 IMU = Table(
@@ -176,12 +198,31 @@ WHEELS = Table(
 )
 
 
+def since_skipped(t_ns: Integers, resumed: NDArray[np.bool_]) -> Array:
+    """Return the times (N,) [s] in which the motion of increments at N timestamps [ns] is unknown, because rows were skipped.
+
+    ``resumed`` (N,): True for each row that follows a skipped row. Its time is that since the row before; the time of other
+    rows is 0.
+    """
+    return np.asarray(resumed * np.maximum(np.diff(t_ns, prepend=t_ns[:1]), 0) / 1e9)
+
+
+def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
+    """Return the columns of the table of odometry. The column ``unknown`` is left out if it is 0 throughout."""
+    fields = {name: values for name, values in columns_of(stream).items() if name not in ("t", "unknown")}
+    if isinstance(stream, IncrementStream) and stream.unknown.any():
+        fields["unknown"] = stream.unknown
+    return {"odometry": {STAMP.name: checks.absolute(stream.t, writing.t0_ns), **fields}}
+
+
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
     """Return the stream of velocities or increments of a log. Increments with equal timestamps are composed. Of velocities with
     equal timestamps the last is kept."""
     table = rows["odometry"]
     if "dx" not in table.numbers:
         return stream_of(VELOCITIES, table, reading.t0_ns, reading.warnings)
-    moves = np.column_stack([table.numbers[column.name] for column in INCREMENTS.columns[1:]])
-    t_ns, moves = checks.increments_in_order(table.path, table.rows, table.t_ns, moves, reading.warnings)
+    moves = np.column_stack([table.numbers[column.name] for column in INCREMENTS.columns[1:4]])
+    lost = table.numbers.get("unknown", np.zeros(len(table.rows)))
+    moves = np.column_stack((moves, np.maximum(lost, since_skipped(table.t_ns, table.resumed))))
+    t_ns, moves = checks.increments_in_order(table.path, table.rows, table.t_ns, moves, reading.warnings, table.rules)
     return IncrementStream(checks.seconds(t_ns, reading.t0_ns), *np.ascontiguousarray(moves.T))

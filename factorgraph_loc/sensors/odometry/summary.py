@@ -13,6 +13,7 @@ from factorgraph_loc.model.scoring import TICK_GAP
 from factorgraph_loc.sensors import interfaces
 from factorgraph_loc.sensors.interfaces import BETTER, FEWEST, LARGE, SHIFTS, SLOWEST, STEP, Paragraph, Summary
 from factorgraph_loc.sensors.motion import integrated, odometry_model
+from factorgraph_loc.sensors.odometry.jumps import jump_warning, jumps
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.text import Notice, notice
 from factors import se2
@@ -49,7 +50,15 @@ def summarize(log: Log) -> Summary:
         Paragraph(f"the reference {what} {ratio:.3f} times as much as the odometry") for what, ratio in ratios.items()
     ]
     entries = {f"odometry.{what}_ratio": ratio for what, ratio in ratios.items()}
-    return Summary(found=entries, problems=[*covered, *(problems or _doubtful(ratios))], text=text)
+    return Summary(found=entries, problems=[*covered, *_jumps(log), *(problems or _doubtful(ratios))], text=text)
+
+
+def _jumps(log: Log) -> list[Notice]:
+    """A warning about rows of odometry that jump."""
+    stream = log.streams.get("odometry")
+    if not isinstance(stream, VelocityStream | IncrementStream) or not (found := jumps(stream)):
+        return []
+    return [jump_warning("odometry_jumps", found, stream, '; bad_rows = "skip" skips them')]
 
 
 def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:

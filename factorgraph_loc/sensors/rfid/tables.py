@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_loc.errors import bad_field
+from factorgraph_loc.errors import InputError, bad_field
 from factorgraph_loc.files import checks
 from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.sensors.rfid.settings import RfidSettings
@@ -125,7 +125,7 @@ def read_rounds(
     if inventories is not None:
         return _from_inventories(reads, inventories, warnings)
     assert reads is not None
-    checks.arrivals(reads.path, reads.rows, reads.t_ns, warnings)
+    checks.arrivals(reads.path, reads.rows, reads.t_ns, warnings, reads.rules)
     order = np.argsort(reads.t_ns, kind="stable")
     antenna = [reads.names["antenna"][i] for i in order.tolist()]
     t_ns = reads.t_ns[order]
@@ -145,6 +145,8 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
         none = np.zeros(0, dtype=np.int64)
         return ReadsByRound(none, none, [], (nothing, nothing, nothing), end_ns, antenna)
     if "inventory" in reads.numbers:
+        if inventories.rules is not None and not inventories.rules.refuse:
+            _require_all(inventories)
         number = _named_rounds(reads, end_ns, antenna)
     else:
         duration_ns = np.rint(duration * 1e9).astype(np.int64)
@@ -154,6 +156,15 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
         sentence = "{source}: {outside} of {reads} reads lie outside of every inventory and are skipped"
         warnings.append(notice("outside_inventories", sentence, reads.path, left, len(number)))
     return _rounds(reads, keep, number[keep], end_ns, antenna)
+
+
+def _require_all(inventories: TableRows) -> None:
+    """InputError if rows were skipped or sorted, as reads name them by their number."""
+    first, rows = int(inventories.rows.min(initial=2)), inventories.rows
+    if first > 2 or np.any(rows != np.arange(first, first + len(rows))):
+        raise InputError(
+            f"{inventories.path}: rows are skipped or sorted, but the reads name them by number in the column inventory: remove it"
+        )
 
 
 def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:

@@ -1,0 +1,87 @@
+"""Single rows of odometry whose speed or turn rate no robot can reach between the rows around them.
+
+Their cause is mostly an angle that wraps inside of the robot's software.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from factorgraph_loc.files.row_rules import RowRules
+from factorgraph_loc.model.measurement import selected
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
+from factorgraph_loc.text import Notice, notice
+from factors.se2 import Array, Integers
+
+LEAST_TURN, LEAST_SPEED = 6.0, 5.0  # rad/s, m/s: from the rows around
+FACTOR = 5.0  # to the rows around
+AROUND = (-2, -1, 1, 2)  # rows that a row is compared with
+
+
+class Jump(NamedTuple):
+    """A row of odometry that jumps: its number from 0, ``what`` jumps, its rate, and those of the rows ``before`` and ``after``."""
+
+    row: int
+    what: str
+    unit: str
+    rate: float
+    before: float
+    after: float
+
+
+def jumps(stream: VelocityStream | IncrementStream) -> list[Jump]:
+    """The rows whose speed or turn rate differs from that of the two rows before and after by more than a robot can accelerate."""
+    if len(stream.t) < len(AROUND) + 1:
+        return []
+    if isinstance(stream, VelocityStream):
+        speeds, turns = stream.v, stream.w
+    else:
+        steps = np.diff(stream.t, prepend=2.0 * stream.t[0] - stream.t[1])
+        steps = np.maximum(steps, np.median(steps))  # stamps may be near each other by chance
+        speeds, turns = np.hypot(stream.dx, stream.dy) / steps, stream.dtheta / steps
+    kinds = (("turn rate", "rad/s", turns, LEAST_TURN), ("speed", "m/s", speeds, LEAST_SPEED))
+    out = [
+        Jump(i, what, unit, *(float(rates[k]) for k in (i, max(i - 1, 0), min(i + 1, len(rates) - 1))))
+        for what, unit, rates, least in kinds
+        for i in _outliers(rates, least).tolist()
+    ]
+    return sorted(out)
+
+
+def _outliers(rates: Array, least: float) -> Integers:
+    """The indices of the rates (N,) that are far from the median of the rows around them."""
+    padded = np.pad(rates, 2, mode="edge")
+    usual = np.median([padded[2 + k : len(padded) - 2 + k] for k in AROUND], axis=0)
+    return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
+
+
+def jump_warning(kind: str, found: list[Jump], stream: VelocityStream | IncrementStream, end: str) -> Notice:
+    """The warning of a ``kind`` about jumps, with the ``end`` of its sentence."""
+    first = found[0]
+    sentence = (
+        "the {what} of the odometry jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {before:.2f} and {after:.2f} "
+        f"{{unit}} (such rows: {{rows}}){end}"
+    )
+    rows = len({jump.row for jump in found})
+    t = float(stream.t[first.row])
+    return notice(kind, sentence, first.what, first.rate, first.unit, t, first.before, first.after, rows)
+
+
+def without_jumps(
+    stream: VelocityStream | IncrementStream, rules: RowRules, warnings: list[Notice]
+) -> VelocityStream | IncrementStream:
+    """The odometry without the rows that jump, if the ``rules`` skip bad rows; a warning counts them.
+
+    The velocity before such a row is held. The motion of a skipped increment is unknown.
+    """
+    if rules.bad_rows == "refuse" or not (found := jumps(stream)):
+        return stream
+    warnings.append(jump_warning("skipped_jumps", found, stream, ": skipped"))
+    keep = np.ones(len(stream.t), dtype=bool)
+    keep[[jump.row for jump in found]] = False
+    kept = selected(stream, keep)
+    if isinstance(kept, IncrementStream):
+        rows = np.flatnonzero(keep)
+        kept.unknown[:] = np.where(np.diff(rows, prepend=-1) > 1, np.diff(kept.t, prepend=kept.t[0]), kept.unknown)
+    assert isinstance(kept, VelocityStream | IncrementStream)
+    return kept
