@@ -44,7 +44,7 @@ MECHANISMS: dict[str, Callable[[], None]] = {
     "moved_tags": without_state(2),
     "learnt_share": constant(tag_states, "_raised", 0.0),
     "final_tags": lambda: setattr(known_tags.KnownTags, "without_doubtful", lambda _, reads: reads),
-    "bursts": attribute(monitor.BurstMonitor, "together", 1.0),
+    "bursts": attribute(monitor.BurstMonitor, "overdispersion", 1.0),
     "silence": constant(monitor.SilenceMonitor, "add", False),
     "consistency": constant(monitor.ConsistencyMonitor, "add", None),
     "dead_antennas": constant(monitor.ConsistencyMonitor, "dead_antennas", []),

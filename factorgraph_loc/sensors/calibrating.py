@@ -52,7 +52,7 @@ class SensorKnowledge:
     ``constants``: the fitted constants.
     ``notes``: warnings.
     ``figures``: plain values for the report, by name.
-    ``residuals``: those of each log.
+    ``residuals``: the residuals of each log.
     ``details``: data for :meth:`Calibrator.pictures`.
     ``correlations``: pairs of strongly correlated constants
     (:meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`).
@@ -128,7 +128,8 @@ class OneOfSeveral(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """See :meth:`Calibrator.learn`."""
+        """Estimate the sensor's constants and noise, with all other sensors of its kind removed. See
+        :meth:`Calibrator.learn`."""
         kind, name = self._calibrator.section, self.section
         alone = [
             replace(
@@ -178,7 +179,7 @@ class ConstantsCalibrator(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, _grids: Path | None, _like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """See :meth:`Calibrator.learn`."""
+        """Estimate the sensor's constants and noise by least squares. See :meth:`Calibrator.learn`."""
         if self.channel not in traced[0].log.streams:
             return SensorKnowledge()
         if traced[0].constants is not None:

@@ -128,10 +128,15 @@ def line(name: str, shift: float, than: str, setting: str, offset: float) -> Not
     the limit of the search, the true one may be larger, and the warning proposes to correct the manifest.
     """
     if abs(shift) > FARTHEST - STEP:
-        sentence = "{name} is stamped {shift:.1f} s or more apart from {other}: correct clock_offset in the manifest"
+        sentence = (
+            "{name}: timestamps differ by {shift:.1f} s or more from {other}: correct clock_offset in the manifest"
+        )
         return notice("clocks_apart", sentence, name, FARTHEST, than)
     late = "later" if shift > 0.0 else "earlier"
-    sentence = "{stream} is stamped about {shift:.2f} s {late} than {other}: set {section}.time_offset = {offset:+.2f} in the rig"
+    sentence = (
+        "{stream}: timestamps are about {shift:.2f} s {late} than those of {other}: set {section}.time_offset = "
+        "{offset:+.2f} in the rig"
+    )
     return notice("time_offset", sentence, name, abs(shift), late, than, setting, offset)
 
 

@@ -93,7 +93,7 @@ def test_at_constant_speed_no_clock_can_be_off(log):
     v = 0.5 + 0.01 * rng.standard_normal(len(t))
     along = Trajectory(t + 1.0, driven(se2.exp(0.05 * np.column_stack((v, 0.0 * v, 0.0 * v))[:-1])), has_heading=False)
     straight = replace(log, reference=along, streams={"odometry": VelocityStream(t, v, 0.0 * t)})
-    assert not any("stamped" in line for line in motion_problems(straight))
+    assert not any("timestamps" in str(line) for line in motion_problems(straight))
 
 
 @pytest.mark.parametrize("has_heading", [True, False])
@@ -156,7 +156,7 @@ def test_a_reference_that_stands_still_meanwhile_is_told(log):
     poses = log.reference.poses.copy()
     poses[(log.reference.t > 43.0) & (log.reference.t < 53.0), :] = poses[430]
     lines = motion_problems(replace(log, reference=Trajectory(log.reference.t, poses)))
-    assert "the reference stands still at 43.0 s, where the odometry drives" in str(lines[-1])
+    assert "the reference stands still at 43.0 s, while the odometry drives" in str(lines[-1])
 
 
 CORNERS = {"a": (0.0, 0.0), "b": (10.0, 0.0), "c": (10.0, 8.0), "d": (0.0, 8.0), "e": (5.0, -3.0)}

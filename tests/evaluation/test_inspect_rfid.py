@@ -84,7 +84,7 @@ def test_an_antenna_that_stops() -> None:
     stream = stream_of(make_log())
     right = np.array(stream.antenna) == "right"
     (problem,) = inspect(make_log(**only(~right | (stream.t < 30.0)))).problems
-    assert str(problem) == "antenna right stops at 29.5 s, 30.0 s before the others"
+    assert str(problem) == "antenna right stops at 29.5 s, 30.0 s before the last antenna"
     # its rounds go on, without a read
     epc = ["" if r and t >= 30.0 else e for r, t, e in zip(right, stream.t, stream.epc, strict=True)]
     (problem,) = inspect(make_log(epc=epc)).problems
@@ -97,6 +97,9 @@ def test_an_antenna_that_stops() -> None:
 def test_clocks_that_do_not_agree() -> None:
     t = stream_of(make_log()).t
     (problem,) = inspect(make_log(t=t + 3.0)).problems
-    assert str(problem) == "the reads reach 2.6 s after the odometry: do their clocks agree?"
+    assert str(problem) == "the reads extend 2.6 s after the odometry: do the clocks of reader and odometry agree?"
     (problem,) = inspect(make_log(t=np.where(t >= 30.0, t - 10.0, t))).problems
-    assert str(problem) == "38 rounds have stamps up to 9.5 s before an earlier one: did the clock of the reader jump?"
+    assert (
+        str(problem)
+        == "38 rounds have timestamps up to 9.5 s before an earlier round: did the clock of the reader jump?"
+    )

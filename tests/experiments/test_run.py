@@ -239,7 +239,7 @@ def test_tags_that_are_believed_dead_are_named(reading):
     found = Diagnostics(doubted={"dead_tags": {"b": 0.7, "c": 0.999}})
     use = use_of(reading, ALL, "smoother", settings_of("smoother", {}))
     (told,) = doubts(use, found, Learnt())
-    assert str(told).startswith("straight: 2 of 3 tags of the map are believed dead")
+    assert str(told).startswith("straight: 2 of 3 tags of the map are probably dead")
     assert str(told).endswith("c (> 99 %), b (70 %)")
     assert list(doubts(use, Diagnostics(), Learnt())) == []
 

@@ -46,11 +46,11 @@ class CameraUncertainty(FileModel):
     """Standard deviations of the camera's constants before a run. A constant is estimated if its value is above 0."""
 
     x: Distance = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the camera's x"""
     y: Distance = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the camera's y"""
     z: Distance = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the camera's height"""
     roll: Turn = 0.0
     """standard deviation of a rotation about the robot's x axis"""
     pitch: Turn = 0.0
@@ -60,7 +60,7 @@ class CameraUncertainty(FileModel):
     focal: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """relative standard deviation of the focal length"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the time offset"""
 
 
 class CameraSettings(SensorSettings):

@@ -35,7 +35,7 @@ GROSS = 4.0  # minimum ratio of the standard deviations of gross and of normal e
 SEPARATIONS = 20  # steps of expectation-maximisation
 SMALLEST = 1e-3  # m, rad, m per m; minimum standard deviation
 MIN_SIGHTINGS = 100
-MOST_SIGHTINGS = 12000  # per log
+MOST_SIGHTINGS = 12000  # largest number of sightings that are used per log
 # ranges are of the other kind (distance or depth) if the ratio of its errors to those of the given kind is below this
 BETTER_KIND = 0.9
 SIGMAS = ("range_sigma", "range_sigma_relative", "bearing_sigma")

@@ -32,7 +32,7 @@ FEWEST, GROWTH = 8, 1.25  # number of sightings at the first attempt, and its fa
 DIRECTIONS = 24  # number of initial positions on a circle around the robot
 RADII = (1.0, 3.0, 10.0, 30.0)  # m; radii of the initial positions if there is no range
 ITERATIONS, REFINEMENTS = 20, 8  # largest numbers of iterations, with independent and with correlated odometry errors
-CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m
+CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m; iterations end if a step is shorter than the first; longest step
 FLAT = 1e-4 * np.eye(2)  # information of the nearly flat prior [1/m^2]
 NEAR, MOST_FUSED = 0.5, 8  # m; minimum distance between distinct positions; largest number of distinct positions
 MARGIN = 12.0  # minimum excess of the losses of other positions; more if the median squared residual is above TYPICAL
@@ -136,13 +136,13 @@ class _PathSightings:
             turned = by_constants[-1][2]
             if covariances[-1][2, 2] + turned @ uncertainty @ turned > DRIFT**2:
                 break
-        back = np.unique(np.linspace(0, len(forth) - 1, USED).astype(int))  # newest first
+        back = np.unique(np.linspace(0, len(forth) - 1, USED).astype(int))  # used sightings, newest first
         self.count = len(back)
         used = [rows[-1 - i] for i in back.tolist()]
         self._model = model
         self._ranges, self._bearings = np.array([row.range for row in used]), np.array([row.bearing for row in used])
         self._is_measured = ~np.isnan(np.column_stack((self._ranges, self._bearings)))
-        self._back = se2.inverse(np.array(forth)[back])  # poses at the sightings
+        self._back = se2.inverse(np.array(forth)[back])  # poses of the robot at the sightings
         # matrices (K, 3, 3) from an error of the path to the error of the pose at a sighting
         self._carried = se2.adjoint(np.array(forth)[back])
         # covariance (K, K, 3, 3) of the path errors: those of two poses share the error of the path since the later pose

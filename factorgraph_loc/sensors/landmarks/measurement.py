@@ -90,19 +90,19 @@ class BearingRangeUncertainty(FileModel):
     """Standard deviations of the sensor's constants before a run. A constant is estimated if its value is above 0."""
 
     x: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the sensor's x"""
     y: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the sensor's y"""
     bearing_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the bearing bias"""
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """relative standard deviation of the constant"""
+    """relative standard deviation of the range scale"""
     range_bias: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
     """standard deviation of the range bias, which is constant for each landmark; the particle filter does not estimate it"""
     depth_axis: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the direction of the depth axis"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the time offset"""
 
 
 class BearingRangeSettings(SensorSettings):
@@ -134,7 +134,7 @@ class BearingRangeSettings(SensorSettings):
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
     """scale of the Geman-McClure loss, in standard deviations"""
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
-    """standard deviations of constants; those above 0 are estimated"""
+    """standard deviations of constants; a constant is estimated if its value is above 0"""
 
     def model(self) -> BearingRangeModel:
         return BearingRangeModel(

@@ -254,7 +254,7 @@ def _shifted(log: Log) -> list[Notice]:
         return [interfaces.line(name, best, "the reference", name, -best)]
     if height > TALL and _cost(errors(0.0, height)) < BETTER * _cost(errors(0.0)):
         sentence = (
-            "ranges near landmarks are too long, as if these were {height:.1f} m above or below the sensor: give z of the "
+            "ranges near landmarks are too long, as if the landmarks were {height:.1f} m above or below the sensor: give z of the "
             "landmarks, and {name}.z of the rig"
         )
         return [notice("height", sentence, height, name)]
@@ -316,4 +316,8 @@ def not_located(log: Log, located: Container[str]) -> list[Notice]:
     """Return a note that lists the sighted landmarks that are not in ``located``. Returns [] if all are."""
     counts = Counter(name for stream in _streams(log).values() for name in stream.landmark)
     missing = [f"{name} ({count} sightings)" for name, count in sorted(counts.items()) if name not in located]
-    return [notice("not_located", "not located: {landmarks}", listed(missing))] if missing else []
+    return (
+        [notice("not_located", "landmarks that were sighted but could not be located: {landmarks}", listed(missing))]
+        if missing
+        else []
+    )

@@ -132,7 +132,7 @@ class SightingWindow:
         sightings = np.zeros((len(self.points), 3)), self._from_robot(), self._ranges, self._bearings
         jacobian = linearize_each(self._model.packed, *sightings)[1][..., :POINT]
         covariance = np.eye(2) + jacobian @ error @ jacobian.transpose(0, 2, 1)
-        # without a bearing the direction of the range is unknown: use the worst case
+        # without a bearing the direction to the landmark is unknown, so use the odometry error in the worst direction
         worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
         covariance[:, 0, 0] = np.where(self._missing[:, 1], 1.0 + worst, covariance[:, 0, 0])
         return positive.whitener(covariance)

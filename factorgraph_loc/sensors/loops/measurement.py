@@ -57,7 +57,7 @@ class LoopSettings(SensorSettings):
     """scale of the Geman-McClure loss of a loop of score 1, in standard deviations"""
 
 
-LEAST_AGE = 1e-6  # s
+LEAST_AGE = 1e-6  # s; the earlier pose of a loop must be older by at least this
 _TOLD = (
     *(
         number(name, LENGTH, -LONGEST_RANGE, LONGEST_RANGE, "position in the frame of the earlier pose", may_lack=True)

@@ -243,7 +243,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         """Return the constants to estimate, with priors. Delay, lag and slowdown only exist for commanded velocities. Wheels
         with encoders have hardly any bias per time, so its priors are narrow."""
         commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
-        by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s
+        by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s; prior sigmas
         priors = {
             "scale_distance": (0.05, 0.2, 5.0),
             "scale_rotation": (0.05, 0.2, 5.0),

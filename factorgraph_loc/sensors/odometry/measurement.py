@@ -160,11 +160,11 @@ INCREMENTS = Table(
     "odometry",
     (
         STAMP,
-        within("dx", LENGTH, LONGEST_WAY, "forward motion since the row before"),
-        within("dy", LENGTH, LONGEST_WAY, "motion to the left since the row before"),
-        within("dtheta", ANGLE, MOST_TURNED, "rotation since the row before"),
+        within("dx", LENGTH, LONGEST_WAY, "forward motion since the previous row"),
+        within("dy", LENGTH, LONGEST_WAY, "motion to the left since the previous row"),
+        within("dtheta", ANGLE, MOST_TURNED, "rotation since the previous row"),
         number(
-            "unknown", DURATION, 0.0, MAX_SPAN, "part of the time since the row before in which the motion is unknown"
+            "unknown", DURATION, 0.0, MAX_SPAN, "part of the time since the previous row in which the motion is unknown"
         ),
     ),
     optional=(("unknown",),),
@@ -175,7 +175,7 @@ IMU = Table(
     (STAMP, within("w", RATE, FASTEST_TURN, "turn rate of a gyro")),
     stream="factorgraph_loc.sensors.odometry.measurement:YawRateStream",
 )
-# wheel counters, which are converted to increments
+# distances by wheel counters, which are converted to increments
 WAYS = Table(
     "odometry",
     (

@@ -38,13 +38,13 @@ class OdometryUncertainty(FileModel):
     """Standard deviations of the odometry's constants before a run. A constant is estimated if its value is above 0."""
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """relative standard deviation of the constant"""
+    """relative standard deviation of the scale of distances"""
     scale_rotation: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """relative standard deviation of the constant"""
+    """relative standard deviation of the scale of rotations"""
     heading_rate_bias: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/s")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the bias of the turn rate"""
     heading_drift: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad/m")] = 0.0
-    """standard deviation of the constant"""
+    """standard deviation of the heading drift"""
 
 
 class DifferentialDrive(FileModel):

@@ -95,7 +95,7 @@ def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
     """Return warnings about ratios that differ from 1. Rotations of another sign or unit are left to
     :func:`motion_problems`."""
     keys = {"travels": "scale_distance", "turns": "scale_rotation"}
-    sentence = "the reference {moves} {ratio:.2f} times as much as the odometry ({setting}, or fgloc calibrate)"
+    sentence = "the reference {moves} {ratio:.2f} times as much as the odometry: set odometry.{setting}, or run fgloc calibrate"
     return [
         notice("odometry_scale", sentence, what, ratio, keys[what])
         for what, ratio in ratios.items()
@@ -111,7 +111,7 @@ def _standstill(t: Array, ours: Array, theirs: Array) -> list[Notice]:
     if not len(stuck):
         return []
     first, far = float(t[stuck[0]]), float(np.max(_chords(ours, steps)[stuck]))
-    sentence = "the reference stands still at {t:.1f} s, where the odometry drives {distance:.1f} m in {duration:g} s"
+    sentence = "the reference stands still at {t:.1f} s, while the odometry drives {distance:.1f} m in {duration:g} s"
     return [notice("reference_stands", sentence, first, far, STILL)]
 
 

@@ -1,4 +1,4 @@
-"""RFID readers: detection, strength and phase of tags."""
+"""Reads of RFID tags, with their signal strength and phase."""
 
 from factorgraph_loc.model.sections import Layer, Section
 from factorgraph_loc.sensors.registry import Channel, SensorType

@@ -1,9 +1,10 @@
-"""Expected information of RFID antennas along a path, for planning: simulated reads and their likelihood for particles.
+"""Predicts the information of RFID antennas along candidate paths, for planning.
 
-All antennas of a robot measure from one pose, so a table holds the result of all antennas for each tag position in the robot
-frame, and a tag is looked up once. Only reads need the individual antennas, and they are few: log p(z | x) = sum of log(1 - q) over
-all tags in range + sum of logit(q) over the reads. Both are relative to the floor of false reads, so that tags out of range
-contribute nothing. Walls and false reads of tags out of range are not simulated.
+Reads are simulated, and their likelihood is evaluated for particles. With the probability q of a read, the log-likelihood is
+the sum of log(1 - q) over all tags in range plus the sum of logit(q) over the reads. The first sum comes from a table of the
+robot: for each position of a tag in the robot frame it has the sum over all antennas. The second sum needs each antenna, but
+reads are few. Both sums are relative to a tag out of range, which contributes nothing. Walls, and false reads of tags out of
+range, are not simulated.
 """
 
 import math
@@ -24,18 +25,21 @@ from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.kernels import FAST
 from factors.se2 import Array
 
-COARSE = 3  # cells and heights, in those of the tables of the antennas
-FACINGS = 24  # directions of tags
+COARSE = 3  # ratio of the size of cells, in position and height, to that of the antennas' tables
+FACINGS = 24  # number of facing directions of tags
 UNREAD = 1e-3  # a tag is out of range if no antenna exceeds the probability of a false read by this
-MOST_LOOKS = 1 << 16  # per path; a stride of random numbers, so that paths of all lengths share them
+MOST_LOOKS = 1 << 16  # largest number of measurements of a path; measurement k has the same random numbers on all paths
 
 
 class ScanTables(NamedTuple):
-    """:class:`~factors.rfid.places.RobotTables` with C = H F S S cells, for simulated scans.
+    """Tables of the response of A antennas to T tags, for simulated scans, made of :class:`~factors.rfid.places.RobotTables`.
 
-    ``read`` (C, A): probability; ``gain`` (A, C): its logit; ``missed`` (C,): sum over antennas of log(1 - q) above that out of
-    reach; ``silent`` (C,): the absolute sum, 0 out of range. ``size``: S; ``layers``: F. ``points`` (T, 2) [m], ``facing`` (T,)
-    [rad], NaN if unknown, and ``first`` (T,): first cell of each tag's height.
+    A table has C = H F S S cells: H heights, F facings (the last for an unknown one), and S x S positions in the robot frame.
+    ``read`` (C, A): probability q of a read. ``gain`` (A, C): its logit.
+    ``missed`` (C,): sum over antennas of log(1 - q), minus its value for a tag out of range.
+    ``silent`` (C,): sum over antennas of log(1 - q), 0 out of range.
+    ``size``: S. ``layers``: F. ``cell``: size of a cell [m].
+    ``points`` (T, 2) [m] and ``facing`` (T,) [rad], NaN if unknown: the tags. ``first`` (T,): first cell of each tag's height.
     """
 
     read: Array32
@@ -51,7 +55,7 @@ class ScanTables(NamedTuple):
 
 
 def make_tables(likelihood: RfidLikelihood) -> ScanTables:
-    """The tables of a model with a map of tags."""
+    """Return the tables of a detection model and its map of tags."""
     tables, tags = likelihood.robot_tables(COARSE, FACINGS), likelihood.tags
     antennas, _, layers, size, _ = tables.gain.shape
     gain, missed = tables.gain.reshape(antennas, -1), tables.missed.sum(axis=0).ravel()
@@ -64,7 +68,8 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
 
 @compiled
 def _uniform(seed: np.uint64, number: int) -> float:
-    """The random number with this index, the same for all candidates (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
+    """Return a uniform random number that only depends on ``seed`` and its index ``number``, so that it is the same for all
+    candidate paths (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
     z = seed + np.uint64(number + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -74,7 +79,8 @@ def _uniform(seed: np.uint64, number: int) -> float:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
-    """The table cells of a tag relative to poses (M, 3); ``turns`` (2, M): cosine and sine of their headings."""
+    """Write the table cell of tag ``t`` at each of the robot's ``poses`` (M, 3) to ``out`` (M,). ``turns`` (2, M): cosine and
+    sine of the headings."""
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
@@ -106,16 +112,17 @@ def log_weights(
     tempering: float,
     out: Array32,
 ) -> None:
-    """Tempered log-likelihood (J, M) of scans simulated from the first J = ``scans`` particles on one path, for each of M
-    particles.
+    """Simulate scans from the first J = ``scans`` particles on one path. Write to ``out[j, m]`` the tempered log-likelihood of
+    particle m, given the scans from particle j.
 
-    ``poses`` (S, M, 3): measurement poses; ``rounds`` (S,); ``stops`` (M,): number of measurements of each particle.
+    ``poses`` (S, M, 3): poses of M particles at S stops. ``rounds`` (S,): inventory rounds at each stop. ``stops`` (M,): number
+    of stops of each particle. ``out`` (J, M).
     """
     steps, count, _ = poses.shape
     tags = len(tables.points)
     missed = tables.missed
     cells = np.empty((steps, tags, count), np.int32)
-    # log-likelihood of no reads at all, cumulated over the measurements
+    # log-likelihood of scans without any read, cumulated over the stops
     silence = np.zeros((steps + 1, count), np.float32)
     turns = np.empty((2, count), np.float32)
     for k in range(steps):
@@ -140,7 +147,7 @@ def log_weights(
 def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
-    """Draw the reads of each scan, and add their log-likelihood."""
+    """Draw the random reads of each scan, and add their log-likelihoods to ``out``. See :func:`log_weights`."""
     steps, tags, count = cells.shape
     antennas = tables.read.shape[1]
     gain = tables.gain
@@ -155,7 +162,7 @@ def _add_reads(
                 if k >= stops[n] or silent == 0.0:
                     continue
                 left = _uniform(seed, (n * MOST_LOOKS + k) * tags + t)
-                # exp(x) is at least 1 + x
+                # the first test avoids most calls of exp(x), which is at least 1 + x
                 if left < 1.0 + silent or left < math.exp(silent):
                     continue
                 for a in range(antennas):
@@ -172,7 +179,8 @@ def _add_reads(
 
 @compiled
 def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
-    """Number of ``count`` rounds that read a tag, by inversion, and the rest of the draw, which is uniform again."""
+    """Draw the number of ``count`` rounds that read a tag with probability ``q``, by inversion of ``uniform``. Also returns
+    what is left of ``uniform``, which is again uniform in 0 to 1."""
     p = (1.0 - q) ** count
     k = 0
     while uniform >= p and k < count:
@@ -184,14 +192,15 @@ def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
 
 @dataclass(frozen=True, eq=False)
 class RfidForecast:
-    """A :class:`~factorgraph_loc.sensors.interfaces.Forecast` of inventory rounds, ``rounds_per_metre`` of each antenna."""
+    """Predicts the information of inventory rounds on candidate paths. It implements
+    :class:`~factorgraph_loc.sensors.interfaces.Forecast`. ``rounds_per_metre``: rounds of each antenna per metre of path."""
 
     likelihood: RfidLikelihood
     rounds_per_metre: float = 4.0
 
     @property
     def goals(self) -> Array:
-        """The positions of the tags."""
+        """The positions (T, 2) of the tags [m]."""
         return self.likelihood.tags.points[:, :2]
 
     @cached_property
@@ -199,7 +208,8 @@ class RfidForecast:
         return make_tables(self.likelihood)
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Expected information, proportional to the number of rounds."""
+        """Return the expected information (N, 3, 3) at ``poses`` (N, 3). It is proportional to the number of rounds on the path
+        lengths ``ways`` (N,) [m]."""
         count = len(self.likelihood.model.antennas)
         hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
         one_round = TagReadCounts(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
@@ -207,7 +217,8 @@ class RfidForecast:
         return np.asarray((self.rounds_per_metre * ways)[:, None, None] * score)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Weigh particles by simulated scans, with the path's rounds distributed over the poses."""
+        """Add log-likelihoods of simulated scans to ``out``. The rounds of the path are distributed evenly over the poses. See
+        :class:`~factorgraph_loc.sensors.interfaces.Forecast`."""
         steps, total = len(poses), round(metres * self.rounds_per_metre)
         rounds = np.diff(np.arange(steps + 1) * total // steps).astype(np.int64)
         added = np.empty_like(out)
@@ -217,7 +228,8 @@ class RfidForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> RfidForecast | None:
-    """The forecast for a robot with ``speed`` [m/s], with the rates of a simulation; None without antennas or tags."""
+    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: those of the simulation, for the rate of
+    rounds. Returns None without antennas or tags."""
     if rig.find(RfidSettings) is None or not world.tags:
         return None
     likelihood = RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags)

@@ -1,4 +1,4 @@
-"""Scans as likelihoods: reads and misses of the tags of the map, signal strength and phase."""
+"""Turns RFID scans into likelihoods: reads and misses of the map's tags, signal strengths, and phases."""
 
 import math
 from collections import deque
@@ -30,21 +30,21 @@ from factors.rfid.signals import (
 from factors.rfid.tag_states import FARTHEST, TagStates, sigma_poses
 from factors.se2 import Array, Integers
 
-CONFIRMED = (
-    1.0  # s until a read counts as evidence on the state of its tag: a track that it contradicts may be doubted by then
-)
-CLEAR = math.log(0.99 / 0.01)  # log-odds of a tag that is clearly not as surveyed
+# s; a read becomes evidence on the state of its tag after this time, because by then a wrong track is suspicious
+CONFIRMED = 1.0
+CLEAR = math.log(0.99 / 0.01)  # log-odds of a tag that is clearly dead, weak or moved
 WIDENED = 4.0  # factor of the pose's sigmas for evidence on tags, because consecutive scans share the pose error
-STANDING = np.zeros(3)  # velocity
-PASS_SIGMA = 0.1  # m: accuracy of the pose from one pass of a tag
-EXACT = 0.2  # a survey is exact if its sigma is below this share of that
+STANDING = np.zeros(3)  # velocity of a robot at rest
+PASS_SIGMA = 0.1  # m; standard deviation of a pose that is determined by driving past one tag
+EXACT = 0.2  # a survey is treated as exact if its sigma is below this fraction of PASS_SIGMA
 
 
 def trust(sigmas: Array) -> float:
-    """The exponent of a likelihood of tags whose positions have standard deviations ``sigmas`` (T,) [m].
+    """Return the exponent, at most 1, of the likelihood of tags whose surveyed positions have standard deviations ``sigmas``
+    (T,) [m].
 
-    The survey error is the same in all reads of a tag, so reads cannot average it out. A pass of a tag determines the pose with
-    variance :data:`PASS_SIGMA` squared, and with the sum of both variances if the survey is inexact.
+    The survey error of a tag is the same in all its reads, so it does not average out. Driving past a tag determines the pose
+    with the variance :data:`PASS_SIGMA` squared. With an inexact survey the variance is the sum of both.
     """
     counted = np.where(sigmas > EXACT * PASS_SIGMA, sigmas, 0.0)
     return float(np.mean(1.0 / (1.0 + (counted / PASS_SIGMA) ** 2))) if len(sigmas) else 1.0
@@ -52,8 +52,9 @@ def trust(sigmas: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TagMap:
-    """``names``: T EPCs; ``tags``: in the world frame, with the survey transform applied; ``index``: by EPC; ``sigmas`` (T,) [m]:
-    standard deviations of their survey along an axis."""
+    """The T tags of a map. ``names``: their EPCs. ``tags``: positions and facings in the world frame, after the survey
+    transform. ``index``: the index of each EPC. ``sigmas`` (T,): standard deviations [m] of the surveyed positions along an
+    axis."""
 
     names: tuple[str, ...]
     tags: TagArray
@@ -62,7 +63,8 @@ class TagMap:
 
 
 def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
-    """The tags of a map, or those of them in ``names``."""
+    """Return the tags of a map, or only the tags with an EPC in ``names``. ``survey``: the transform from the survey to the
+    world."""
     chosen = {name: tag for name, tag in world.tags.items() if names is None or name in names}
     points = np.array([(tag.x, tag.y, tag.z) for tag in chosen.values()]).reshape(-1, 3)
     facing = np.array([np.nan if tag.facing is None else tag.facing for tag in chosen.values()])
@@ -73,12 +75,13 @@ def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None 
     return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)}, sigmas)
 
 
-MARGIN = 1.0  # m; distance from walls and tags at which the robot may be
-MARGIN_OF_TAGS = 3.0  # m; without walls
+MARGIN = 1.0  # m; largest distance of the robot from the bounding box of walls and tags
+MARGIN_OF_TAGS = 3.0  # m; largest distance of the robot from the bounding box of the tags if there are no walls
 
 
 def extent(world: World, tags: TagArray) -> Array:
-    """The area of the robot: lower and upper corner (2, 2) [m], from the walls, or from the tags without walls."""
+    """Return the area where the robot may be, as lower and upper corner (2, 2) [m]: the bounding box of walls and tags with a
+    margin. Both corners are zero without walls and tags."""
     ends = np.array(world.walls).reshape(-1, 2)
     margin = MARGIN if len(ends) else MARGIN_OF_TAGS
     points = np.concatenate((ends, tags.points[:, :2])) if len(tags.points) else ends
@@ -88,14 +91,18 @@ def extent(world: World, tags: TagArray) -> Array:
 
 
 def whole_scans(log: Log) -> list[RfidScan]:
-    """All RFID scans in order of arrival; empty without a reader."""
+    """Return all RFID scans of a log in order of arrival, or [] if it has none."""
     return [m for m in log.measurements(("rfid",)) if isinstance(m, RfidScan)]
 
 
 @dataclass(frozen=True, eq=False)
 class TagEvidence:
-    """The evidence of a scan on the states of U ``tags``, see :meth:`~factors.rfid.tag_states.TagStates.expect`; ``is_read`` (U,):
-    whether it read them."""
+    """The evidence of a scan on the states of tags: as surveyed, weak, moved or dead.
+
+    ``tags`` (U,): indices in the map. ``log_likelihoods`` (U, S): log-likelihoods of the scan's reads and misses for S
+    hypotheses of each tag's state, see :meth:`~factors.rfid.tag_states.TagStates.expect`. ``is_read`` (U,): True for tags that
+    the scan read.
+    """
 
     tags: Integers
     log_likelihoods: Array
@@ -103,10 +110,10 @@ class TagEvidence:
 
 
 class KnownTags:
-    """Turns scans into read counts of the map's tags. Tags and antennas that map or rig lack are counted as ignored.
+    """Turns scans into read counts of the map's tags. Unknown tags and antennas are counted as ignored in the diagnostics.
 
-    It also tracks the ``states`` of the tags. A read shows that a tag is not dead; other evidence of a scan requires a known
-    pose (:meth:`weigh_states`, :meth:`learn`). Tags that are believed dead, weak or moved are listed in the diagnostics.
+    It also estimates the ``states`` of the tags. A read shows that a tag is not dead. All other evidence of a scan requires a
+    known pose (:meth:`weigh_states`, :meth:`learn`). Tags that are probably dead, weak or moved are listed in the diagnostics.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
@@ -118,8 +125,8 @@ class KnownTags:
         self._tempering = model.tempering
         self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
         self.states = TagStates(len(self.map.names), settings.dead_tags, settings.weak_tags, settings.moved_tags)
-        self._excluded: set[int | None] = set()  # antennas that are dead
-        self._waiting: deque[tuple[float, Integers, Array]] = deque()  # evidence of reads since `CONFIRMED` ago
+        self._excluded: set[int | None] = set()  # indices of antennas that are dead
+        self._waiting: deque[tuple[float, Integers, Array]] = deque()  # evidence of reads younger than CONFIRMED
 
     @property
     def antennas(self) -> Sequence[str]:
@@ -127,20 +134,24 @@ class KnownTags:
         return list(self._antennas)
 
     def exclude(self, antenna: int) -> str:
-        """Ignore the rounds of an antenna, which is dead, until it reads a tag; returns its name."""
+        """Ignore the rounds of a dead antenna until it reads a tag. Returns its name."""
         self._excluded.add(antenna)
         self._rounds = {}
         return self.antennas[antenna]
 
     def temper(self, tempering: float) -> None:
-        """Use this exponent of the likelihood where it is less than that of the rig."""
+        """Set the exponent of the likelihood to ``tempering``, or to that of the rig if this is smaller."""
         new = min(self._tempering, tempering) * self.trust
         if new != self.likelihood.model.tempering:
             self.likelihood = self.likelihood.tempered(new)
 
     def read_counts(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
-        """Reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time, with the robot's
-        velocity ``twist`` (3,). Without ``count``, ignored reads are not counted, because the scan will be processed again."""
+        """Return reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time. Returns
+        None if the map has no tags or no antenna is known.
+
+        ``twist`` (3,): velocity of the robot. ``count``: False if the scan will be processed again. Ignored reads are not
+        counted then.
+        """
         diagnostics = self._diagnostics if count else Diagnostics()
         if self._excluded:
             active = {self._antennas.get(m.antennas[i]) for i in set(m.antenna.tolist())}
@@ -157,7 +168,7 @@ class KnownTags:
             return None
         reads: list[tuple[int, int]] = []
         unknown = 0
-        # count a tag once per round
+        # a tag that was read several times in one round counts once
         for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
             place = self.map.index.get(name)
             if place is None:
@@ -173,28 +184,30 @@ class KnownTags:
         hits = np.zeros((len(used), len(tags)), dtype=np.int64)
         np.add.at(hits, (at, np.searchsorted(tags, places)), 1)
         odds = self.states.odds[tags]
-        # reads of a tag that has probably moved do not inform an unknown pose
+        # reads of a tag that has probably moved have no information on an unknown pose
         elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
         prior = self.states.prior
         twists = np.tile(twist, (len(used), 1))
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """The evidence of ``counts`` on the states of tags in reach.
+        """Return the evidence of reads and misses ``counts`` on the states of tags in range.
 
-        ``pose`` (3,): predicted, with body-frame ``covariance`` (3, 3). ``parameters`` (Q,): of the likelihood, as estimated.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the predicted pose of the robot. ``parameters`` (Q,): estimated
+        parameters of the likelihood.
         """
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
         return TagEvidence(*self.likelihood.displaced(poses, counts, *places))
 
     def with_states(self, counts: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
-        """The counts with the states of tags that may be dead or moved, given their ``evidence``."""
+        """Return the counts with the probabilities of dead, weak and moved tags. ``evidence``: the evidence of the same
+        scan."""
         elsewhere = self.states.expect(evidence.tags, evidence.log_likelihoods)
         return counts.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
-        """The counts with the effect of tags removed that are clearly not as surveyed."""
+        """Return the counts without the effect of tags that are clearly dead, weak or moved."""
         clear = self.states.odds[reads.tags] > CLEAR
         if not clear.any():
             return reads
@@ -203,7 +216,8 @@ class KnownTags:
         )
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
-        """Learn of the tags that were not read at ``t``, and of those that were read :data:`CONFIRMED` ago."""
+        """Update the states of tags by the evidence of a scan at ``t`` [s]. Misses are used at once. Reads are used after
+        :data:`CONFIRMED` seconds."""
         is_read, tags, log_likelihoods = evidence.is_read, evidence.tags, evidence.log_likelihoods
         self.states.learn(t, tags[~is_read], log_likelihoods[~is_read])
         self._waiting.append((t, tags[is_read], log_likelihoods[is_read]))
@@ -212,23 +226,27 @@ class KnownTags:
         self._report_suspects()
 
     def forget(self, since: float) -> None:
-        """Take back what was learnt since ``since``."""
+        """Undo all updates of the tags' states since the time ``since`` [s]."""
         self.states.forget(since)
         self._waiting = deque(row for row in self._waiting if row[0] < since)
         self._report_suspects()
 
     def silent(self) -> None:
-        """Take back what was learnt since the last read, because the reader or all tags have failed."""
+        """Undo all updates of the tags' states since the last read, because the reader or all tags have failed."""
         self.forget(math.nextafter(self.states.last_read, math.inf))
 
     def _report_suspects(self) -> None:
+        """Write the names and probabilities of dead, weak and moved tags to the diagnostics."""
         for state, tags in self.states.suspects.items():
             names = map(self.map.names.__getitem__, tags)
             self._diagnostics.doubted[f"{state}_tags"] = dict(zip(names, tags.values(), strict=True))
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
-        """The active antennas: row of each, -1 if the rig lacks it; antenna index and number of rounds of each row. Cached, because
-        consecutive scans have the same antennas."""
+        """Return three lists: the row in the read counts of each active antenna in ``names``, and the antenna index and the
+        number of rounds of each row. The row is -1 for an unknown or dead antenna.
+
+        The result is cached, because consecutive scans have the same antennas.
+        """
         if names not in self._rounds:
             antennas = [self._antennas.get(name, -1) for name in names]
             antennas = [-1 if antenna in self._excluded else antenna for antenna in antennas]
@@ -239,8 +257,8 @@ class KnownTags:
         return self._rounds[names]
 
     def places(self, m: RfidScan) -> tuple[Integers, Integers]:
-        """Antenna and tag indices of each read of a scan, -1 if the rig or the map lacks them, or if the tag is believed not to be
-        where the map has it."""
+        """Return the antenna index and the tag index of each read of a scan. An index is -1 if the rig or the map lacks the
+        element. A tag that is probably dead, weak or moved also has -1."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
         tags[(tags >= 0) & (self.states.odds[tags] > 0.0)] = -1
@@ -252,17 +270,17 @@ Row = tuple[float, int, int, float, float]  # time of the read, antenna, tag, ph
 
 
 class TagSignals:
-    """Turns scans into strength observations and windows of phases, if these sensors are used.
+    """Turns scans into signal strengths and windows of phases, if the run uses the sensors ``rssi`` and ``phase``.
 
-    Windows of the rig's ``window`` seconds end at least ``step`` seconds apart.
+    A window has the phases of the rig's last ``window`` seconds. Two windows end at least ``step`` seconds apart.
     """
 
     def __init__(self, setup: Setup, tags: KnownTags) -> None:
         settings, self._tags = setup.rig.of(RfidSettings), tags
         self.strength: RssiLikelihood | None = None
         self.phase: PhaseLikelihood | None = None
-        self._rows: deque[tuple[float, Row]] = deque()  # with the scan's time
-        self._ended: deque[float] = deque()
+        self._rows: deque[tuple[float, Row]] = deque()  # reads with a phase, each with the time of its scan
+        self._ended: deque[float] = deque()  # times [s] at which windows ended
         self._window = self._step = 0.0
         self._newest = -np.inf
         antennas = tags.likelihood.model.antennas
@@ -273,7 +291,7 @@ class TagSignals:
             self._window, self._step = settings.phase.window, settings.phase.step
 
     def strengths(self, m: RfidScan) -> RssiReads | None:
-        """The reads with a strength, relative to the pose at the scan's time."""
+        """Return the reads with a signal strength, relative to the pose at the scan's time, or None without any."""
         if self.strength is None:
             return None
         antennas, tags = self._tags.places(m)
@@ -283,7 +301,7 @@ class TagSignals:
         return RssiReads(np.zeros((len(rows), 3)), antennas[rows], tags[rows], m.rssi[rows])
 
     def keep(self, m: RfidScan) -> bool:
-        """Add the phases of a scan; True if a window ends with it."""
+        """Store the phases of a scan. Returns True if a window ends with this scan."""
         if self.phase is None:
             return False
         antennas, tags = self._tags.places(m)
@@ -300,12 +318,15 @@ class TagSignals:
         return True
 
     def times(self) -> Array:
-        """Times (R,) [s] of the reads of the window."""
+        """Return the times (R,) [s] of the reads in the current window."""
         return np.array([row[0] for row in self._of_window()])
 
     def phases(self, offsets: Array, pose: Array) -> RfidFactor | None:
-        """The window as a factor on a pose predicted as ``pose`` (3,); ``offsets`` (R, 3): robot poses at the reads relative to it.
-        None if too few reads are near their tags."""
+        """Return the phases of the current window as a factor on the robot's pose. Returns None if too few reads are near their
+        tags.
+
+        ``pose`` (3,): the predicted pose. ``offsets`` (R, 3): the robot's poses at the reads, relative to that pose.
+        """
         if self.phase is None:
             return None
         _, antennas, tags, phase, frequency = (np.array(column) for column in zip(*self._of_window(), strict=True))
@@ -314,14 +335,15 @@ class TagSignals:
         return RfidFactor(self.phase, reads) if len(reads.phase) else None
 
     def forget(self, since: float) -> None:
-        """Forget scans since ``since``, at most :data:`GOING_BACK` ago; they will be processed again."""
+        """Delete the scans since the time ``since`` [s], because they will be processed again. It is at most :data:`GOING_BACK`
+        ago."""
         while self._rows and self._rows[-1][0] >= since:
             self._rows.pop()
         while self._ended and self._ended[-1] >= since:
             self._ended.pop()
 
     def clear(self) -> None:
-        """Forget all reads."""
+        """Delete all reads."""
         self._rows.clear()
         self._ended.clear()
 

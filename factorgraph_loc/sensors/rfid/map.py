@@ -1,4 +1,4 @@
-"""RFID tags of the map, and their tables."""
+"""RFID tags of the map, and the files that list them."""
 
 import math
 from collections.abc import Mapping
@@ -22,17 +22,18 @@ TAGS = Table(
         within("x", LENGTH, FARTHEST, "position in the frame of the survey"),
         within("y", LENGTH, FARTHEST, "position in the frame of the survey"),
         number("z", LENGTH, -FARTHEST, FARTHEST, "height; 0 if empty", may_lack=True),
-        number("facing", ANGLE, -FULL_TURN, FULL_TURN, "direction that its front faces", may_lack=True),
-        number("sigma", LENGTH, 0.0, 100.0, "standard deviation of its survey in x and y", may_lack=True),
+        number("facing", ANGLE, -FULL_TURN, FULL_TURN, "direction that the front of the tag faces", may_lack=True),
+        number("sigma", LENGTH, 0.0, 100.0, "standard deviation of the surveyed x and y", may_lack=True),
     ),
     optional=(("sigma",),),
 )
 
 
 class Tag(FileModel):
-    """An RFID tag: surveyed position [m] and the direction that it faces [rad], None if unknown.
+    """An RFID tag of the map: its surveyed position [m], and the direction ``facing`` of its front [rad], None if unknown.
 
-    ``sigma``: standard deviation of the survey in x and y [m]; ``covariance``: (xx, xy, yy) [m^2] instead of ``sigma``.
+    ``sigma``: standard deviation of the surveyed x and y [m]. ``covariance``: may be given instead of ``sigma``, as
+    (xx, xy, yy) [m^2].
     """
 
     x: Coordinate
@@ -43,19 +44,20 @@ class Tag(FileModel):
     covariance: Covariance | None = None
 
     def spread(self) -> Array:
-        """The covariance (2, 2) of the position [m^2]."""
+        """Return the covariance (2, 2) of the surveyed position [m^2]."""
         return spread_of(self.sigma, self.covariance)
 
 
 class TagsFile(ColumnMapping):
-    """A foreign table of tags with the fields epc, x, y and optionally z, facing, sigma. ``epc_case``: letter case of EPCs in
-    comparisons with the reads."""
+    """The mapping of a foreign table of tags to the fields epc, x, y and optionally z, facing, sigma. ``epc_case``: a
+    conversion of the EPCs, such as upper case, so that they equal the EPCs of the reads."""
 
     epc_case: EpcCase = "as written"
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """The tags of a world file: inline, in a native table, or in a foreign table with a mapping."""
+    """Return the section ``tags`` of a world file. If its ``content`` names a native table, or maps a foreign table, read the
+    tags from that table in ``folder``. ``source``: the world file for messages."""
     if isinstance(content, str):
         return read_tags(inside(folder, content, source))
     if isinstance(content, dict) and isinstance(content.get("file"), str):
@@ -65,7 +67,8 @@ def read_layer(content: Any, source: object, folder: Path) -> Any:
 
 
 def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
-    """Write tags as a table and return its name; None if one has a covariance, which a table cannot hold."""
+    """Write tags as a table next to the world file ``base``, and return the name of the table. Returns None and writes nothing
+    if there are no tags, or if a tag has a covariance, which has no column."""
     if not tags or any(tag.covariance is not None for tag in tags.values()):
         return None
     write_tags(tags, base.with_name(base.name + TAGS_SUFFIX))
@@ -73,10 +76,10 @@ def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
 
 
 def read_tags(path: Path, mapping: TagsFile | None = None) -> dict[str, Tag]:
-    """Read ``NAME.tags.csv`` with the columns epc, x, y, z, facing and optionally sigma; facing may be empty; or a foreign table
-    with a ``mapping``.
+    """Read tags from a native table ``NAME.tags.csv``, or from a foreign table by a ``mapping``.
 
-    InputError names file, row and field of an invalid value, or of a duplicate EPC.
+    A native table has the columns epc, x, y, z, facing (may be empty) and optionally sigma. Raises InputError with file, row
+    and field for an invalid value or a duplicate EPC.
     """
     if mapping is None:
         cells, _ = read_cells(path, (TAGS,))

@@ -1,4 +1,7 @@
-"""Monitors of a run: a lost track, a failed reader, reads in bursts, and reads that are not as predicted."""
+"""Monitors of the RFID sensor in a run.
+
+They detect a lost track, a failed reader, correlated reads, and reads that contradict the detection models.
+"""
 
 import math
 from collections import deque
@@ -13,50 +16,54 @@ from factors.compiled import compiled
 from factors.rfid.detection import ExpectedReads, TagReadCounts
 from factors.se2 import Array, Integers
 
-DURATION = 5.0  # s of scans that are tested jointly
-KEPT = 60.0  # s
-SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; thresholds at which a suspicion begins and ends
-SCANS = 4  # minimum number
-BLOCK, POSSIBLE = 10.0, 0.01  # s of counting; least probability of a counted read
-INDEPENDENT = 1.5  # largest ratio of variances of independent reads
-PRIOR = 50.0  # variance of independent reads that is believed beforehand
-REMEMBERED = 0.95  # share of what was counted that still counts a block later
+DURATION = 5.0  # s; scans of this time are tested jointly
+KEPT = 60.0  # s; older scans are discarded
+SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; a suspicion begins above the first and ends below the second
+SCANS = 4  # minimum number of scans in a test
+BLOCK, POSSIBLE = 10.0, 0.01  # s, length of a block of time; minimum probability of a read that is counted
+INDEPENDENT = 1.5  # a ratio of variances up to this is treated as 1
+PRIOR = 50.0  # prior sum of the variances of reads, at the ratio 1
+REMEMBERED = 0.95  # weight of the sums of earlier blocks after each block
 NO_TAGS = np.empty(0, dtype=np.int64)
-SILENT = 8.0  # log odds above which silence is attributed to a failure instead of the pose
+SILENT = 8.0  # log odds above which missing reads are attributed to a failure instead of a wrong pose
 
 
 class SilenceMonitor:
-    """Detects that no tag is read where tags should be: the reader or the tags have failed. The misses are then uninformative, and
-    would drive the estimate to an area without tags."""
+    """Detects that no tag is read although reads are expected, because the reader or the tags have failed. Misses are then
+    without information, and would shift the estimate to an area without tags."""
 
     REJECTED = "rfid: no tag read where some should be"
 
     def __init__(self) -> None:
         self._evidence = 0.0
-        self.lasts = False  # whether the last scan was part of such a silence
+        self.lasts = False  # True if the last scan was part of such a failure
 
     def add(self, reads: int, evidence: float) -> bool:
-        """Add a scan with its number of reads and its log-probability at the predicted pose; True in a silence."""
+        """Add a scan: its number of ``reads``, and its log-probability ``evidence`` at the predicted pose. Returns True during
+        a failure."""
         self._evidence = 0.0 if reads else self._evidence + evidence
         self.lasts = self._evidence < -SILENT
         return self.lasts
 
 
 class ScanMonitor:
-    """Detects that scans are much less likely than they would be on a correct track.
+    """Detects that scans are much less likely than expected on a correct track.
 
-    That is only a suspicion, because dead tags and a wrong map have the same effect. The search decides whether there is a
-    better pose.
+    This is only a suspicion, because dead tags and a wrong map have the same effect. A search decides if there is a better
+    pose.
     """
 
     def __init__(self) -> None:
         self._scans: deque[tuple[float, float, float]] = deque()
-        self.suspicious_since: float | None = None  # the time [s] since which scans are unlikely
-        self._usual = 0.0  # mean excess of the negative log-likelihood that was accepted
+        self.suspicious_since: float | None = None  # the time [s] since which scans are unlikely, or None
+        self._usual = 0.0  # mean excess of the negative log-likelihood of scans on an accepted track
 
     def add(self, t: float, surprise: float, variance: float) -> None:
-        """Add a scan: excess of its negative log-likelihood over the expected value, and the variance of that, at the predicted
-        pose. Later scans are discarded."""
+        """Add a scan at ``t`` [s]. Scans after ``t`` are discarded.
+
+        ``surprise``: its negative log-likelihood at the predicted pose minus the expected value. ``variance``: the variance of
+        ``surprise``.
+        """
         while self._scans and self._scans[-1][0] >= t:
             self._scans.pop()
         self._scans.append((t, surprise, variance))
@@ -70,18 +77,20 @@ class ScanMonitor:
             self.suspicious_since = None
 
     def accept(self) -> None:
-        """Accept the track: the model or the map is wrong instead, and scans will remain as unlikely as the last ones."""
+        """End the suspicion, because the track is correct and the model or the map is wrong. Later scans are expected to be as
+        unlikely as the last ones."""
         excess, _, count = self._sums()
         self._usual = excess / max(count, 1)
         self.suspicious_since = None
 
     def clear(self) -> None:
-        """Forget the scans: a new track starts."""
+        """Discard the scans, because a new track starts."""
         self._scans.clear()
         self.suspicious_since = None
 
     def _sums(self) -> tuple[float, float, int]:
-        """Sums of the excesses and of the variances of the last scans, and their number."""
+        """Return the sum of the surprises, the sum of their variances, and the number of the scans of the last DURATION
+        seconds."""
         excess, variance, count = 0.0, 0.0, 0
         for t, surprise, own in reversed(self._scans):
             if t <= self._scans[-1][0] - DURATION:
@@ -90,10 +99,10 @@ class ScanMonitor:
         return excess, variance, count
 
     def _beginning(self) -> float:
-        """The change point, which maximises the total excess after it."""
+        """Return the time [s] at which the suspicion begins. It maximises the sum of the surprises after it."""
         total, most, begin = 0.0, -math.inf, self._scans[-1][0]
         for t, surprise, variance in reversed(self._scans):
-            # scans as likely as expected count against it
+            # one standard deviation is subtracted, so that scans with the expected likelihood reduce the sum
             total += surprise - self._usual - math.sqrt(variance)
             if total > most:
                 most, begin = total, t
@@ -101,29 +110,31 @@ class ScanMonitor:
 
 
 class BurstMonitor:
-    """The number of correlated rounds that inform as much as one independent round.
+    """Estimates the overdispersion of reads: the number of correlated rounds that have the information of one independent
+    round.
 
-    Reads and misses behind a person or a shelf are correlated. The number of reads in a block of time then scatters more about its
-    expectation than independent reads would. The result is the ratio of the two variances (McCullagh and Nelder, "Generalized
-    linear models", 1989, section 4.5), over A antennas and T tags.
+    Reads and misses are correlated, for example behind a person. The number of reads in a block of time then varies more around
+    its expectation than the number of independent reads. The overdispersion is the ratio of the two variances (McCullagh and
+    Nelder, "Generalized linear models", 1989, section 4.5). Arguments are the numbers of antennas and tags.
     """
 
     def __init__(self, antennas: int, tags: int) -> None:
-        # reads minus expected reads and their variance in this block; and the tags with any
+        # for each tag and antenna: reads minus expected reads in this block, and the variance of independent reads
         self._cells = np.zeros((tags, 2, antennas))
-        self._tags = NO_TAGS
-        self._sums = np.full(2, PRIOR)  # of the squares, and of the variances, of all blocks
+        self._tags = NO_TAGS  # tags whose cells are not zero
+        self._sums = np.full(2, PRIOR)  # sums over all blocks: of the squared differences, and of the variances
         self._begun = -math.inf
         self._last = -math.inf
 
     @property
-    def together(self) -> float:
-        """The ratio, 1 where a right model may have it by chance."""
+    def overdispersion(self) -> float:
+        """The ratio of the variances. Small ratios, which occur by chance with a correct model, are replaced by 1."""
         ratio = float(self._sums[0] / self._sums[1])
         return ratio if ratio > INDEPENDENT else 1.0
 
     def add(self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
-        """Add the reads of a scan once; ``counts`` (C,): whether each tag is counted."""
+        """Add a scan, unless a scan of this time or later was added. ``measured``: its reads. ``reads``: observed and expected
+        reads of C tags. ``counts`` (C,): True for tags that are counted."""
         if t <= self._last:
             return
         self._last = t
@@ -135,7 +146,7 @@ class BurstMonitor:
         self._tags = np.union1d(self._tags, reads.tags)
 
     def clear(self) -> None:
-        """Forget this block: the track was wrong."""
+        """Discard the current block, because the track was wrong."""
         _taken(self._cells, self._tags)
         self._tags, self._begun = NO_TAGS, -math.inf
 
@@ -150,7 +161,8 @@ def _count(
     p: Array,
     counts: NDArray[np.bool_],
 ) -> None:
-    """Add to the cells of :class:`BurstMonitor`."""
+    """Add the reads of C ``tags`` by K ``antennas`` to the cells of :class:`BurstMonitor`. ``hits``, ``p`` (K, C): numbers of
+    reads, and probabilities of a read in one of ``rounds`` (K,)."""
     for c in range(len(tags)):
         for k in range(len(antennas)):
             if counts[c] and p[k, c] > POSSIBLE:
@@ -160,7 +172,7 @@ def _count(
 
 @compiled
 def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
-    """The sums of the squares and of the variances in the cells of some tags, which are empty then."""
+    """Return the sums of squared differences and of variances in the ``cells`` of ``tags``, and set these cells to zero."""
     squares = variances = 0.0
     for t in tags:
         for a in range(cells.shape[2]):
@@ -170,21 +182,24 @@ def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
     return squares, variances
 
 
-BAND, BANDS = 1.0, 50  # m of distance, and how many bands; the last one has no end
-FEWEST = 30.0  # least predicted reads of a reported group
-SHOWN = 4  # groups that are named
-DIFFERENT = 0.15  # least relative error of the predicted reads of a doubted model
-TINY = 1e-9  # reads: none of them has no logarithm
-WINDOW = 15.0  # s after which counts have the weight 1 / e
-DOUBTED, TRUSTED = 1e-5, 1e-3  # probability of such counts with a right model at which doubts begin, and end
-MANY, NEARLY_NONE = 12.0, 0.05  # predicted reads of an antenna that may be dead, and the share of these that it reads
-KNOWN = BAND / 4.0  # m: largest standard deviation of the position with which a scan informs the model
+BAND, BANDS = 1.0, 50  # m, width of a band of distance; number of bands, of which the last has no upper end
+FEWEST = 30.0  # minimum number of predicted reads of a group
+SHOWN = 4  # number of groups that a message names
+DIFFERENT = 0.15  # a model is doubted only if the relative error of its predicted reads exceeds this
+TINY = 1e-9  # replaces zero reads in a logarithm
+WINDOW = 15.0  # s; the weight of reads falls to 1/e in this time
+DOUBTED, TRUSTED = 1e-5, 1e-3  # a doubt begins below the first, and ends above the second, p-value of the counts
+# an antenna is dead if at least MANY reads are predicted, and it makes a fraction below NEARLY_NONE of them
+MANY, NEARLY_NONE = 12.0, 0.05
+KNOWN = BAND / 4.0  # m; scans are only counted if the standard deviation of the position is below this
 
 
 @dataclass(frozen=True, eq=False)
 class ReadGroups:
-    """Counts of reads in G groups: bands of distance, then ``antennas``. ``sums`` (3, G): observed reads, predicted ones, and the
-    variance of the former if rounds are independent."""
+    """Counts of reads in G groups: one group for each band of distance, then one for each of the ``antennas``.
+
+    ``sums`` (3, G): observed reads, predicted reads, and the variance of the observed reads if rounds were independent.
+    """
 
     antennas: Sequence[str]
     sums: Array = field(init=False)
@@ -193,21 +208,23 @@ class ReadGroups:
         object.__setattr__(self, "sums", np.zeros((3, BANDS + len(self.antennas))))
 
     def add(self, antennas: Integers, rounds: Integers, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
-        """Add ``reads`` in ``rounds`` (K,) of ``antennas`` (K,); ``counts`` (K, C): which of them are counted."""
+        """Add reads of C tags by K ``antennas`` in ``rounds`` (K,). ``counts`` (K, C): True for reads that are counted."""
         _add(self.sums, antennas, rounds, reads.hits, reads.p, reads.distance, counts)
 
     def large(self, fewest: float = FEWEST) -> Integers:
-        """The groups of at least ``fewest`` predicted reads; antennas only if there are several."""
+        """Return the indices of groups with at least ``fewest`` predicted reads. Antennas are only included if there are
+        several."""
         count = len(self.sums[1]) if len(self.antennas) > 1 else BANDS
         return np.flatnonzero(self.sums[1, :count] >= fewest)
 
     def names(self, groups: Integers) -> list[str]:
-        """The names of groups."""
+        """Return the names of groups by their indices."""
         bands = [f"{b * BAND:g} to {(b + 1) * BAND:g} m" for b in range(BANDS)]
         return [(bands + [f"antenna {name}" for name in self.antennas])[g] for g in groups.tolist()]
 
     def shares(self, groups: Integers) -> str:
-        """Reads over predicted reads of groups, those first that are off by the most standard deviations."""
+        """Return a text with the ratios of observed to predicted reads of groups. Groups with the largest errors, in standard
+        deviations, come first."""
         observed, predicted, variance = self.sums[:, groups]
         worst = np.argsort(-np.abs(observed - predicted) / np.sqrt(variance), kind="stable")[:SHOWN]
         names = self.names(groups[worst])
@@ -215,11 +232,11 @@ class ReadGroups:
 
 
 class ConsistencyMonitor:
-    """Whether reads are as the detection models predict, in a window that forgets.
+    """Tests if recent reads agree with the detection models. ``doubted``: True while they do not.
 
-    The bands of distance and the antennas have a chi-square each, where ``together`` rounds count as one; groups with
-    few predicted reads are merged, far bands with nearer ones: there are the reads if a range is too short. The model is
-    doubted while one of them is beyond chance, and more than :data:`DIFFERENT` of the predicted reads are missing or too many.
+    Observed and predicted reads are compared by bands of distance, and by antennas, with a chi-square test each. Groups with
+    few predicted reads are merged, far bands with nearer ones. The model is doubted if a test fails, and if the errors exceed
+    the fraction :data:`DIFFERENT` of the predicted reads.
     """
 
     def __init__(self, antennas: Sequence[str]) -> None:
@@ -228,9 +245,11 @@ class ConsistencyMonitor:
         self.doubted = False
 
     def add(
-        self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], together: float
+        self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], overdispersion: float
     ) -> None:
-        """Add the reads of a scan once; ``counts`` (K, C): whether each read is counted."""
+        """Add a scan, unless a scan of this time or later was added. ``measured``: its reads. ``reads``: observed and expected
+        reads. ``counts`` (K, C): True for reads that are counted. ``overdispersion``: the number of correlated rounds that
+        count as one."""
         if t <= self._last:
             return
         forgotten = math.exp((self._last - t) / WINDOW)
@@ -238,33 +257,35 @@ class ConsistencyMonitor:
         self._groups.sums[:2] *= forgotten
         self._groups.sums[2] *= forgotten**2
         self._groups.add(measured.antennas, measured.rounds, reads, counts)
-        by_distance, by_antenna = self._chance(slice(0, BANDS), together), self._chance(slice(BANDS, None), together)
-        chance = min(by_distance, by_antenna)
+        groups = slice(0, BANDS), slice(BANDS, None)
+        chance = min(self._chance(group, overdispersion) for group in groups)
         self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
 
-    def _chance(self, groups: slice, together: float) -> float:
-        """The probability of counts that are so far off with a right model; 1 if they are not off by much."""
+    def _chance(self, groups: slice, overdispersion: float) -> float:
+        """Return the p-value of the counts: the probability of such large errors with a correct model. It is 1 for small
+        errors."""
         observed, predicted, variance = _merged(self._groups.sums[:, groups], FEWEST)
         off = observed - predicted
         if np.sum(np.abs(off)) <= DIFFERENT * np.sum(predicted):
             return 1.0
-        # the deviance, whose tail is right for few reads too (McCullagh and Nelder, 1989, section 2.3)
+        # the tail of the deviance is also accurate for few reads (McCullagh and Nelder, 1989, section 2.3)
         deviance = 2.0 * (observed * np.log(np.maximum(observed, TINY) / predicted) - off) * predicted / variance
-        return float(chi_squared.survival(np.sum(deviance) / together, len(off)))
+        return float(chi_squared.survival(np.sum(deviance) / overdispersion, len(off)))
 
     @property
     def shares(self) -> str:
-        """Reads over predicted reads of the groups that are off most."""
+        """A text with the ratios of observed to predicted reads of the groups with the largest errors."""
         groups = self._groups.large()
         return self._groups.shares(groups if len(groups) else self._groups.large(1.0))
 
-    def dead_antennas(self, together: float) -> list[int]:
-        """The antennas that read nothing, or nearly so, although :data:`MANY` independent reads were predicted of each."""
+    def dead_antennas(self, overdispersion: float) -> list[int]:
+        """Return the indices of antennas that read nearly nothing, although :data:`MANY` independent reads were predicted of
+        each."""
         observed, predicted, _ = self._groups.sums[:, BANDS:]
-        return np.flatnonzero((predicted > MANY * together) & (observed < NEARLY_NONE * predicted)).tolist()
+        return np.flatnonzero((predicted > MANY * overdispersion) & (observed < NEARLY_NONE * predicted)).tolist()
 
     def clear(self) -> None:
-        """Forget everything: the track was wrong, or the model changes."""
+        """Discard all counts, because the track was wrong or the model changes."""
         self._groups.sums[:] = 0.0
         self.doubted = False
 
@@ -279,7 +300,8 @@ def _add(
     distance: Array,
     counts: NDArray[np.bool_],
 ) -> None:
-    """Add to the groups of :class:`ReadGroups`."""
+    """Add reads of C tags by K ``antennas`` to the ``sums`` of :class:`ReadGroups`. ``hits``, ``p``, ``distance``, ``counts``
+    (K, C)."""
     for k in range(len(antennas)):
         for c in range(p.shape[1]):
             if counts[k, c]:
@@ -292,8 +314,11 @@ def _add(
 
 @compiled
 def _merged(sums: Array, least: float) -> Array:
-    """Sums (3, G) of groups, each merged with those before it until ``least`` reads are predicted of it; what is left of the first
-    ones goes with the last that was made."""
+    """Merge neighbouring groups until each has ``least`` predicted reads. Returns sums (3, H) of the H merged groups.
+
+    ``sums`` (3, G): as in :class:`ReadGroups`. Merging begins at the last group. First groups that remain with too few
+    predicted reads are merged with the next ones. H is 0 if all groups together have too few.
+    """
     out, count, open_ = np.zeros(sums.shape), 0, 0.0
     for g in range(sums.shape[1] - 1, -1, -1):
         if open_ == 0.0 and sums[1, g] == 0.0:

@@ -1,4 +1,4 @@
-"""The RFID sensor of a run: tag reads and misses, signal strength, and phase."""
+"""The RFID sensor of a run: it turns scans into observations of reads and misses, signal strength, and phase."""
 
 from __future__ import annotations
 
@@ -31,31 +31,34 @@ from factors.rfid.signals import PhaseLikelihood
 from factors.se2 import Array
 from factors.update import Correction
 
-PLACED = 5.0  # m: standard deviation of the position, above which a scan does not inform single tags
-SCAN = 50  # work of a scan, besides that of the tags in reach
-# sentences of events
-DEAD_ANTENNA = "antenna {antenna} reads no tag where it should: it is ignored until it does"
+PLACED = 5.0  # m; with a larger standard deviation of the position, a scan is no evidence on the states of tags
+SCAN = 50  # cost of a scan in units of one RFID tag, besides the tags in range
+# messages of events
+DEAD_ANTENNA = "antenna {antenna} reads no tag although reads are expected: it is ignored until it reads a tag"
 DOUBTED_MODEL = "reads are not as the detection models predict: {shares}"
 SILENT = "no tag is read where some should be"
 
 
 @dataclass(frozen=True)
 class TagObservation:
-    """A likelihood of what was read, of the pose and of those parameters of the detection models that are estimated, which are
-    the one block of ``blocks``. ``found``: how many reads."""
+    """An observation of RFID reads: of reads and misses, of signal strengths, or of phases.
+
+    ``factor``: the likelihood, which depends on the pose and on estimated parameters of the detection models. ``found``: number
+    of reads. ``blocks``: the name of the block of the estimated parameters, or ().
+    """
 
     t: float
     factor: RfidFactor
     found: int
-    here: TagReadCounts | None = None  # reads and misses, relative to the pose at the scan's time
-    rounds: int = 0  # antenna rounds, for reads and misses
+    here: TagReadCounts | None = None  # reads and misses at the pose of the scan's time; None for strength and phase
+    rounds: int = 0  # number of antenna rounds of reads and misses
     blocks: tuple[str, ...] = ()
-    states: TagEvidence | None = None  # evidence on the states of tags
+    states: TagEvidence | None = None  # evidence of the scan on the states of tags
     iterations: ClassVar[int] = ITERATIONS
 
     @property
     def is_judged(self) -> bool:
-        """Whether it is an observation of reads and misses."""
+        """True for an observation of reads and misses."""
         return self.here is not None
 
     @property
@@ -64,13 +67,13 @@ class TagObservation:
 
     @property
     def things(self) -> frozenset[Hashable]:
-        """The tags that were read, by index in the map."""
+        """The indices in the map of the tags that were read."""
         reads = self.factor.reads
         return frozenset(reads.read_tags.tolist()) if isinstance(reads, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
-        """The reads and misses at their own time, with the models of the rig, because a wrong track spoils what is learnt of them;
-        None for strength and phase, whose likelihoods are multimodal."""
+        """Return the reads and misses on the pose at their own time, with the detection models of the rig instead of estimated
+        ones, which a wrong track may have corrupted. Returns None for strength and phase, whose likelihoods are multimodal."""
         likelihood = self.factor.likelihood
         if self.here is None or not isinstance(likelihood, RfidLikelihood):
             return None
@@ -89,9 +92,10 @@ class TagObservation:
         columns: Mapping[str, slice],
         iterations: int = 1,
     ) -> Correction:
-        """The most likely pose and parameters, by Fisher scoring; what else is in the state follows by correlation."""
+        """Correct the pose and the estimated parameters by Fisher scoring. Other components of the state are corrected through
+        their correlation."""
         at, prior = [0, 1, 2], NO_VALUES
-        for name in self.blocks:  # at most one
+        for name in self.blocks:  # there is at most one block
             at, prior = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
         own = np.ascontiguousarray(covariance[np.ix_(at, at)])
         correction = self.factor.correct(pose, own, prior, iterations)
@@ -105,18 +109,19 @@ class TagObservation:
         return self.factor.log_likelihood(poses, *(values[name] for name in self.blocks))
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        """The same with the estimated detection models; their uncertainty is neglected."""
+        """Return the observation on the pose only, with the detection models fixed at the estimates ``values``. Their
+        uncertainty is neglected."""
         if not self.blocks:
             return self
         return replace(self, factor=self.factor.fixed(values[self.blocks[0]]), blocks=())
 
 
 class TagSensor(Sensor):
-    """Scans of RFID tags.
+    """The RFID sensor, bound to a run.
 
-    Each scan gives an observation of reads and misses and one of the signal strengths; once per second the recent phases give
-    another one. Silence of the reader (:class:`.SilenceMonitor`) is not used as evidence. Only reads
-    and misses are used to find a pose, because strength and phase have multimodal likelihoods.
+    Each scan yields an observation of reads and misses, and one of signal strengths. Once per second, the recent phases yield
+    another one. Missing reads by a failure of the reader (:class:`.SilenceMonitor`) are no evidence. A search for the pose only
+    uses reads and misses, because strength and phase have multimodal likelihoods.
     """
 
     modality = "rfid"
@@ -139,8 +144,8 @@ class TagSensor(Sensor):
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
         self._bursts = BurstMonitor(len(self.tags.antennas), len(self.tags.map.names))
         self._consistency = ConsistencyMonitor(self.tags.antennas)
-        self._heard = -math.inf  # last scan that was checked for silence
-        self._confirmed = -math.inf  # time [s] after which a new track is accepted and models are learnt
+        self._heard = -math.inf  # time [s] of the last scan that the silence monitor has processed
+        self._confirmed = -math.inf  # time [s] after which a new track is trusted, so that states and models are learnt
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
         twist = self._wheels.twist(m.t) if "time_offset" in self.constants.names else STANDING
@@ -170,11 +175,13 @@ class TagSensor(Sensor):
                     yield TagObservation(m.t, window, 1)
 
     def _learns(self, t: float) -> bool:
-        """Whether models and states of tags are learnt: not on a track that is suspicious, or that has just been found, or whose
-        motion is unknown."""
+        """True if detection models and states of tags are learnt at ``t`` [s]. They are not learnt on a track that is
+        suspicious, has just begun, or slips."""
         return not self._wheels.is_slipping and self.suspicious_since is None and t >= self._confirmed
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, counts: TagReadCounts) -> TagObservation:
+        """Return the observation of reads and misses. ``moved``: relative to the pose that the observation depends on.
+        ``counts``: relative to the pose at the scan's time."""
         factor = RfidFactor(self.tags.likelihood, moved, self.constants.indices)
         return TagObservation(m.t, factor, int(counts.hits.sum()), counts, len(m.antennas), self._blocks)
 
@@ -194,19 +201,21 @@ class TagSensor(Sensor):
         return True
 
     def _count(self, observation: TagObservation, view: View) -> None:
-        """Count reads and misses against what is expected of them, temper by how they go together, and doubt the models."""
+        """Compare reads and misses with their expectation. Adapt the tempering to their correlation, exclude dead antennas, and
+        report models that contradict the reads."""
         assert isinstance(observation.factor.reads, TagReadCounts)
-        t, looks, states = observation.t, observation.factor.reads, self.tags.states
-        reads = self.tags.likelihood.expected(view.pose, looks, self._estimated(view))
+        t, measured, states = observation.t, observation.factor.reads, self.tags.states
+        reads = self.tags.likelihood.expected(view.pose, measured, self._estimated(view))
         surveyed = states.odds[reads.tags] <= 0.0
-        self._bursts.add(t, looks, reads, surveyed)
-        self.tags.temper(1.0 / self._bursts.together)
+        self._bursts.add(t, measured, reads, surveyed)
+        self.tags.temper(1.0 / self._bursts.overdispersion)
         if np.trace(view.covariance[:2, :2]) < KNOWN**2:
-            # not without those that are believed to have moved: with a wrong model most tags seem to
+            # tags that have probably moved are counted if they were read, because with a wrong model most tags seem to have
+            # moved
             counts = (reads.p > POSSIBLE) & (surveyed | states.were_read(reads.tags))
             overdispersion = 1.0 / self.tags.likelihood.model.tempering
             doubted = self._consistency.doubted
-            self._consistency.add(t, looks, reads, counts, overdispersion)
+            self._consistency.add(t, measured, reads, counts, overdispersion)
             for antenna in self._consistency.dead_antennas(overdispersion):
                 name = self.tags.exclude(antenna)
                 self._diagnostics.event(t, "dead_antenna", DEAD_ANTENNA, antenna=name)
@@ -215,19 +224,21 @@ class TagSensor(Sensor):
                 self._diagnostics.event(t, "doubted_model", DOUBTED_MODEL, shares=self._consistency.shares)
 
     def _values(self, view: View) -> dict[str, Array]:
-        """The parameters (P,) of the detection models that are estimated, by block."""
+        """Return the estimated parameters (P,) of the detection models by the name of their block, or {} if none is
+        estimated."""
         value = view.value(self.name) if self._blocks else None
         return {} if value is None else {self.name: value}
 
     def _estimated(self, view: View) -> Array:
-        """The estimated parameters (Q,) of the likelihood."""
+        """Return all parameters (Q,) of the likelihood, with the current values of those that are estimated."""
         out = self.tags.likelihood.parameters.copy()
         for value in self._values(view).values():
             out[list(self.constants.indices)] = value
         return out
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
-        # a scan without reads that is repeated after going back in time counts once
+        """False if the scan is part of a failure of the reader. ``evidence``: its log-probability at the predicted pose."""
+        # a scan without reads that is processed again after a late measurement counts only once
         if observation.found or observation.t > self._heard:
             lasted = self._silence.lasts
             if self._silence.add(observation.found, evidence) and not lasted:
@@ -240,7 +251,7 @@ class TagSensor(Sensor):
         counts = self.tags.read_counts(m, count=False)
         if counts is None:
             return None
-        observation = self._detection(m, counts, counts)  # with the models of the rig
+        observation = self._detection(m, counts, counts)  # with the detection models of the rig
         return replace(observation, factor=replace(observation.factor, estimated=()), blocks=())
 
     @property
@@ -259,7 +270,7 @@ class TagSensor(Sensor):
         self._monitor.accept()
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
-        """Merge all reads and misses into one factor."""
+        """Merge all reads and misses on one pose into one factor of a graph. Strengths and phases remain separate."""
         counts: list[TagReadCounts] = []
         terms: list[Term] = []
         for observation in observations:
@@ -277,8 +288,9 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """The factor without tags that have clearly moved or died. Others have the odds before their scan, so that no scan is
-        weighed by what was learnt from it. Phase, which has local optima centimetres apart, is left out while losses are wide."""
+        """Return the factor without tags that are clearly dead, weak or moved. Other tags have the odds before their scan,
+        because a scan must not be used twice. Returns None for phases while losses are wide (``width`` above 1), because phases
+        have local optima centimetres apart."""
         factor = cast(RfidFactor, factor)
         if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None
@@ -299,7 +311,8 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """The sensor of a run; None where it is not used. InputError if the rig lacks a model that is used."""
+    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength or phase,
+    but the rig has no model of it."""
     settings, sensors = binding.setup.rig.rfid, binding.setup.sensors
     signals = [signal for signal in ("rssi", "phase") if signal in sensors]
     for signal in signals:
@@ -307,6 +320,6 @@ def bind(binding: Binding) -> TagSensor | None:
             raise InputError(f"the rig has no [rfid.{signal}], which the sensor {signal} needs")
     if settings is None or TagSensor.modality not in sensors:
         return None
-    # strength and phase have the mounting of the rig: another one of the reads would contradict them
+    # strength and phase use the mounting of the rig, so reads must not estimate another mounting
     constants = NOTHING if binding.calibration == "none" else settings.estimated(mounting=not signals)
     return TagSensor(binding, constants)

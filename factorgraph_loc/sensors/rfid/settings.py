@@ -1,4 +1,4 @@
-"""Settings of RFID readers, their detection, strength and phase models, and files of detection grids."""
+"""Settings of RFID readers: antennas, models of detection, strength and phase, and files of detection grids."""
 
 from __future__ import annotations
 
@@ -27,83 +27,84 @@ Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
 class PriorSettings(FileModel):
-    """How well a detection model is known, as standard deviations (:mod:`factors.rfid.parameters`); what is above 0 is learnt on
-    the way by every estimator that uses tags."""
+    """Standard deviations of the parameters of a detection model before a run (:mod:`factors.rfid.parameters`). Every estimator
+    that uses tags estimates a parameter if its value is above 0."""
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
-    """standard deviation of the logarithm of a factor of its range"""
+    """standard deviation of the logarithm of the model's range"""
     read_rate: Annotated[float, Field(ge=0.0, le=3.0)] = 1.0
-    """standard deviation of the logit of its largest probability"""
+    """standard deviation of the logit of the model's largest probability"""
 
 
 class RfidUncertainty(FileModel):
-    """Standard deviations of mounting and clock; those above 0 are estimated. Those that are not given are in proportion to the
-    largest `prior.range_scale` of the models: a calibration of these is one of the mounting, too."""
+    """Standard deviations of mounting and clock before a run. A constant is estimated if its value is above 0. Defaults are
+    proportional to the largest `prior.range_scale` of the models, because a calibration of the models also calibrates the
+    mounting."""
 
     yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
-    """standard deviation of the yaw of all antennas in common; by default 0.35 times range_scale"""
+    """standard deviation of a yaw that all antennas share; by default 0.35 times range_scale"""
     antenna_yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
-    """standard deviation of the yaw of each antenna in addition, if there are several; by default 0.25 times range_scale"""
+    """standard deviation of an additional yaw of each of several antennas; by default 0.25 times range_scale"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] | None = None
     """standard deviation of the time offset; by default 0.4 times range_scale"""
 
 
-BY_RANGE = {"yaw": 0.35, "antenna_yaw": 0.25, "time_offset": 0.4}  # rad, rad, s for a `range_scale` of 1
+BY_RANGE = {"yaw": 0.35, "antenna_yaw": 0.25, "time_offset": 0.4}  # rad, rad, s; default values for range_scale = 1
 
 
 class BeamSettings(FileModel):
-    """See :class:`factors.rfid.model.BeamModel`: p0 sigmoid((r_max - r) / s_r) exp(-(phi / sigma_phi)^2 / 2), with distance r and
-    bearing phi."""
+    """A detection model with a beam: the probability of a read at distance r and bearing phi is
+    p0 sigmoid((r_max - r) / s_r) exp(-(phi / sigma_phi)^2 / 2). See :class:`factors.rfid.model.BeamModel`."""
 
     kind: Literal["beam"] = "beam"
-    """beam: falls off with distance and bearing; logistic: in eleven coefficients; grid: a learnt field"""
+    """kind of model: beam falls off with distance and bearing, logistic has eleven coefficients, grid is a learnt field"""
     prior: PriorSettings = Field(default_factory=PriorSettings)
-    """how well the model is known"""
+    """standard deviations of the model's parameters before a run"""
     p0: Annotated[float, Field(ge=1e-6, le=1.0 - 1e-6)] = 0.9
     """beam: largest probability of a read"""
     r_max: Annotated[float, Field(ge=0.01, le=50.0), InUnit("m")] = 4.5
-    """beam: distance at which it has fallen to a half"""
+    """beam: distance at which the probability has fallen to a half"""
     s_r: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("m")] = 0.3
-    """beam: width of that fall"""
+    """beam: length scale of the fall at r_max"""
     sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("rad")] = 0.698
     """beam: width of the beam, as standard deviation of the bearing"""
     behind: Annotated[float, Field(ge=1e-3, le=1.0)] = 1.0
-    """beam: share of reads from behind a tag whose facing is known"""
+    """beam: factor of the probability behind a tag whose facing is known"""
 
     def model(self) -> DetectionModel:
         return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi, self.behind)
 
 
 class LogisticSettings(FileModel):
-    """See :class:`factors.rfid.model.LogisticModel`; ``coefficients`` in the order of ``factors.rfid.model.FEATURES``."""
+    """A detection model by logistic regression. See :class:`factors.rfid.model.LogisticModel`."""
 
     kind: Literal["logistic"] = "logistic"
     prior: PriorSettings = Field(default_factory=PriorSettings)
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=11, max_length=11)]
-    """logistic: of the logit of the probability, by distance, bearing, height and facing"""
+    """logistic: coefficients of the logit of the probability of a read, in the order of factors.rfid.model.FEATURES"""
 
     def model(self) -> DetectionModel:
         return LogisticModel(self.coefficients)
 
 
 class GridSettings(FileModel):
-    """A learnt detection grid."""
+    """A detection model as a learnt grid, which is stored in a file."""
 
     kind: Literal["grid"] = "grid"
     prior: PriorSettings = Field(default_factory=PriorSettings)
     file: str
-    """grid: the name of an .npz in the folder of the rig's file"""
+    """grid: name of an .npz file in the folder of the rig's file"""
     _folder: Path = PrivateAttr(default=Path())
 
     def model(self) -> GridModel:
-        """Read the grid; InputError if the file is invalid."""
+        """Read the grid. Raises InputError if the file is invalid."""
         return read_grid(self.path())
 
     def path(self) -> Path:
         return inside(self._folder, self.file, "grid")
 
     def placed(self, folder: Path) -> GridSettings:
-        """A copy whose file reference is relative to ``folder``, which holds the rig's file."""
+        """Return a copy whose file name is relative to ``folder``, the folder of the rig's file."""
         out = self.model_copy()
         out._folder = folder
         return out
@@ -113,7 +114,7 @@ ModelSettings = Annotated[BeamSettings | LogisticSettings | GridSettings, Field(
 
 
 class AntennaSettings(FileModel):
-    """An antenna on the robot."""
+    """Mounting and detection model of an antenna on the robot."""
 
     x: Offset = 0.0
     """position of the antenna, forward"""
@@ -122,44 +123,45 @@ class AntennaSettings(FileModel):
     z: Offset = 0.0
     """height of the antenna"""
     yaw: Angle = 0.0
-    """direction of its boresight; left is positive"""
+    """direction of the antenna's boresight; left is positive"""
     pitch: Annotated[float, Field(ge=-1.6, le=1.6), InUnit("rad")] = 0.0
-    """elevation of that direction; up is positive"""
+    """elevation of the antenna's boresight; up is positive"""
     model: str = "default"
-    """its detection model, a name in models"""
+    """name of the antenna's detection model in models"""
 
 
 class RssiSettings(FileModel):
-    """See :class:`factors.rfid.signals.RssiModel`; ``coefficients`` in the order of ``factors.rfid.signals.FEATURES``."""
+    """A model of the signal strength of reads. See :class:`factors.rfid.signals.RssiModel`."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
-    """of the RSSI [dBm]: by 1, -10 log10 of the distance, w, w^2, c and c^2, with w = 1 - cosine of the bearing and c the
-    cosine of the facing"""
+    """coefficients of the RSSI [dBm] for the features 1, -10 log10 of the distance, w, w^2, c and c^2; w is 1 minus the cosine
+    of the bearing, c is the cosine of the facing"""
     sigma: Annotated[float, Field(ge=0.01, le=30.0), InUnit("dB")]
-    """scale of the Student noise"""
+    """scale of the Student-t noise"""
     dof: Annotated[float, Field(ge=0.1, le=1000.0)]
-    """degrees of freedom of the Student noise"""
+    """degrees of freedom of the Student-t noise"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.005
     """exponent of the likelihood, below 1 for correlated reads"""
 
     def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
-        """The model for the given antennas."""
+        """Return the model for the given antennas."""
         return RssiModel(antennas, self.coefficients, self.sigma, self.dof, self.tempering)
 
 
 class PhaseSettings(FileModel):
-    """See :class:`factors.rfid.signals.PhaseModel`. Reads in overlapping windows are weighted by ``step`` / ``window``."""
+    """A model of the phase of reads in windows of time. See :class:`factors.rfid.signals.PhaseModel`. Windows may overlap, so
+    reads have the weight ``step`` / ``window``."""
 
     kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
-    """concentration of the phases"""
+    """concentration of the phases (parameter of the von Mises distribution)"""
     tempering: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.05
     """exponent of the likelihood, below 1 for correlated reads"""
     max_range: Annotated[float, Field(ge=0.01, le=50.0), InUnit("m")] = 1.5
-    """largest distance of reads that count"""
+    """largest distance of a tag from the antenna at which its phase is used"""
     min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
-    """smallest number of reads in a window"""
+    """smallest number of reads of a tag by an antenna in a window"""
     window: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 2.0
-    """length of the windows for comparisons of phases of one antenna and tag"""
+    """length of the windows in which phases of one tag and antenna are compared"""
     step: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 1.0
     """time between the beginnings of two windows"""
 
@@ -170,17 +172,17 @@ class PhaseSettings(FileModel):
         return self
 
     def model(self, antennas: tuple[Antenna, ...]) -> PhaseModel:
-        """The model of one window for the given antennas."""
+        """Return the model of the phases in one window for the given antennas."""
         return PhaseModel(
             antennas, self.kappa, self.tempering * self.step / self.window, self.max_range, self.min_reads
         )
 
 
-RACKHAM_RADIUS = 0.25  # m
+RACKHAM_RADIUS = 0.25  # m; distance of the antennas from the centre of the robot
 
 
 def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
-    """Eight antennas around the body at height ``z`` [m], as on the robot of the paper."""
+    """Return eight antennas around the body of a robot at height ``z`` [m]."""
     out = {}
     for i in range(8):
         yaw = se2.wrap_scalar(i * math.pi / 4.0)
@@ -191,19 +193,20 @@ def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
 
 
 def default_models() -> dict[str, BeamSettings | LogisticSettings | GridSettings]:
-    """The default model of uncalibrated antennas."""
+    """Return the default detection model of uncalibrated antennas."""
     return {"default": BeamSettings()}
 
 
 class RfidSettings(SensorSettings):
-    """The RFID reader, with either ``antennas`` or a ``preset`` of them."""
+    """An RFID reader. Its antennas are given either by ``antennas`` or by a ``preset``."""
 
     preset: Literal["rackham"] | None = None
-    """instead of antennas: eight antennas 1 to 8 around the body, 1 to the front, the others counter-clockwise"""
+    """instead of antennas: eight antennas named 1 to 8 around the body, the first to the front, the next ones
+    counter-clockwise"""
     preset_z: Offset = 1.0
     """height of the antennas of the preset"""
     antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
-    """antennas by their names in the reads"""
+    """antennas by the names that the reads give"""
     models: dict[str, ModelSettings] = Field(default_factory=default_models)
     """detection models of antennas by name; the default is a beam"""
     false_read: Share = 1e-3
@@ -215,17 +218,17 @@ class RfidSettings(SensorSettings):
     round_gap: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("s")] = 0.05
     """gap between reads that ends an inventory round, if the log has no rounds"""
     dead_tags: Share = 0.03
-    """prior share of broken, hidden or missing tags of a map"""
+    """prior probability that a tag of the map is broken, hidden or missing"""
     weak_tags: Share = 0.03
-    """prior share of tags that are read much less than the antennas' models say, as on metal"""
+    """prior probability that a tag is read much less than its antenna's model predicts, for example on metal"""
     moved_tags: Share = 0.03
-    """prior share of tags that are half a metre or more from where the map has them"""
+    """prior probability that a tag is half a metre or more from its position in the map"""
     uncertainty: RfidUncertainty = Field(default_factory=RfidUncertainty)
     """standard deviations of the antennas' yaw and of the time offset"""
     rssi: RssiSettings | None = None
-    """model of the strength of a read; used by the sensor rssi"""
+    """model of the signal strength of reads, required by the sensor rssi"""
     phase: PhaseSettings | None = None
-    """model of the phase of a read; used by the sensor phase"""
+    """model of the phase of reads, required by the sensor phase"""
 
     @model_validator(mode="after")
     def _is_complete(self) -> RfidSettings:
@@ -242,20 +245,20 @@ class RfidSettings(SensorSettings):
         return self.antennas if self.preset is None else rackham(self.preset_z)
 
     def placed(self, folder: Path) -> RfidSettings:
-        """A copy whose grids are files in ``folder``."""
+        """Return a copy whose grids are files in ``folder``."""
         models = {k: m.placed(folder) if isinstance(m, GridSettings) else m for k, m in self.models.items()}
         return self.model_copy(update={"models": models})
 
     def write_beside(self, folder: Path) -> None:
-        """Write the grids into ``folder``."""
+        """Write the files of detection grids into ``folder``."""
         for model in self.models.values():
             if isinstance(model, GridSettings) and model.path().resolve() != (folder / model.file).resolve():
                 write_grid(model.model(), folder / model.file)
 
     def estimated(self, *, mounting: bool = True) -> Estimated:
-        """The parameters of the likelihood (:mod:`factors.rfid.parameters`) that are not known exactly.
+        """Return the parameters of the likelihood (:mod:`factors.rfid.parameters`) that an estimator estimates.
 
-        ``mounting``: whether the yaw of antennas and the time offset are among them.
+        ``mounting``: if False, the yaw of antennas and the time offset are not estimated.
         """
         used, known, antennas = self.parameter_names(), self.uncertainties(), list(self.all_antennas())
         names = [used[model][i] if model in used else "" for model in self.models for i in range(len(OF_MODEL))]
@@ -267,19 +270,21 @@ class RfidSettings(SensorSettings):
         return Estimated.among(names, np.array(sigmas))
 
     def uncertainties(self) -> dict[str, float]:
-        """The standard deviations of mounting and clock, given or by default."""
+        """Return the standard deviations of mounting and clock, as given or by default."""
         largest = max(self.models[antenna.model].prior.range_scale for antenna in self.all_antennas().values())
         given = self.uncertainty.model_dump(exclude_none=True)
         return {name: share * largest for name, share in BY_RANGE.items()} | given
 
     def parameter_names(self) -> dict[str, tuple[str, ...]]:
-        """The names of the parameters of each model that an antenna has; with the model's name if there are several."""
+        """Return the names of the parameters of each detection model that an antenna uses. If antennas use several models,
+        names have the prefix ``MODEL.``."""
         used = {antenna.model for antenna in self.all_antennas().values()}
         prefixes = {model: "" if len(used) == 1 else f"{model}." for model in self.models if model in used}
         return {model: tuple(prefix + name for name in OF_MODEL) for model, prefix in prefixes.items()}
 
     def model(self) -> RfidModel:
-        """The model of all antennas, in the order of :meth:`all_antennas`. InputError if a grid cannot be read."""
+        """Return the model of all antennas, in the order of :meth:`all_antennas`. Raises InputError if a grid cannot be
+        read."""
         names = list(self.models)
         return RfidModel(
             antennas=tuple(
@@ -293,7 +298,7 @@ class RfidSettings(SensorSettings):
 
 
 class SurveySettings(FileModel):
-    """The transform from the tags' survey frame to the world: a rotation about a point, then a translation."""
+    """The transform from the frame in which tags were surveyed to the world: a rotation about a point, then a translation."""
 
     x: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
     """translation of the map's tags"""
@@ -307,7 +312,7 @@ class SurveySettings(FileModel):
     """centre of the rotation, in the frame of the survey"""
 
     def transform(self) -> Array:
-        """The pose (3,) of the survey's origin in the world."""
+        """Return the pose (3,) of the survey's frame in the world."""
         pivot = np.array((self.about_x, self.about_y))
         turned = se2.transform_from(np.array((0.0, 0.0, self.heading)), pivot)
         origin = pivot + np.array((self.x, self.y)) - turned
@@ -315,13 +320,14 @@ class SurveySettings(FileModel):
 
 
 ARRAYS = ("logits", "origin", "cell", "heights")
-FARTHEST = 1000.0  # m from the antenna
-FINEST = 1e-3  # m; minimum distance of knots
-LARGEST = 20.0  # of a logit; the probability is 0 or 1 to nine digits
+FARTHEST = 1000.0  # m; largest distance of a grid's knots from the antenna
+FINEST = 1e-3  # m; minimum distance between knots
+LARGEST = 20.0  # largest logit of a knot; the probability is then 0 or 1 to nine digits
 
 
 def read_grid(path: str | Path) -> GridModel:
-    """Read a grid; infinite logits are clipped. InputError names what is missing or has a wrong shape."""
+    """Read a detection grid from an .npz file. Infinite logits are clipped. Raises InputError with the array that is missing,
+    or whose shape or values are invalid."""
     arrays = _read_arrays(Path(path))
     logits, origin, heights = arrays["logits"], arrays["origin"], np.atleast_1d(arrays["heights"])
     if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):
@@ -343,7 +349,7 @@ def read_grid(path: str | Path) -> GridModel:
 
 
 def _read_arrays(path: Path) -> dict[str, Array]:
-    """The arrays of a grid by name; the unpacked size that the archive declares is checked first."""
+    """Return the arrays of a grid file by name. The archive's declared unpacked size is checked first."""
     with opened(path, GRID) as file, foreign(path, "is not a file of arrays (.npz)"):
         with zipfile.ZipFile(file) as archive:
             require_size(path, "its size in bytes when unpacked", sum(m.file_size for m in archive.infolist()), GRID)
@@ -355,7 +361,7 @@ def _read_arrays(path: Path) -> dict[str, Array]:
 
 
 def write_grid(grid: GridModel, path: str | Path) -> None:
-    """Write a grid atomically."""
+    """Write a detection grid to an .npz file, atomically."""
     with replacing(Path(path)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,

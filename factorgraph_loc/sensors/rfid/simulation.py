@@ -1,4 +1,4 @@
-"""Simulated reads of tags, on a drive and by an active robot: settings, faults, reads, strength and phase."""
+"""Simulates reads of tags with signal strength, phase and faults, for simulated logs and for active localization."""
 
 import math
 from collections.abc import Mapping
@@ -27,21 +27,21 @@ from factors.se2 import Array
 
 
 class SimulatedPhaseSettings(FileModel):
-    """Phase of reads."""
+    """Settings of simulated phases of reads."""
 
     frequency: Annotated[float, Field(ge=3e8, le=6e9), InUnit("Hz")] = 920.625e6
     """frequency of the carrier"""
     sigma: Annotated[float, Field(ge=0.0, le=3.0), InUnit("rad")] = 0.1
-    """noise"""
+    """standard deviation of the phase noise"""
     flips: Share = 0.2
-    """share of reads that are off by pi, as with most readers"""
+    """fraction of reads whose phase is off by pi, as with most readers"""
 
 
 class SimulatedRssiSettings(FileModel):
-    """Strength of reads, with Student noise."""
+    """Settings of simulated signal strengths of reads. The noise has a Student-t distribution."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
-    """weights of the features of the strength, as rfid.rssi.coefficients of a rig"""
+    """coefficients of the strength, as rfid.rssi.coefficients of a rig"""
     sigma: Annotated[float, Field(ge=0.0, le=30.0), InUnit("dB")] = 2.0
     """scale of the noise"""
     dof: Annotated[float, Field(ge=0.1, le=100.0)] = 4.0
@@ -49,25 +49,25 @@ class SimulatedRssiSettings(FileModel):
 
 
 class Fading(FileModel):
-    """Persistent misses: each antenna misses each tag for a while."""
+    """Fades: intervals in which an antenna misses a tag. Fades are independent for each antenna and tag."""
 
     duration: Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("s")] = 2.0
-    """mean time for which an antenna misses a tag"""
+    """mean duration of a fade"""
     share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
-    """share of all time for which it does"""
+    """fraction of the time in which an antenna misses a tag by fades"""
 
 
 class AntennaStop(FileModel):
-    """An antenna that reads nothing any more."""
+    """The failure of an antenna, which reads nothing from then on."""
 
     model_config = ConfigDict(coerce_numbers_to_str=True)  # antennas are often named by numbers
 
     antenna: str
     """name of the antenna"""
     time: Duration
-    """time of its failure"""
+    """time of the failure"""
     rounds_go_on: bool = False
-    """whether its rounds go on, without reads, as with a broken cable"""
+    """the antenna still has inventory rounds, but without reads, as with a broken cable"""
 
 
 class ClockJump(FileModel):
@@ -76,30 +76,30 @@ class ClockJump(FileModel):
     time: Duration
     """time of the jump"""
     jump: Annotated[float, Field(ge=-60.0, le=60.0), InUnit("s")]
-    """how much later the reader's timestamps are from then on"""
+    """change of the reader's timestamps after the jump"""
 
 
 class Silence(FileModel):
-    """An interval without reads."""
+    """An interval without reads by any antenna."""
 
     time: Duration
-    """begin of it"""
+    """begin of the interval"""
     duration: Duration
-    """duration of it"""
+    """duration of the interval"""
 
 
 class FaultSettings(FileModel):
-    """Faults of RFID."""
+    """Faults of a simulated RFID reader, its tags and its map."""
 
     fading: Fading = Fading()
     false_reads: Share = 0.0
-    """share of all reads that are of random tags, in addition to the model's false_read"""
+    """fraction of all reads that are of random tags, in addition to the model's false_read"""
     dead: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """share of tags that are never read"""
+    """fraction of tags that are never read"""
     misplaced: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """share of tags that are misplaced in the map"""
+    """fraction of tags that have a wrong position in the map"""
     misplaced_by: Metres = 1.0
-    """how far these are off"""
+    """distance of the wrong positions from the true ones"""
     antenna_stop: AntennaStop | None = None
     clock_jump: ClockJump | None = None
     silence: Silence | None = None
@@ -109,13 +109,14 @@ Hits = NDArray[np.bool_]
 
 
 def read_probabilities(likelihood: RfidLikelihood, poses: Array) -> Array:
-    """Probability (N, A, T), floor included, that a round of each antenna at poses (N, 3) reads each tag."""
+    """Return the probabilities (N, A, T) that one round of each of A antennas at ``poses`` (N, 3) reads each of T tags. They
+    include the probability of false reads."""
     antennas = range(len(likelihood.model.antennas))
     return np.stack([likelihood.probabilities(poses, a) for a in antennas], axis=1)
 
 
 def draw_dead(faults: FaultSettings, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """The tags, of ``count``, that are never read."""
+    """Choose the dead tags among ``count`` tags at random. Returns their indices."""
     return np.asarray(rng.permutation(count)[: round(faults.dead * count)])
 
 
@@ -127,11 +128,12 @@ def draw_reads(
     dead: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> Hits:
-    """Reads (N, A, T) of rounds at ``times`` (N,), with all faults except those of the map and the clock. ``dead``: tags that are
-    never read.
+    """Draw the reads of A antennas and T tags in rounds at ``times`` (N,). Returns a mask (N, A, T) that is True for reads.
 
-    In a fade a tag has false reads only. Outside of fades the probability is raised to preserve the model's overall probability,
-    as far as possible: a rig whose ``miss`` is at least the share of fades allows it.
+    ``probabilities`` (N, A, T): of a read without faults. ``faults``: all except those of the map and the clock are simulated.
+    ``dead``: indices of tags that are never read. In a fade a tag has only false reads. Outside of fades the probability is
+    higher, so that its mean is that of ``probabilities``. This is possible if the rig's ``miss`` is at least the fraction of
+    time in fades.
     """
     shape = probabilities.shape
     share = faults.fading.share
@@ -155,14 +157,17 @@ def draw_reads(
 def rfid_stream(
     names: list[str], epcs: list[str], times: Array, hits: Hits, faults: FaultSettings, signals: Mapping[str, Array]
 ) -> RfidStream:
-    """The stream of reads (N, A, T) of antennas ``names`` (A) and tags ``epcs`` (T). All antennas end a round at ``times`` (N,),
-    which are also the times of the reads. ``signals``: the available columns of rssi, phase and frequency (N, A, T)."""
+    """Return the stream of the reads ``hits`` (N, A, T), a mask, of antennas ``names`` (A) and tags ``epcs`` (T).
+
+    All antennas end a round at each of ``times`` (N,) [s], which are also the times of the reads. ``signals``: values (N, A, T)
+    of rssi, phase and frequency, if they are simulated.
+    """
     listened = np.ones(hits.shape[:2], dtype=bool)
     stop = faults.antenna_stop
     if stop is not None and not stop.rounds_go_on:
         listened[times >= stop.time, names.index(stop.antenna)] = False
     empty = listened & ~hits.any(axis=2)
-    # an additional column for rounds without reads
+    # the last column, without a tag, is for rounds without reads
     n, a, tag = np.nonzero(np.concatenate((hits & listened[:, :, None], empty[:, :, None]), axis=2))
     if (jump := faults.clock_jump) is not None:
         times = times + np.where(times >= jump.time, jump.jump, 0.0)
@@ -182,17 +187,17 @@ def rfid_stream(
 
 
 def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.Generator) -> Hits:
-    """Whether each tag is in a fade for each antenna, (N, A, T): a stationary two-state Markov chain.
+    """Simulate fades at ``times`` (N,). Returns a mask (N, A, T) that is True while a tag is in a fade for an antenna.
 
-    Fades end with the rate 1 / duration and start with the rate that gives the share (Gilbert, Bell System Technical Journal 39,
-    1960).
+    ``shape``: (A, T). Each pair has a stationary Markov chain of two states (Gilbert, Bell System Technical Journal 39, 1960).
+    Fades end with the rate 1 / ``duration``, and begin with the rate that results in the fraction ``share``.
     """
     out = np.empty((len(times), *shape), dtype=bool)
     rate = 1.0 / (fading.duration * (1.0 - fading.share))
     state = rng.random(shape) < fading.share
     for i in range(len(times)):
         if i:
-            # probability that the chain has forgotten its state after dt; then it is in a fade with probability share
+            # with this probability the state is drawn again, independent of the previous one
             forgotten = rng.random(shape) < -np.expm1(-rate * (times[i] - times[i - 1]))
             state = np.where(forgotten, rng.random(shape) < fading.share, state)
         out[i] = state
@@ -200,7 +205,8 @@ def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.
 
 
 def _false(count: int, share: float, shape: tuple[int, ...], rng: np.random.Generator) -> Hits:
-    """Random false reads (N, A, T), whose expected share of all reads is ``share``, given ``count`` others."""
+    """Return random false reads as a mask of this ``shape`` (N, A, T). Their expected fraction of all reads is ``share``, if
+    there are ``count`` true reads."""
     out = np.zeros(shape, dtype=bool)
     size = out.size
     extra = min(rng.poisson(count * share / (1.0 - share)), size)
@@ -216,7 +222,8 @@ def strengths(
     settings: SimulatedRssiSettings,
     rng: np.random.Generator,
 ) -> Array:
-    """RSSI [dBm] (N, A, T) of the reads ``hits`` (N, A, T) at poses (N, 3), NaN elsewhere: :mod:`factors.rfid.signals`."""
+    """Simulate the RSSI (N, A, T) [dBm] of the reads ``hits`` (N, A, T), a mask, at robot ``poses`` (N, 3). It is NaN without a
+    read. The model is that of :mod:`factors.rfid.signals`."""
     n, a, tag = np.nonzero(hits)
     reads = RssiReads(poses[n], a, tag, np.full(len(n), np.nan))
     features = strength_features(rfid.model().antennas, tags, np.zeros(3), reads)
@@ -228,10 +235,10 @@ def strengths(
 def phases(
     rfid: RfidSettings, tags: TagArray, poses: Array, settings: SimulatedPhaseSettings, rng: np.random.Generator
 ) -> Array:
-    """Phase (N, A, T) in [0, 2 pi) of a read of each tag by each antenna at poses (N, 3).
+    """Simulate the phase (N, A, T) in [0, 2 pi) of a read of each tag by each antenna at robot ``poses`` (N, 3).
 
-    ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4) with a random offset for each antenna and tag, noise, and an
-    additional pi for a share of the reads.
+    The phase is ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4), with frequency f, distance d and speed of
+    light c. The offset is random for each antenna and tag. Noise is added, and pi for a fraction of the reads.
     """
     at = np.array([(antenna.x, antenna.y, antenna.z) for antenna in rfid.all_antennas().values()])
     planar = se2.transform_from(poses[:, None], at[None, :, :2])[:, :, None] - tags.points[:, :2]
@@ -245,7 +252,8 @@ def phases(
 
 
 def simulate(ride: Ride) -> Simulated:
-    """The reads of a simulated drive, with all faults."""
+    """Return the reads of a simulated drive with all faults, the surveyed map, and metadata that lists dead and misplaced
+    tags."""
     settings, rfid, rng = ride.settings, ride.rig.of(RfidSettings), ride.rng("reads")
     tags = tag_map(ride.world, ride.rig.of(SurveySettings))
     times = ride.times(settings.rounds_per_second)
@@ -271,19 +279,22 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Rate [Hz] of the simulated rounds; ValueError if rig and faults are inconsistent."""
+    """Return {"tags": the number of simulated chances to read a tag per second}. Raises ValueError if the rig has no RFID
+    reader, or if a fault names an unknown antenna."""
     if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no rfid, expected antennas")
     stop, names = settings.faults.antenna_stop, list(settings.rig.of(RfidSettings).all_antennas())
     if stop is not None and stop.antenna not in names:
-        raise ValueError(f"antenna {quoted(stop.antenna)} stops, expected one of {listed(names)}")
+        raise ValueError(
+            f"faults.antenna_stop names the antenna {quoted(stop.antenna)}, expected one of {listed(names)}"
+        )
     return {"tags": settings.rounds_per_second * len(names) * settings.world.tag_count()}
 
 
 def _surveyed(
     tags: Mapping[str, Tag], faults: FaultSettings, rng: np.random.Generator
 ) -> tuple[dict[str, Tag], list[str]]:
-    """The tags of the surveyed map, and the names of misplaced ones."""
+    """Return the tags as surveyed, some at wrong positions, and the names of the misplaced tags."""
     names = list(tags)
     chosen = sorted(rng.permutation(len(names))[: round(faults.misplaced * len(names))].tolist())
     surveyed = dict(tags)
@@ -295,7 +306,8 @@ def _surveyed(
 
 
 class SimulatedReader:
-    """A :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`: all antennas measure one round at a time."""
+    """A simulated RFID reader on a moving robot, whose antennas have one round each per measurement. It implements
+    :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`."""
 
     channel, decides = "rfid", True
 
@@ -306,7 +318,7 @@ class SimulatedReader:
         self._likelihood = RfidLikelihood(rig.of(RfidSettings).model(), self._map.tags)
 
     def measure(self, t: float, pose: Array) -> RfidScan:
-        """A round that ends at ``t``."""
+        """Simulate one round of all antennas that ends at ``t`` [s], from the robot's ``pose`` (3,)."""
         chance = read_probabilities(self._likelihood, pose[None])[0]
         antenna, tag = np.nonzero(self._rng.random(chance.shape) < chance)
         unknown = np.full(len(tag), np.nan)
@@ -317,7 +329,7 @@ class SimulatedReader:
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
-    """The antennas of a rig; InputError if the settings have faults."""
+    """Return the simulated reader of a rig. Raises InputError if the settings have faults, which are not supported here."""
     if settings.faults != FaultSettings():
         raise InputError(f"{settings.name}: has faults, which active runs do not support")
     return SimulatedReader(world, rig, settings.rounds_per_second, rng)

@@ -1,4 +1,4 @@
-"""Scans of an RFID reader: their tables, stream and validation."""
+"""Scans of an RFID reader: their types, the columns of their files, and the validation of pushed scans."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from factorgraph_loc.text import listed, plain
 from factors.rfid.signals import PhaseReads
 from factors.se2 import Array, Integers
 
-MAX_GAP = 0.1  # s; longest gap of a reference that is interpolated
-PHASE_WINDOW = 2.0  # s
+MAX_GAP = 0.1  # s; longest interpolated gap of a reference
+PHASE_WINDOW = 2.0  # s; length of the windows in which phases are compared
 
 ANTENNA = named("antenna", "the name of an antenna")
 RFID = Table(
@@ -44,7 +44,7 @@ RFID = Table(
         named("epc", "the EPC of a tag"),
         number("rssi", POWER, -200.0, 200.0, "strength of the response, by the reader's own zero", may_lack=True),
         number("phase", ANGLE, -FULL_TURN, FULL_TURN, "phase as the reader reports it", may_lack=True),
-        number("frequency", FREQUENCY, 1e8, 1e10, "of the carrier", may_lack=True),
+        number("frequency", FREQUENCY, 1e8, 1e10, "frequency of the carrier", may_lack=True),
         Column("inventory", "whole", PURE, 1.0, 2.0**53, False, "the row of the round in inventories"),
     ),
     is_scan=True,
@@ -55,9 +55,9 @@ INVENTORIES = Table(
     (STAMP, ANTENNA, number("duration", DURATION, 0.0, 3600.0, "duration of the round, which ends at the timestamp")),
     is_scan=True,
 )
-# the place of an antenna in a scan
+# the index of a read's antenna in a scan
 PLACE = Column("antenna", "whole", PURE, -(2.0**53), 2.0**53, False, "index in antennas")
-# the reads of a stream or scan, grouped in rounds
+# the fields of reads in a stream or scan, whose times are relative to the end of the round
 READS = Table(
     "reads",
     (
@@ -71,11 +71,12 @@ READS = Table(
 
 @dataclass(frozen=True, slots=True)
 class RfidScan:
-    """Inventory rounds of one or several antennas that ended at one time, with R tag reads.
+    """Inventory rounds of A antennas that ended at the time ``t`` [s], with R tag reads.
 
-    ``antennas``: A names of the active antennas; a name may occur twice, for two rounds. A tag of the map without a read was missed
-    by all active antennas. ``antenna`` (R,): index in ``antennas``; ``tags``: R EPCs; ``age`` (R,) [s]: time from the read to
-    ``t``; ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, and ``frequency`` (R,) [Hz] of the carrier: NaN if
+    ``antennas``: the names of the active antennas. A name occurs twice for an antenna with two rounds. All active antennas have
+    missed the tags of the map that were not read.
+    ``antenna`` (R,): index of each read's antenna in ``antennas``. ``tags``: R EPCs. ``age`` (R,): time [s] from the read to
+    ``t``. ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, ``frequency`` (R,) of the carrier [Hz]: NaN if
     unknown.
     """
 
@@ -94,17 +95,17 @@ class RfidScan:
 
     @property
     def count(self) -> int:
-        """Number of rounds."""
+        """The number of rounds."""
         return len(self.antennas)
 
 
 @dataclass(frozen=True)
 class RfidStream(Stream):
-    """One row per read of a tag, and one with an empty EPC for a round without reads.
+    """All reads of a log, one per row. A round without reads has one row with an empty EPC. Rows of one timestamp form a scan.
 
-    ``t`` (N,): end of the inventory round; rows of one timestamp form a scan. ``round`` (N,): number of the round, unique within a
-    timestamp. ``antenna`` and ``epc``: N names; ``age`` (N,) [s]: time from the read to ``t``; ``rssi`` (N,) [dBm], ``phase`` (N,)
-    [rad], ``frequency`` (N,) [Hz]: NaN if unknown.
+    ``t`` (N,): end of the inventory round [s]. ``round`` (N,): number of the round, unique within a timestamp. ``antenna``,
+    ``epc``: N names. ``age`` (N,): time [s] from the read to ``t``. ``rssi`` (N,) [dBm], ``phase`` (N,) [rad], ``frequency``
+    (N,) [Hz]: NaN if unknown.
     """
 
     kind: ClassVar[type[Any]] = RfidScan
@@ -118,7 +119,7 @@ class RfidStream(Stream):
 
     @cached_property
     def number(self) -> Integers:
-        """The number (N,) of each row's round among all R rounds, in order of arrival."""
+        """The number (N,) of each row's round among all R rounds of the log, in order of arrival."""
         scan = np.cumsum(np.diff(self.t, prepend=np.nan) != 0.0).tolist()
         numbers: dict[tuple[int, int], int] = {}
         keys = zip(scan, self.round.tolist(), strict=True)
@@ -126,11 +127,11 @@ class RfidStream(Stream):
 
     @property
     def first_rows(self) -> Integers:
-        """The first row (R,) of each round."""
+        """The index (R,) of the first row of each round."""
         return np.asarray(np.unique(self.number, return_index=True)[1])
 
     def hits(self, tags: Mapping[str, int]) -> NDArray[np.bool_]:
-        """Whether each round read each of T ``tags``, (R, T), which are given by EPC with their columns."""
+        """Return a mask (R, T) that is True if a round read a tag. ``tags``: the column of each of T EPCs."""
         out = np.zeros((len(self.first_rows), len(tags)), dtype=bool)
         columns = np.array([tags.get(epc, -1) for epc in self.epc], dtype=np.int64)
         out[self.number[columns >= 0], columns[columns >= 0]] = True
@@ -159,10 +160,13 @@ class RfidStream(Stream):
 
 @dataclass(frozen=True)
 class RfidRead:
-    """A read of a tag: name of the antenna and EPC; ``t`` [s]: time of the read, None for the end of the round. ``rssi`` [dBm],
-    ``phase`` [rad] as the reader reports it, ``frequency`` [Hz] of the carrier: NaN if unknown. ``round``: index of the round in
-    the list of antennas that are pushed together, or None. In that case the first read of a tag by an antenna belongs to the
-    antenna's first round, the next one to its next round, as a tag responds once per round."""
+    """One read of a tag, as an argument of :func:`scan_of`.
+
+    ``antenna``: the name of the antenna. ``epc``: the EPC of the tag. ``t``: time of the read [s], None for the end of the
+    round. ``rssi`` [dBm], ``phase`` [rad] as the reader reports it, ``frequency`` of the carrier [Hz]: NaN if unknown.
+    ``round``: index of the round in the list of antennas, or None. If it is None, the first read of a tag by an antenna belongs
+    to the antenna's first round, the second read to its second round, because a tag responds once per round.
+    """
 
     antenna: str
     epc: str
@@ -174,8 +178,8 @@ class RfidRead:
 
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
-    """The scan of rounds of ``antennas`` that ended at ``t``; InputError if a read is invalid, or names another antenna or a round
-    of another antenna."""
+    """Return a scan of rounds of ``antennas`` that ended at ``t`` [s]. Raises InputError if a read is invalid, or if its
+    antenna or its round is not in the scan."""
     t = values.seconds_of("RfidScan", t)
     where = f"RfidScan at {t:.3f} s"
     antenna_names = values.names(where, "antennas", values.items_of(where, "antennas", antennas))
@@ -198,8 +202,11 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
 
 
 def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
-    """The round of each read (R,). If a read does not name it: the first round of its antenna without a read of the tag, in order
-    of time, or the last round."""
+    """Return the index (R,) of the round of each read. ``times``: times of the reads [s]. ``names``: the antenna of each round.
+
+    A read without a given round belongs to the first round of its antenna that has no read of the tag yet, in order of time. If
+    all rounds of the antenna have one, it belongs to the last round.
+    """
     own = {name: [k for k, other in enumerate(names) if other == name] for name in names}
     out = np.full(len(reads), -1, dtype=np.int64)
     for i, read in enumerate(reads):
@@ -222,7 +229,8 @@ def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: S
 
 
 def check(m: RfidScan, where: str) -> dict[str, Any]:
-    """The fields of a scan; InputError names the first invalid one."""
+    """Return the validated fields of a scan. Raises InputError with the first invalid field. ``where``: the scan's name in
+    messages."""
     tags, antennas = values.names(where, "tags", m.tags), values.names(where, "antennas", m.antennas)
     antenna = values.integers(where, PLACE, m.antenna, len(tags))
     if np.any((antenna < 0) | (antenna >= len(antennas))):
@@ -236,8 +244,12 @@ def check(m: RfidScan, where: str) -> dict[str, Any]:
 def along_reference(
     log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
 ) -> tuple[RfidStream, Integers, Array, Array, Integers, Integers]:
-    """The reads of known tags by known antennas within the reference: the stream, R row indices, times (R,) [s], poses (R, 3) of
-    the robot, and indices (R,) of antennas and tags. InputError if the log has no reference or no reads."""
+    """Return the R reads of known tags by known antennas within the reference of a log.
+
+    ``tags``, ``antennas``: the index of each EPC and of each antenna name. Returns the stream, the row indices (R,) of the
+    reads, their times (R,) [s], the robot's poses (R, 3), the antenna indices (R,), and the tag indices (R,). Raises InputError
+    if the log has no reference or no reads.
+    """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference trajectory, expected one for calibration")
     stream = log.streams.get("rfid")
@@ -254,8 +266,12 @@ def along_reference(
 def phase_reads(
     log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], window: float = PHASE_WINDOW, first_window: int = 0
 ) -> PhaseReads:
-    """The reads with a phase along the reference, relative to the world's origin, in windows of ``window`` seconds, numbered
-    from ``first_window``. ``tags`` and ``antennas``: indices by name. Raises InputError like :func:`along_reference`."""
+    """Return the reads with a phase along the reference of a log, in windows of ``window`` seconds, numbered from
+    ``first_window``.
+
+    The poses of the reads are in the world frame. ``tags``, ``antennas``: the index of each EPC and of each antenna name.
+    Raises InputError like :func:`along_reference`.
+    """
     stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
     windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)
     reads = PhaseReads(poses, antenna, tag, stream.phase[rows], stream.frequency[rows], windows)

@@ -1,9 +1,9 @@
-"""Summaries of RFID reads: of a log, of what a run can do with them, and of reads against predicted reads.
+"""Summarises RFID reads of a log, and reviews a finished run: warnings, and the reliability of the detection models.
 
-The last is a reliability diagram (DeGroot and Fienberg, "The comparison and evaluation of forecasters", The Statistician 32, 1983)
-of a detection model along the final trajectory, by distance and antenna. Reads and misses of one tag by one antenna follow each
-other with the same reflections and the same obstacles. How much more they scatter than independent ones over some seconds gives the
-variance of all counts (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
+The reliability compares observed with predicted reads along the final trajectory, by distance and antenna (a reliability
+diagram: DeGroot and Fienberg, "The comparison and evaluation of forecasters", The Statistician 32, 1983). Reads of one tag by
+one antenna are correlated, because reflections and obstacles last for seconds. The overdispersion of reads in blocks of time
+accounts for this in the variance of all counts (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
 """
 
 import math
@@ -32,16 +32,19 @@ from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.rfid.parameters import MOST_CERTAIN, rate_of
 from factors.se2 import Array, Integers, wrap_scalar
 
-STOPPED = 10.0  # s; an antenna without rounds for longer before the end has stopped
-CLOCK_STEP = 1.0  # s
-SHOWN = 5  # names in a line or a warning
+STOPPED = 10.0  # s; an antenna whose last round is earlier than this before the end has stopped
+CLOCK_STEP = 1.0  # s; a larger step back of timestamps, or a larger offset to the odometry, causes a warning
+SHOWN = 5  # number of names that a line or a warning lists
 UNKNOWN_ANTENNA = "antenna {antenna} is not on the rig: {reads} reads, {rounds} rounds"
 
 
 @dataclass(frozen=True)
 class AntennaSummary:
-    """An antenna: numbers of reads and rounds, rounds per second, rounds without a read, and timestamps [s] of the last round and
-    read (or None)."""
+    """A summary of one antenna in a log.
+
+    ``reads``, ``rounds``: their numbers. ``rate``: rounds per second. ``silent``: number of rounds without reads. ``last``,
+    ``last_read``: timestamps [s] of the last round and of the last read, which is None without reads.
+    """
 
     reads: int
     rounds: int
@@ -53,8 +56,12 @@ class AntennaSummary:
 
 @dataclass(frozen=True)
 class RfidSummary:
-    """All reads. ``known``: number of tags of the map that are read; ``unread``: tags that are never read; ``unknown``: reads by
-    EPC that the map lacks; ``late``: number of rounds with a timestamp older than one before, and the largest step back [s]."""
+    """A summary of all reads of a log.
+
+    ``known``: number of tags of the map that are read. ``unread``: tags of the map that are never read. ``unknown``: number of
+    reads of each EPC that the map lacks. ``late``: number of rounds with an earlier timestamp than a previous one, and the
+    largest step back [s].
+    """
 
     reads: int
     scans: int
@@ -67,7 +74,7 @@ class RfidSummary:
 
 
 def summarize(log: Log) -> Summary:
-    """``rfid``: a :class:`RfidSummary`, or None if the log lacks the stream."""
+    """Return a summary with warnings. Its entry ``rfid`` is an :class:`RfidSummary`, or None if the log has no reads."""
     summary, in_map = summarize_rfid(log), {"tags": len(log.world.tags)}
     if summary is None:
         return Summary({"rfid": None}, in_map)
@@ -90,7 +97,7 @@ def _paragraph(found: RfidSummary) -> Paragraph:
 
 
 def summarize_rfid(log: Log) -> RfidSummary | None:
-    """Summary of the stream ``rfid``, or None."""
+    """Return a summary of the stream ``rfid``, or None if the log lacks it."""
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
         return None
@@ -126,7 +133,7 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
 
 
 def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
-    """Warnings about the reads."""
+    """Return warnings about tags, antennas and clock of the reads of a log."""
     out = list[Notice]()
     if found.unread:
         sentence = "{unread} of {tags} tags of the map are never read: {names}"
@@ -153,7 +160,7 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
     last = max((antenna.last for antenna in found.antennas.values()), default=0.0)
     for name, antenna in found.antennas.items():
         if antenna.last < last - STOPPED:
-            stops = "antenna {antenna} stops at {t:.1f} s, {before:.1f} s before the others"
+            stops = "antenna {antenna} stops at {t:.1f} s, {before:.1f} s before the last antenna"
             out.append(notice("antenna_stops", stops, name, antenna.last, last - antenna.last))
         elif antenna.last_read is None:
             out.append(notice("silent", "antenna {antenna} reads nothing", name))
@@ -166,7 +173,7 @@ def _clock_trouble(log: Log, found: RfidSummary) -> list[Notice]:
     out = []
     count, step = found.late
     if step > CLOCK_STEP:
-        jump = "{rounds} rounds have stamps up to {step:.1f} s before an earlier one: did the clock of the reader jump?"
+        jump = "{rounds} rounds have timestamps up to {step:.1f} s before an earlier round: did the clock of the reader jump?"
         out.append(notice("late_rounds", jump, count, step))
     odometry = log.streams.get("odometry")
     if odometry is None or not len(odometry.t) or not found.rounds:
@@ -175,27 +182,30 @@ def _clock_trouble(log: Log, found: RfidSummary) -> list[Notice]:
     wheels = odometry.t + log.rig.time_offset("odometry")
     for side, excess in (("before", wheels.min() - t.min()), ("after", t.max() - wheels.max())):
         if excess > CLOCK_STEP:
-            apart = "the reads reach {excess:.1f} s {side} the odometry: do their clocks agree?"
+            apart = "the reads extend {excess:.1f} s {side} the odometry: do the clocks of reader and odometry agree?"
             out.append(notice("clocks_differ", apart, excess, side))
     return out
 
 
-CLEARLY = 3.0  # standard deviations
-CHANGED = 0.1  # of a range or of a probability: less is nothing to warn of
-TURNED, LATE = math.radians(3.0), 0.05  # rad, s: likewise of the yaw of an antenna, and of a time offset
+CLEARLY = 3.0  # standard deviations; a smaller change of a parameter causes no warning
+CHANGED = 0.1  # minimum change of a range (relative) or of a probability that causes a warning
+TURNED, LATE = math.radians(3.0), 0.05  # rad, s; minimum change of a yaw and of a time offset that causes a warning
 
 
 def review(use: Use, ending: Ending) -> Review:
-    """The warnings of a run, and the reliability of the detection models along its final trajectory."""
+    """Return the warnings about a finished run, and the reliability of the detection models along its final trajectory."""
     models = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
     return Review((*doubts(use, ending.diagnostics, ending.learnt), *models.warnings), models.reliability)
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
-    """That an estimator takes no tags, that no tag of a map is read, which are believed dead or moved at the end, the surest first,
-    and how the antennas differ from the rig's models."""
+    """Yield warnings about a finished run.
+
+    They state that the estimator does not use RFID, that no tag of the map is read, which tags are probably dead, weak or moved
+    (most probable first), and how the estimated models and mountings of the antennas differ from the rig.
+    """
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
-    if rounds and use.estimator != "dead_reckoning":  # obvious from its name
+    if rounds and use.estimator != "dead_reckoning":  # its name says that it uses odometry only
         ignored = "{log}: {estimator} does not use RFID: all {rounds} inventory rounds are ignored"
         yield notice("unused_rfid", ignored, log.name, use.estimator, rounds)
     if "rfid" not in use.sensors:
@@ -205,12 +215,12 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notic
         if tags:
             yield notice("unread_map", "{log}: none of the {tags} tags of the map is read", log.name, len(tags))
         else:
-            yield notice("no_map", "{log}: reads are of no use without a map", log.name)
+            yield notice("no_map", "{log}: reads are not used, because the map has no tags", log.name)
         return
     for kind, why in (
-        ("dead_tags", "are believed dead, as they were not read from where they should have been"),
-        ("weak_tags", "are probably weak, as they were read much less than the antennas' models say"),
-        ("moved_tags", "are believed to have moved, as they were read from elsewhere than they should have been"),
+        ("dead_tags", "are probably dead, because they were not read where reads were expected"),
+        ("weak_tags", "are probably weak, because they were read much less than the antennas' models predict"),
+        ("moved_tags", "have probably moved, because they were read from other positions than expected"),
     ):
         if suspects := diagnostics.doubted.get(kind):
             ranked = sorted(suspects.items(), key=lambda row: -row[1])
@@ -223,7 +233,7 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notic
 
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
-    """The learnt parameters of the antennas' models that clearly differ from the rig."""
+    """Yield warnings about estimated parameters of detection models and mountings that clearly differ from the rig."""
     names = settings.parameter_names()
     for name, parameters in names.items():
         peak = min(settings.models[name].model().peak, MOST_CERTAIN)
@@ -236,13 +246,14 @@ def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
             yield notice("range", sentence, of, 100.0 * abs(factor - 1.0), direction)
         share = peak * rate_of(peak, rate[0])
         if abs(rate[0]) > CLEARLY * rate[1] and abs(share - peak) > CHANGED:
-            sentence = "{antennas} read {percent:.0f} % of the tags next to them, where the rig says {expected:.0f} %"
+            sentence = "{antennas} read nearby tags in {percent:.0f} % of the rounds, but the rig's models predict {expected:.0f} %"
             yield notice("read_rate", sentence, of, 100.0 * share, 100.0 * peak)
     yield from _mounting(settings, learnt)
 
 
 def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
-    """The yaw of antennas and the time offset that were estimated and are clearly not what the rig says, with the lines for it."""
+    """Yield warnings about estimated yaws of antennas and a time offset that clearly differ from the rig, with the settings
+    that correct them."""
     common, turned = learnt.values.get("rfid.yaw", (0.0, 0.0)), dict[str, float]()
     for name in settings.all_antennas():
         own = learnt.values.get(f"rfid.antennas.{name}.yaw", (0.0, 0.0))
@@ -264,15 +275,18 @@ def _percent(probability: float) -> str:
     return "> 99 %" if probability > 0.99 else f"{100.0 * probability:.0f} %"
 
 
-MOST_ROUNDS = 6000  # of a long log so many are looked at, evenly spread
-OFF = 4.0  # standard deviations above which a group that is off is doubted
-TOGETHER = 2.0  # rounds that count as one: larger ratios to `1 / tempering` are reported
+MOST_ROUNDS = 6000  # number of rounds of a long log that are compared, evenly spread
+OFF = 4.0  # standard deviations; a larger difference of observed and predicted reads of a group is reported
+TOGETHER = 2.0  # a warning is given if the overdispersion exceeds this multiple of 1 / tempering
 
 
 @dataclass(frozen=True, eq=False)
-class _Looks:
-    """M rounds of an antenna at a tag that it may have read: probability ``p`` and ``hit`` (M,); ``antenna``, ``tag``, ``block``
-    (M,) of time; ``distance`` (M,) [m]."""
+class _Trials:
+    """M trials: in each, one antenna could read one tag in one round.
+
+    ``p`` (M,): predicted probability of a read. ``hit`` (M,): 1 for a read, otherwise 0. ``antenna``, ``tag`` (M,): indices.
+    ``block`` (M,): number of the block of time. ``distance`` (M,): distance of antenna and tag [m].
+    """
 
     p: Array
     hit: Array
@@ -283,10 +297,11 @@ class _Looks:
 
 
 def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Review:
-    """The reliability of the detection models with what was learnt of them, and warnings.
+    """Compare reads with the detection models, as estimated in a run, along its final trajectory. Returns the reliability and
+    warnings.
 
-    Empty without reads, antennas or covariances. Probably dead tags and times without reads are left out. Tags that
-    seem to have moved count, because many seem to where the model is wrong.
+    The result is empty without reads, antennas or covariances. Tags that are probably dead, and times without reads, are
+    omitted. Tags that seem to have moved are not omitted, because a wrong model has the same effect on many tags.
     """
     log, settings = use.log, use.log.rig.find(RfidSettings)
     stream = log.streams.get("rfid")
@@ -296,14 +311,14 @@ def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Traje
         return Review()
     dead = diagnostics.doubted.get("dead_tags", {})
     kept = [name for name in log.world.tags if name not in dead]
-    looks = _observed(use, stream, settings, learnt, final, kept)
+    trials = _observed(use, stream, settings, learnt, final, kept)
     names = list(settings.all_antennas())
-    return _counted(log.name, looks, names, settings.tempering)
+    return _counted(log.name, trials, names, settings.tempering)
 
 
 def _observed(
     use: Use, stream: RfidStream, settings: RfidSettings, learnt: Learnt, final: Trajectory, kept: list[str]
-) -> _Looks:
+) -> _Trials:
     log, tags = use.log, tag_map(use.log.world, use.log.rig.of(SurveySettings), kept)
     likelihood = RfidLikelihood(settings.model(), tags.tags)
     estimated = settings.estimated()
@@ -323,49 +338,53 @@ def _observed(
     p, distance = kernels.probabilities(likelihood.packed, antenna[used], poses[used], *survey)
     n, tag = np.nonzero(p > POSSIBLE)
     rows = used[n]
-    return _Looks(p[n, tag], hits[rows, tag].astype(float), antenna[rows], tag, block[rows], distance[n, tag])
+    return _Trials(p[n, tag], hits[rows, tag].astype(float), antenna[rows], tag, block[rows], distance[n, tag])
 
 
-def _counted(log: str, looks: _Looks, antennas: list[str], tempering: float) -> Review:
-    """The counts by bands of distance and by antennas, empty if there are too few."""
-    if looks.p.sum() < FEWEST:
+def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -> Review:
+    """Count observed and predicted reads by bands of distance and by antennas. Returns the reliability and warnings. The result
+    is empty if there are too few predicted reads. ``log``: the name of the log."""
+    if trials.p.sum() < FEWEST:
         return Review()
     groups = ReadGroups(antennas)
-    ones = np.ones(len(looks.p), dtype=np.int64)
-    reads = ExpectedReads(looks.tag, looks.hit.astype(np.int64)[:, None], looks.p[:, None], looks.distance[:, None])
-    groups.add(looks.antenna, ones, reads, ones[:, None] > 0)
-    ratio, chosen = _overdispersion(looks, (looks.distance // BAND).astype(np.int64)), groups.large()
+    ones = np.ones(len(trials.p), dtype=np.int64)
+    reads = ExpectedReads(trials.tag, trials.hit.astype(np.int64)[:, None], trials.p[:, None], trials.distance[:, None])
+    groups.add(trials.antenna, ones, reads, ones[:, None] > 0)
+    ratio, chosen = _overdispersion(trials, (trials.distance // BAND).astype(np.int64)), groups.large()
     if not len(chosen):
         return Review()
     observed, predicted, variance = groups.sums[:, chosen]
-    # what the estimators take successive rounds for is no reason to doubt the model either
+    # the tempering of the rig already assumes correlated rounds, so the variance is at least that of the tempering
     sigma = np.sqrt(max(ratio, 1.0 / tempering) * variance)
     off = (np.abs(observed - predicted) > OFF * sigma) & (np.abs(observed / predicted - 1.0) > DIFFERENT)
     doubts = []
     if np.any(off):
         shares = groups.shares(chosen[off])
-        sentence = "{log}: reads over those that the detection models predict, by distance and antenna: {shares}"
+        sentence = (
+            "{log}: the ratio of observed to predicted reads is far from 1 at these distances and antennas: {shares}"
+        )
         doubts.append(notice("detection_model", sentence, log, shares))
     if ratio * tempering > TOGETHER:
         sentence = (
-            "{log}: reads and misses come in bursts, {rounds:.0f} rounds inform as much as one: set rfid.tempering = "
+            "{log}: reads are correlated, {rounds:.0f} rounds have the information of one: set rfid.tempering = "
             "{tempering:.2g} in the rig, which has {present:g}"
         )
         doubts.append(notice("bursts", sentence, log, ratio, 1.0 / ratio, tempering))
     return Review(tuple(doubts), Reliability("reads", groups.names(chosen), observed, predicted, sigma, ratio))
 
 
-def _overdispersion(looks: _Looks, band: Integers) -> float:
-    """:func:`.overdispersion` about the share of the predicted reads that the band has."""
+def _overdispersion(trials: _Trials, band: Integers) -> float:
+    """Return the overdispersion (:func:`.overdispersion`) of trials, after the probabilities are scaled to the observed reads
+    in each band of distance. ``band`` (M,): number of each trial's band."""
     share = np.ones(int(band.max(initial=0)) + 1)
-    predicted, observed = np.bincount(band, looks.p), np.bincount(band, looks.hit)
+    predicted, observed = np.bincount(band, trials.p), np.bincount(band, trials.hit)
     np.divide(observed, predicted, out=share, where=predicted > 0.0)
-    p = np.clip(looks.p * share[band], 0.0, 1.0 - 1e-3)
-    return overdispersion(looks.hit, np.ones(len(p)), p, looks.antenna, looks.tag, looks.block)[0]
+    p = np.clip(trials.p * share[band], 0.0, 1.0 - 1e-3)
+    return overdispersion(trials.hit, np.ones(len(p)), p, trials.antenna, trials.tag, trials.block)[0]
 
 
 def draw(log: Log) -> Marks:
-    """The tags of the map, corrected by the rig's survey transform, and the times of their reads."""
+    """Return what a viewer shows: the tags of the map, after the rig's survey transform, and the times of their reads."""
     known = tag_map(log.world, log.rig.of(SurveySettings))
     stream = log.streams.get("rfid")
     t, names = np.empty(0), tuple[str, ...]()

@@ -1,8 +1,9 @@
-"""The RFID tables of the native format: ``rfid.csv`` with a row per read, and ``inventories.csv`` with a row per round.
+"""Reads and writes the RFID tables of the native format: ``rfid.csv`` with a row per read, ``inventories.csv`` with a row per
+round.
 
-A read belongs to the round of its antenna that contains its timestamp, or to the one that it names. Without the second table
-rounds are derived from the gaps between reads, and rounds without reads are unknown. Misses are as informative as reads, so reads
-must be assigned correctly.
+A read belongs to the round that it names, or to the round of its antenna that contains its timestamp. Without inventories,
+rounds are derived from the gaps between reads, and rounds without reads are unknown. Misses are as informative as reads, so
+each read must be assigned to the correct round.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,13 +20,14 @@ from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
-OUTSIDE = -1
+OUTSIDE = -1  # round of a read that no inventory contains
 
 
 def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Integers:
-    """Round numbers (N,) from 0 of reads at sorted ``t_ns`` (N,) by N antennas.
+    """Return the round numbers (N,), from 0, of reads at sorted times ``t_ns`` (N,) by the antennas ``antenna`` (N).
 
-    A round ends with a read of another antenna, or after ``gap`` seconds without a read. Rounds without reads cannot be detected.
+    A round ends with a read of another antenna, or after ``gap`` seconds without a read. Rounds without reads cannot be
+    detected.
     """
     names = np.asarray(antenna, dtype=str)
     first = np.ones(len(t_ns), dtype=bool)
@@ -36,10 +38,11 @@ def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Inte
 def rounds_from_inventories(
     t_ns: Integers, antenna: Sequence[str], end_ns: Integers, inventory_antenna: Sequence[str], duration_ns: Integers
 ) -> Integers:
-    """Index of the inventory among R for each of N reads, :data:`OUTSIDE` if none of its antenna contains its timestamp.
+    """Return for each of N reads the index of the inventory, among R, of its antenna that contains its timestamp. Without such
+    an inventory the index is :data:`OUTSIDE`.
 
-    An inventory contains the timestamps from ``end_ns - duration_ns`` to ``end_ns``, inclusive; on a border the earlier one is
-    used.
+    An inventory contains the timestamps from ``end_ns - duration_ns`` to ``end_ns``, inclusive. A read on the border of two
+    inventories belongs to the earlier one.
     """
     names, listening = np.asarray(antenna, dtype=str), np.asarray(inventory_antenna, dtype=str)
     out = np.full(len(t_ns), OUTSIDE, dtype=np.int64)
@@ -58,8 +61,8 @@ def rounds_from_inventories(
 
 
 def ends_of(t_ns: Integers, number: Integers, gap: float) -> Integers:
-    """Times (R,) at which R rounds of :func:`rounds_from_gaps` were complete: at the next read of another antenna, or ``gap``
-    seconds after the last read."""
+    """Return the times (R,) [ns] at which R rounds of :func:`rounds_from_gaps` end: at the next read of another antenna, but at
+    most ``gap`` seconds after the last read of the round."""
     last = np.flatnonzero(np.diff(number, append=number[-1:] + 1))
     following = np.append(t_ns, np.iinfo(np.int64).max)[last + 1]
     return np.asarray(np.minimum(t_ns[last] + round(gap * 1e9), following), dtype=np.int64)
@@ -71,9 +74,10 @@ ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 
 @dataclass(frozen=True)
 class ReadsByRound:
-    """N reads in rounds ``number`` (N,) of R.
+    """N reads in R rounds.
 
-    ``columns``: RSSI, phase and frequency, each (N,). ``end_ns`` (R,) and ``antenna`` (R): the rounds in order of arrival.
+    ``t_ns`` (N,), ``epc`` (N), ``number`` (N,): time [ns], EPC and round index of each read. ``columns``: RSSI, phase and
+    frequency, each (N,). ``end_ns`` (R,) and ``antenna`` (R): end [ns] and antenna of each round, in order of arrival.
     """
 
     t_ns: Integers
@@ -84,9 +88,9 @@ class ReadsByRound:
     antenna: list[str]
 
     def stream(self, t0_ns: int) -> RfidStream:
-        """The stream of the reads, in the order of the rounds.
+        """Return the stream of the reads, in the order of the rounds. ``t0_ns``: the absolute time of t = 0 [ns].
 
-        Reads of a round keep their order; a round without reads becomes a row without an EPC.
+        Reads of a round keep their order. A round without reads becomes a row without an EPC.
         """
         silent = np.setdiff1d(np.arange(len(self.end_ns)), self.number)
         rounds = np.concatenate((self.number, silent))
@@ -109,7 +113,7 @@ class ReadsByRound:
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
-    """The stream of reads, in rounds from inventories or from gaps between reads."""
+    """Return the stream of reads of a log, with rounds from inventories or from gaps between reads."""
     settings = reading.rig.find(RfidSettings)
     gap = ROUND_GAP if settings is None else settings.round_gap
     return read_rounds(rows.get("rfid"), rows.get("inventories"), gap, reading.warnings).stream(reading.t0_ns)
@@ -118,9 +122,10 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
 def read_rounds(
     reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[Notice]
 ) -> ReadsByRound:
-    """The reads in their rounds; ``gap`` [s] separates rounds if there are no ``inventories``.
+    """Return the reads in their rounds. Without ``inventories``, a ``gap`` [s] between reads separates rounds.
 
-    InputError names file, row and field of an invalid value; reads outside of every inventory are skipped with a warning.
+    Reads outside of every inventory are skipped with a warning. Raises InputError with file, row and field for an invalid
+    value.
     """
     if inventories is not None:
         return _from_inventories(reads, inventories, warnings)
@@ -136,9 +141,10 @@ def read_rounds(
 
 
 def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[Notice]) -> ReadsByRound:
+    """Assign reads to the rounds of a table of inventories. See :func:`read_rounds`."""
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
-    # a jump of the reader's clock is a fault of the recording: estimators drop the late scans
+    # late inventories are allowed, because a reader's clock may jump; estimators drop the late scans
     checks.arrivals(inventories.path, inventories.rows, end_ns, warnings, max_late_ns=None)
     if reads is None:
         nothing = np.zeros(0)
@@ -168,7 +174,8 @@ def _require_all(inventories: TableRows) -> None:
 
 
 def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
-    """The rounds (N,) that the reads name, as row numbers of the other table, from 1."""
+    """Return the round index (N,) of each read from its column ``inventory``, a row number from 1 of the table of inventories.
+    Raises InputError if the row does not exist, has another antenna, or ends before the read."""
     named = reads.numbers["inventory"]
     with np.errstate(invalid="ignore"):
         bad = ~((named >= 1.0) & (named <= len(end_ns)) & (named == np.floor(named)))
@@ -185,6 +192,7 @@ def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Int
 
 
 def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> ReadsByRound:
+    """Return the selected ``rows`` of a table of reads with their round indices ``number``."""
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in SIGNALS)
@@ -192,7 +200,8 @@ def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers
 
 
 def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
-    """The columns of both tables, in the order of the rounds; a round lasts from its first read to its end."""
+    """Return the columns of both tables, in the order of the rounds. The written duration of a round is the time from its first
+    read to its end."""
     number, first = stream.number, stream.first_rows
     end_ns = checks.absolute(stream.t, writing.t0_ns)
     age_ns = np.rint(stream.age * 1e9).astype(np.int64)

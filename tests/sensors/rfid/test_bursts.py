@@ -19,8 +19,8 @@ def reads(looks, p):
 
 
 def scans(seed, count, stays=0.0, share=0.6):
-    """A monitor after scans of pairs of which a ``share`` is in reach, and is read half of the time. ``stays``: how often a pair
-    does as in the scan before."""
+    """A monitor after scans of pairs of which a ``share`` is in reach, and is read half of the time. ``stays``: how often a
+    pair does as in the scan before."""
     rng = np.random.default_rng(seed)
     monitor = BurstMonitor(ANTENNAS, TAGS)
     hits = rng.random((ANTENNAS, TAGS)) < 0.5
@@ -32,14 +32,14 @@ def scans(seed, count, stays=0.0, share=0.6):
         )
         monitor.add(STEP * i, looks, reads(looks, np.where(reached, 0.5, 1e-3)), ALL)
         if not stays:
-            assert monitor.together == 1.0
+            assert monitor.overdispersion == 1.0
     return monitor
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_independent_reads_stay_independent(seed):
     # some 144 pairs in each block: the ratio has a standard deviation of 0.1 after the first of them, and less later
-    assert scans(seed, 400).together == 1.0
+    assert scans(seed, 400).overdispersion == 1.0
 
 
 @pytest.mark.parametrize("stays", [0.5, 0.8])
@@ -47,7 +47,7 @@ def test_rounds_that_go_together_are_counted_as_fewer(stays):
     # the variance of a sum of 20 rounds of such a chain, over that of independent ones
     n = 20
     expected = 1.0 + 2.0 * sum((1.0 - k / n) * stays**k for k in range(1, n))
-    assert scans(5, 2000, stays).together == pytest.approx(expected, rel=0.1)
+    assert scans(5, 2000, stays).overdispersion == pytest.approx(expected, rel=0.1)
 
 
 def test_scans_that_come_again_count_once():
@@ -56,7 +56,7 @@ def test_scans_that_come_again_count_once():
     again.add(5.0, looks, reads(looks, np.full((1, TAGS), 0.5)), ALL)
     for one in (monitor, again):
         one.add(40.0, looks, reads(looks, np.full((1, TAGS), 0.5)), ALL)
-    assert again.together == monitor.together > 2.0
+    assert again.overdispersion == monitor.overdispersion > 2.0
 
 
 def test_covariances_are_right_although_the_rig_knows_of_no_bursts():

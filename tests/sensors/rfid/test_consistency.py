@@ -150,7 +150,7 @@ def test_a_range_that_is_too_long_shows_at_the_far_end():
     assert share["5 to 6 m"] < 0.6
     assert share["1 to 2 m"] == pytest.approx(1.0, abs=0.15)
     (line,) = warnings
-    assert "by distance and antenna: 5 to 6 m: 0." in str(line)
+    assert "at these distances and antennas: 5 to 6 m: 0." in str(line)
 
 
 def test_a_rate_that_is_too_high_shows_everywhere():

@@ -128,9 +128,9 @@ def test_without_reference_or_reads_it_says_what_is_missing(log: Log) -> None:
         fit_phase([replace(log, reference=None)], SETTINGS)
     with pytest.raises(InputError, match="no RFID reads"):
         fit_phase([replace(log, streams={})], SETTINGS)
-    with pytest.raises(InputError, match="hold 0 reads with a phase"):
+    with pytest.raises(InputError, match="0 reads have a phase"):
         fit_phase([without_signals(log)], SETTINGS)
-    with pytest.raises(InputError, match="hold 0 reads with an RSSI"):
+    with pytest.raises(InputError, match="0 reads have an RSSI"):
         fit_rssi([without_signals(log)], SETTINGS, SURVEY)
 
 

@@ -1,3 +1,3 @@
-"""Calibration of RFID readers and tags from logs with a reference."""
+"""Calibration of RFID readers: survey of the tags, mounting of the antennas, and models of detection, strength and phase."""
 
 __all__ = ["calibrator", "rounds", "signals"]

@@ -1,4 +1,4 @@
-"""The calibrator of RFID, from reads and misses along trajectories, and its picture of the field of the detection models."""
+"""The calibrator of RFID readers, and its plot of the detection models for the report."""
 
 from __future__ import annotations
 
@@ -24,35 +24,36 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
 
-VIEW = 6.0  # m around the antenna
-STEP = 0.1  # m
+VIEW = 6.0  # m; the plot shows this distance around the antenna
+STEP = 0.1  # m; grid spacing of the plot
 
 
 class RfidCalibrator(Calibrator):
-    """The calibrator of RFID."""
+    """Estimates survey, mounting and models of an RFID reader from reads and misses along trajectories."""
 
     section, channel = "rfid", "rfid"
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Survey, mounting and models from logs with reads; with smoothed trajectories no survey."""
+        """Return survey, mounting and models. With smoothed trajectories the survey is not estimated. Raises InputError if the
+        rig has no antennas or a log is too short."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()
         if rig.rfid is None:
             raise InputError(
-                f"{logs[0].name}: its rig has no RFID antennas, expected their mounting in [rfid.antennas]"
+                f"{logs[0].name}: its rig has no RFID antennas, expected the mounting of antennas in [rfid.antennas]"
             )
         if grids is None:
-            raise ValueError("logs with reads of tags need a place for grids")
+            raise ValueError("grids is None, but logs with reads of tags need a path for detection grids")
         if traced[0].constants is not None:
             return relearn_rfid(traced, rig, first, grids)
         known: RfidFit | None = None if like is None else like.details
         return learn_rfid(logs, rig, grids, None if known is None else known.kind)
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
-        """The rig with the first priors of its detection models."""
+        """Return ``rig`` with the priors of the detection models from ``first``. See :meth:`Calibrator.with_priors`."""
         if rig.rfid is None or first.rfid is None:
             return rig
         priors: dict[str, PriorSettings] = {name: model.prior for name, model in first.rfid.models.items()}
@@ -60,11 +61,11 @@ class RfidCalibrator(Calibrator):
         return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
     def is_complete(self, rig: Rig) -> bool:
-        """Whether a detection model was learnt or given, because the default model is uninformative."""
+        """True if the rig has a detection model other than the default, which is too inaccurate."""
         return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
 
     def pictures(self, knowledge: SensorKnowledge) -> Sequence[Part]:
-        """The field around the antenna."""
+        """Return a plot of the probability of a read around the antenna, or () without detection models."""
         if knowledge.details is None:
             return ()
         text = "Probability of a read around the antenna (triangle): observed on the left, the model on the right."
@@ -75,7 +76,8 @@ CALIBRATOR = RfidCalibrator()
 
 
 def field_figure(fit: RfidFit) -> Picture:
-    """Probability of a read around the antenna: observed, and by each model for tags facing towards and away from it."""
+    """Plot the probability of a read around the antenna: as observed, and by each detection model. A model with facing has a
+    plot for tags that face towards, across and away from the antenna."""
     facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in fit.models) else (0.0,)
     figure, axes = grid(len(fit.models), 1 + len(facings), 5.0 * len(fit.models))
     axis = np.arange(-VIEW, VIEW + 1e-9, STEP)
@@ -98,6 +100,8 @@ def field_figure(fit: RfidFit) -> Picture:
 
 
 def _draw(panel: Axes, axis: Array, values: Array) -> QuadMesh:
+    """Draw probabilities ``values`` (N, N) at the grid positions ``axis`` (N,) [m] in x and y, and the antenna at the
+    origin."""
     image = panel.pcolormesh(axis, axis, values.T, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
     panel.plot(0.0, 0.0, ">", color=COLOURS[1], markersize=9)
     panel.set_aspect("equal")

@@ -1,8 +1,8 @@
-"""Detection fields, and the selection of the detection model that predicts held-out reads best.
+"""Fits detection grids, and selects the kind of detection model that predicts held-out reads best.
 
-A field is a grid of logits in an antenna's frame, fitted as a difference to a parametric model: smooth by a penalty on second
-differences (Eilers and Marx, "Flexible smoothing with B-splines and penalties", Statistical Science 11(2), 1996), and zero where
-there are no data. Logits are interpolated as in :mod:`factors.rfid.model`.
+A detection grid has logits of the probability of a read in an antenna's frame. It is fitted as a difference to a parametric
+model. The difference is smooth by a penalty on second differences (Eilers and Marx, "Flexible smoothing with B-splines and
+penalties", Statistical Science 11(2), 1996), and zero without data. Logits are interpolated as in :mod:`factors.rfid.model`.
 """
 
 import math
@@ -22,23 +22,24 @@ from factors.rfid import knots
 from factors.rfid.model import BeamModel, DetectionModel, GridModel, bake, logits
 from factors.se2 import Array
 
-CELL = 0.5  # m
-EXTENT = 6.0  # m
-FACINGS = 5  # knots, if the model uses the facing
-HEIGHT_STEP = 0.5  # m
-PULL = 0.3  # penalty of a knot's difference to the parametric field, in nats
-GRADIENT = 0.01  # nats per logit, at which a field is found
-FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m and cosine; closer pairs are merged
+CELL = 0.5  # m; distance between knots
+EXTENT = 6.0  # m; half the side of a grid
+FACINGS = 5  # number of knots for the facing, if the model uses it
+HEIGHT_STEP = 0.5  # m; distance between knots in height
+PULL = 0.3  # weight of the squared difference of a knot to the parametric model
+GRADIENT = 0.01  # nats per logit; the fit ends at this gradient
+FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m and cosine; pairs that are closer are merged
 SMOOTHNESS = 5.0  # weight of squared second differences of logits
 WORTH = 1e-3  # nats per pair; minimum gain of a more complex model
-MODEL_PAIRS = 40000  # enough for a parametric model
+MODEL_PAIRS = 40000  # number of pairs that is sufficient for a parametric model
 
 
 def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, floor: Floor) -> GridModel:
-    """Fit a grid to pairs, near to the ``parametric`` model; ``smoothness``: weight of squared second differences of logits.
+    """Fit a detection grid to the reads and misses of ``pairs``. Without data it equals the ``parametric`` model.
 
-    The grid has a height axis if the heights of ``pairs`` differ, and a facing axis if the model has one. Along the facing, the
-    difference to the parametric model is constant.
+    ``smoothness``: weight of squared second differences of logits. ``floor``: probabilities of false reads and misses. The grid
+    has an axis for height if the heights of ``pairs`` differ, and one for facing if the parametric model has it. The fitted
+    difference to the parametric model does not depend on the facing.
     """
     base = bake(parametric, EXTENT, CELL, _heights(pairs), FACINGS if parametric.uses_facing else 1)
     shape = (base.logits.shape[0], 1, *base.logits.shape[2:])
@@ -70,7 +71,8 @@ def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, flo
 
 
 def _heights(pairs: TagPairs) -> list[float]:
-    """Evenly spaced heights over nearly all pairs, including zero if it is within; a single one if all are equal."""
+    """Return the knots of a grid in height [m]: evenly spaced multiples of HEIGHT_STEP that cover nearly all ``pairs``, or a
+    single one if their heights are nearly equal."""
     low, high = np.quantile(pairs.points[:, 2], (0.01, 0.99)).tolist()
     if high - low < HEIGHT_STEP:
         return [round(0.5 * (low + high), 3)]
@@ -78,7 +80,8 @@ def _heights(pairs: TagPairs) -> list[float]:
 
 
 def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array:
-    """The matrix (M, knots) from the grid's knots to logits at ``points`` (M, 3) with ``facing`` (M,)."""
+    """Return the interpolation matrix (M, number of knots) from the grid's logits to those at ``points`` (M, 3) with ``facing``
+    (M,)."""
     shape, heights = grid.logits.shape, grid.heights
     axes = [
         knots.linear((points[:, 2] - heights[0]) / (heights[1] - heights[0] if len(heights) > 1 else 1.0), shape[0]),
@@ -95,7 +98,8 @@ def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array
 
 
 def _roughness(shape: Sequence[int]) -> sparse.csc_array:
-    """The sum of squared second differences along each axis, or first differences if an axis has two knots."""
+    """Return the matrix of a quadratic form: the sum of squared second differences along each axis of a grid of this ``shape``.
+    An axis with two knots has first differences."""
     total = sparse.csc_array((int(np.prod(shape)),) * 2)
     for axis, size in enumerate(shape):
         if size < 2:
@@ -110,7 +114,7 @@ def _roughness(shape: Sequence[int]) -> sparse.csc_array:
 
 
 def _merged(pairs: TagPairs) -> TagPairs:
-    """Merge pairs at nearly equal positions at their mean."""
+    """Merge pairs with nearly equal positions and facings into one pair at their mean."""
     rows = np.column_stack((pairs.points, pairs.facing))
     first, cell = cells(rows, FINE)
     hits, count = by_block(np.column_stack((pairs.hits, pairs.count)), cell).T
@@ -120,21 +124,22 @@ def _merged(pairs: TagPairs) -> TagPairs:
 
 @dataclass(frozen=True)
 class Kind:
-    """A model to fit: ``name`` beam, logistic or grid; ``facing``: whether features use the tags' facing; ``own``: one model per
-    antenna."""
+    """A kind of detection model. ``name``: beam, logistic or grid. ``facing``: True if the model depends on the tags' facing.
+    ``own``: True if each antenna has its own model."""
 
     name: str
     facing: bool = False
     own: bool = False
 
     def label(self) -> str:
-        """The text for tables."""
+        """Return the name of the kind in tables."""
         facing = ", with facing" if self.facing else ""
-        return f"{self.name}{facing}, {'one an antenna' if self.own else 'one for all'}"
+        return f"{self.name}{facing}, {'one per antenna' if self.own else 'one for all'}"
 
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
-    """The models, and the model index of each antenna. An antenna without rounds has the common model."""
+    """Fit detection models of a ``kind``. Returns the models, and the index of the model of each antenna. If each antenna has
+    its own model, an antenna without rounds has a model that is fitted to all antennas."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     active = [a for a in range(antennas) if np.any(pairs.antenna == a)]
@@ -145,10 +150,10 @@ def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple
 
 
 def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tuple[Kind, dict[Kind, float]]:
-    """The kind of model that is best by its negative log-likelihood [nats per pair] on held-out folds of ``pairs``, and that of
-    all kinds.
+    """Choose the kind of detection model that predicts held-out reads best. Returns it, and the score of each kind.
 
-    A more complex model must gain :data:`WORTH` over a simpler one. ``facing``: whether the tags' facing is known.
+    The score is the negative log-likelihood [nats per round] on folds of ``pairs`` that are held out. A more complex model must
+    be better than a simpler one by :data:`WORTH`. ``facing``: True if the tags' facing is known.
     """
     kinds = [Kind("beam"), Kind("logistic"), *([Kind("logistic", facing=True)] if facing else [])]
     if antennas > 1:
@@ -162,6 +167,7 @@ def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tup
 
 
 def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
+    """Fit one detection model of a ``kind`` to all ``pairs``."""
     some = pairs.part(np.arange(len(pairs.facing)) % (1 + len(pairs.facing) // MODEL_PAIRS) == 0)
     if kind.name == "beam":
         return fit_model(some, beam(BeamModel()), floor)[0]
@@ -170,7 +176,7 @@ def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
 
 
 def _held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> float:
-    """The negative log-likelihood per pair of each fold with the models of the others."""
+    """Return the negative log-likelihood per round of all folds, each with models that are fitted to the other folds."""
     total = 0.0
     for fold in np.unique(pairs.fold):
         models, which = fit(pairs.part(pairs.fold != fold), kind, floor, antennas)

@@ -1,8 +1,9 @@
-"""RFID settings learnt along trajectories: survey, mounting, detection models, tempering, strength and phase.
+"""Estimates RFID settings along trajectories: survey, mounting, detection models, tempering, and models of strength and phase.
 
-Along references all of these are learnt. Along smoothed trajectories the likelihood of the reads is averaged over possible poses
-(:func:`~factorgraph_loc.sensors.smoothed.possible_poses`). Models keep their kind: a beam is fitted in all its parameters, a
-logistic model in all its coefficients, and a grid in its range and rate. The smoother estimates yaw and clock of the antennas.
+Along references all of these are estimated. Along smoothed trajectories only detection models and tempering are. The likelihood
+of the reads is then averaged over possible poses (:func:`~factorgraph_loc.sensors.smoothed.possible_poses`), and models keep
+their kind. Beams and logistic models are fitted in all parameters, grids only in range and rate. The smoother itself estimates
+yaw and clock.
 """
 
 import hashlib
@@ -56,18 +57,19 @@ from factors.rfid.parameters import OF_MODEL
 from factors.se2 import Array
 
 DEFAULT = "default"
-CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)  # between the days of one installation
-MIN_READS = 100.0  # weighted reads that a model is learnt from
+CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)  # differences between the days of one installation
+MIN_READS = 100.0  # minimum number of weighted reads for the fit of a model
 COEFFICIENT = "coefficient of "
-VAGUE = 0.5  # relative standard error of a parameter that is not determined
-BURSTS = 1.3  # smaller numbers of rounds per independent one do not change the tempering
+VAGUE = 0.5  # a parameter with a larger relative standard error is not determined
+BURSTS = 1.3  # a smaller overdispersion does not change the tempering
 
 
 @dataclass(frozen=True)
 class RfidFit:
-    """The detection models along references.
+    """Fitted detection models and their data.
 
-    ``models``, and ``which`` of them each of the ``antennas`` has; their ``kind``; ``pairs``: the data.
+    ``models``: the models. ``which``: the index of the model of each antenna. ``antennas``: names of the antennas. ``kind``:
+    the kind of all models. ``pairs``: the reads and misses that they are fitted to.
     """
 
     models: tuple[DetectionModel, ...]
@@ -78,10 +80,10 @@ class RfidFit:
 
 
 def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = None) -> SensorKnowledge:
-    """Learn the RFID settings of a rig from ``logs`` with references; ``grids``: path and name prefix of learnt grids.
+    """Estimate the RFID settings of a rig from ``logs`` with references.
 
-    Logs with the same reads count once. With a ``kind``, only models of that kind are fitted. InputError if a log has too few
-    rounds.
+    Of logs with the same reads only one is used. ``grids``: path with name prefix of files for detection grids. ``kind``: the
+    kind of detection model, None to choose the best kind. Raises InputError if a log has too few rounds.
     """
     logs = [log for i, log in enumerate(logs) if recordings(logs)[i] == i]
     settings = rig.of(RfidSettings)
@@ -117,8 +119,11 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
 
 
 def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) -> SensorKnowledge:
-    """The detection models of ``rig``, their priors, the tempering, and yaw and clock of the antennas, from smoothed logs;
-    ``first``: the rig before all turns, about whose values the priors are."""
+    """Estimate detection models, their priors, tempering, and yaw and clock of the antennas, from smoothed logs.
+
+    ``rig``: the rig that the logs were smoothed with. ``first``: the rig before the first repetition of smoothing and
+    calibration. The priors are around its values. ``grids``: path with name prefix of files for detection grids.
+    """
     settings, initial = rig.of(RfidSettings), first.of(RfidSettings)
     floor = floor_of(initial)
     pairs = pairs_of([_possible(trace, settings) for trace in traced], settings, rig.survey)
@@ -127,10 +132,10 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
     for name, labels in settings.parameter_names().items():
         part = pairs.part(np.isin(pairs.antenna, [i for i, model in enumerate(of_antenna) if model == name]))
         if part.hits.sum() < MIN_READS:
-            sentence = "The antennas of model {model} read {reads:.0f} tags, expected {expected:.0f}: it stays."
+            sentence = "The model {model} is unchanged: its antennas have {reads:.0f} reads, expected {expected:.0f}."
             notes.append(notice("few_reads", sentence, quoted(name), part.hits.sum(), MIN_READS))
         elif (fitted := _refitted(part, initial.models[name].model(), name, floor)) is None:
-            sentence = "The logs hardly determine the model {model} of the antennas: it stays."
+            sentence = "The model {model} is unchanged, because the logs hardly determine it."
             notes.append(notice("undetermined_model", sentence, quoted(name)))
         else:
             constants += fitted[1]
@@ -142,15 +147,16 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
     constants.append(FittedConstant("rfid", "tempering", known, tempering, max(error / excess**2, 1e-4)))
     settings, mounting = _mounted(traced, settings, initial)
     changes = {"models": models, "false_read": floor.false_read, "miss": floor.miss, "tempering": tempering}
-    changes["uncertainty"] = RfidUncertainty(**initial.uncertainties())  # not that of the narrower priors of the models
+    # the default uncertainties would shrink with the new priors of the models
+    changes["uncertainty"] = RfidUncertainty(**initial.uncertainties())
     return SensorKnowledge({"rfid": settings.model_copy(update=changes)}, [*constants, *mounting], notes)
 
 
 def _mounted(
     traced: Sequence[Traced], settings: RfidSettings, initial: RfidSettings
 ) -> tuple[RfidSettings, list[FittedConstant]]:
-    """The settings with yaw of the antennas and time offset as the smoother estimated them, if logs determine them, and these
-    constants."""
+    """Return settings with the yaws of the antennas and the time offset that the smoother estimated, and these constants. A
+    constant that the logs do not determine keeps its initial value."""
     known, antennas, constants = initial.uncertainties(), dict(settings.all_antennas()), list[FittedConstant]()
     common = corrections_of("rfid.yaw", traced)
     for name, antenna in antennas.items():
@@ -172,7 +178,8 @@ def _mounted(
 def _mean(
     name: str, corrections: Sequence[tuple[float, float]], initial: float, value: float, prior: float
 ) -> FittedConstant | None:
-    """A constant that is the same in all logs, from the corrections of its ``value``; the initial one if it is not determined."""
+    """Return a constant that is the same in all logs: ``value`` plus the mean of its ``corrections``, each with a standard
+    deviation. It has the ``initial`` value if the logs do not determine it. Returns None without corrections."""
     if not corrections:
         return None
     each, errors = np.array(corrections).T
@@ -184,7 +191,8 @@ def _mean(
 def _refitted(
     pairs: TagPairs, initial: DetectionModel, name: str, floor: Floor
 ) -> tuple[DetectionModel, list[FittedConstant]] | None:
-    """A model of the kind of ``initial`` and its parameters; None if a beam is not determined."""
+    """Fit a detection model of the same kind as ``initial``. Returns the model and its parameters, or None if the data do not
+    determine a beam."""
     family = family_of(initial, pairs)
     model, posterior = fit_model(pairs, family, floor)
     if isinstance(initial, BeamModel) and np.any(posterior.errors > VAGUE * np.abs(posterior.values)):
@@ -198,7 +206,8 @@ def _refitted(
 
 
 def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
-    """The scatter between logs of the range and rate that the smoother estimated, by their ``labels``."""
+    """Return the standard deviations between logs of the range and the rate of a model, from the smoother's estimates.
+    ``labels``: the names of the two parameters."""
     scatters = {}
     for kind, label in zip(OF_MODEL, labels, strict=True):
         if corrections := corrections_of(f"rfid.{label}", traced):
@@ -207,13 +216,14 @@ def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
 
 
 def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
-    """The rounds of a smoothed log, without doubted tags, at poses drawn from the smoothed distribution."""
+    """Return the rounds of a smoothed log, without doubted tags, at poses drawn from the smoothed distribution. Raises
+    InputError if fewer than two tags remain."""
     rounds = rounds_of(trace.log, settings)
     kept = np.array([name not in trace.doubted for name in rounds.names])
     if kept.sum() < 2:
         raise InputError(
-            f"{trace.log.name}: {kept.sum()} of the {len(kept)} tags that were read are not doubted, expected 2 or more to "
-            "learn from without a reference"
+            f"{trace.log.name}: {kept.sum()} of the {len(kept)} tags that were read are where the map has them, expected 2 or "
+            "more for a calibration without a reference"
         )
     assert trace.log.reference is not None
     return replace(
@@ -226,12 +236,14 @@ def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
 
 
 def _bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
-    """:func:`.overdispersion` of pairs with these logits (M,)."""
+    """Return the overdispersion of ``pairs`` with predicted logits (M,), and its standard error. See
+    :func:`.overdispersion`."""
     return overdispersion(pairs.hits, pairs.count, floor.probability(logit), pairs.antenna, pairs.tag, pairs.block)
 
 
 def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """The focus by phases; None if there are too few phases near their tags, or they do not agree better than before."""
+    """Estimate survey and lever arm by phases. Returns None if there are too few phases, or if they do not agree better than
+    before."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:
@@ -240,20 +252,23 @@ def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) 
 
 
 def _priors_of(phase: PhaseFit, survey: SurveySettings) -> dict[str, tuple[float, float]]:
-    """The priors of survey and lever arm that the phases give."""
+    """Return means and standard deviations of changes of survey and lever arm, as estimated by phases, by the names of the
+    changes."""
     shift = (phase.survey.x - survey.x, phase.survey.y - survey.y, phase.survey.heading - survey.heading)
     names = (*SURVEY, "antennas.x", "antennas.y")
     return dict(zip(names, zip((*shift, *phase.lever_arm), phase.sigmas.tolist(), strict=True), strict=True))
 
 
 def floor_of(settings: RfidSettings) -> Floor:
-    """The rig's floor if given, else one that is robust to a few wrong tags and reads."""
+    """Return the rig's probabilities of false reads and misses. If the rig does not set them, return the defaults of
+    :class:`Floor`, which are robust to a few wrong tags and reads."""
     given = settings.model_fields_set & {"false_read", "miss"}
     return Floor(settings.false_read, settings.miss) if given else Floor()
 
 
 def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> SurveySettings:
-    """The survey with its rotation about the centre of the tags, if uncorrected, to separate shift and rotation."""
+    """Return a survey transform whose rotation is about the centre of the tags, so that shift and rotation are uncorrelated. A
+    transform that the rig already has is returned unchanged."""
     if survey != SurveySettings():
         return survey
     places = {name: point for log in rounds for name, point in zip(log.names, log.tags.points[:, :2], strict=True)}
@@ -264,9 +279,10 @@ def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> Surve
 def _with_models(
     settings: RfidSettings, models: Sequence[DetectionModel], which: Sequence[int], grids: Path, floor: Floor
 ) -> RfidSettings:
+    """Return the settings with fitted detection models. ``which``: the index of the model of each antenna."""
     antennas = dict(settings.all_antennas())
     names = [DEFAULT] * len(models)
-    if len(models) > 1:  # a model of a single antenna has the antenna's name
+    if len(models) > 1:  # each model has the name of its antenna
         names = [next((a for a, w in zip(antennas, which, strict=True) if w == i), DEFAULT) for i in range(len(models))]
     antennas = {
         a: s.model_copy(update={"x": round(s.x, 4), "y": round(s.y, 4), "yaw": round(s.yaw, 5), "model": names[w]})
@@ -277,7 +293,7 @@ def _with_models(
             "antennas": antennas,
             "preset": None,
             "models": {name: written(model, name, grids) for name, model in zip(names, models, strict=True)},
-            "uncertainty": RfidUncertainty(),  # in proportion to the priors of the models
+            "uncertainty": RfidUncertainty(),  # defaults, which are proportional to the models' priors
             "false_read": floor.false_read,
             "miss": floor.miss,
         }
@@ -287,8 +303,10 @@ def _with_models(
 def _with_signals(
     logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings, *, focused: bool
 ) -> RfidSettings:
-    """The settings with models for strength, if logs have it, and for phase, if it was focused, as the geometry is too inaccurate
-    otherwise. The rig's sensors determine whether they are used."""
+    """Return the settings with a model of strength if the logs have it, and with a model of phase if ``focused``.
+
+    ``focused``: True if phases have determined the geometry, which is too inaccurate for phases otherwise.
+    """
     changes: dict[str, object] = {}
     try:
         strength = fit_rssi(logs, settings, survey)
@@ -302,7 +320,7 @@ def _with_signals(
 
 
 def written(model: DetectionModel, name: str, grids: Path) -> BeamSettings | LogisticSettings | GridSettings:
-    """The settings of a learnt model; a grid is written to a file with the prefix ``grids``."""
+    """Return the settings of a fitted model. A grid is written to a file whose name has the prefix ``grids``."""
     if isinstance(model, BeamModel):
         values = {field: round(value, 4) for field, value in asdict(model).items()}
         return BeamSettings.bounded(**values, prior=CALIBRATED)
@@ -315,6 +333,6 @@ def written(model: DetectionModel, name: str, grids: Path) -> BeamSettings | Log
 
 
 def _safe(name: str) -> str:
-    """A name that is a valid file name on every system and unique per antenna."""
+    """Convert a name to a file name that is valid on every system. Different names have different results."""
     safe = file_name("".join(c if c.isalnum() or c in "-_" else "-" for c in name))
     return safe if safe == name else f"{safe}-{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"

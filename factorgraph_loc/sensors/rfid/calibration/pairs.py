@@ -1,4 +1,4 @@
-"""Pairs of an active antenna and a tag: position of the tag in the antenna's frame, and number of reads."""
+"""Data for the fit of detection models: pairs of an active antenna and a tag, with position of the tag and number of reads."""
 
 from __future__ import annotations
 
@@ -14,16 +14,21 @@ from factors import se2
 from factors.rfid.model import NEGLIGIBLE_LOGIT, DetectionModel, logits
 from factors.se2 import Array
 
-REACH = 8.0  # m in the plane; the range of a logistic model
-BLOCK = 20.0  # s; reads within a block may be correlated
-BLOCKS = 4  # folds of a single log
+REACH = 8.0  # m; largest distance in the plane of a pair, which is also the range of a logistic model
+BLOCK = 20.0  # s; reads in the same block of time may be correlated
+BLOCKS = 4  # number of folds if there is only one log; otherwise each log is a fold
 
 
 @dataclass(frozen=True, eq=False)
 class TagPairs:
-    """M pairs. ``points`` (M, 3) [m] in the antenna's frame; ``facing`` (M,): cosine of the angle between the tag's facing and the
-    direction to the antenna, 0 if unknown; ``hits`` of ``count`` (M,) rounds; ``antenna`` (M,): index in the rig; ``tag`` (M,):
-    index among all logs; ``fold`` (M,): held out jointly; ``block`` (M,) of time."""
+    """M pairs of an antenna at one pose and a tag.
+
+    ``points`` (M, 3): positions of the tags in the antenna's frame [m].
+    ``facing`` (M,): cosine of the angle between the tag's facing and the direction to the antenna, 0 if unknown.
+    ``hits``, ``count`` (M,): number of rounds that read the tag, and number of rounds.
+    ``antenna``, ``tag`` (M,): index of the antenna in the rig, and of the tag among all logs.
+    ``fold`` (M,): number of the fold for cross-validation. ``block`` (M,): number of the block of time.
+    """
 
     points: Array
     facing: Array
@@ -35,13 +40,14 @@ class TagPairs:
     block: Integers
 
     def part(self, keep: NDArray[np.bool_] | Integers) -> TagPairs:
-        """The selected pairs."""
+        """Return the selected pairs."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """For M pairs: negative log-likelihood, its derivative by the logit, and the Fisher information on the logit."""
+    """The likelihood of M pairs, each field (M,): the negative log-likelihood, its derivative by the logit, and the Fisher
+    information on the logit."""
 
     nll: Array
     gradient: Array
@@ -55,8 +61,11 @@ def pairs_of(
     within: Sequence[Integers] | None = None,
     length: float = BLOCK,
 ) -> TagPairs:
-    """The pairs of several logs within :data:`REACH`, or those of ``within``: flat indices (round, tag) per log. ``length`` of the
-    blocks [s]."""
+    """Return the pairs of several logs.
+
+    ``within``: for each log the flat indices (round, tag) of the pairs, None for all pairs within :data:`REACH`. ``length``:
+    length of the blocks of time [s].
+    """
     numbers = {name: i for i, name in enumerate(dict.fromkeys(name for log in logs for name in log.names))}
     parts = []
     blocks = 0
@@ -77,14 +86,17 @@ def pairs_of(
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
-    """Flat indices (round, tag) of the pairs of a log within :data:`REACH`."""
+    """Return the flat indices (round, tag) of the pairs of a log within :data:`REACH`."""
     every = np.arange(log.hits.size)
     return every[view_of(log, settings, survey, every)[1] < REACH]
 
 
 def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: Integers) -> tuple[Array, Array]:
-    """For the pairs of a log with flat indices ``pairs`` (M,) of round and tag: coordinates (M, 4), the tag's position in the
-    antenna's frame [m] and its facing (:class:`TagPairs`), and the distance (M,) in the plane."""
+    """Return the geometry of the pairs of a log with flat indices ``pairs`` (M,) of round and tag.
+
+    Returns coordinates (M, 4), which are the tag's position in the antenna's frame [m] and its facing as in :class:`TagPairs`,
+    and the distance (M,) of antenna and tag in the plane [m].
+    """
     row, column = np.divmod(pairs, len(log.names))
     transform = survey.transform()
     tag = se2.transform_from(transform, log.tags.points[:, :2])[column]
@@ -105,19 +117,20 @@ def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: 
 
 @dataclass(frozen=True)
 class Floor:
-    """Probabilities of a false read, and of a miss at any position."""
+    """Probabilities that do not depend on the position: of a false read, and of a miss."""
 
     false_read: float = 0.02
     miss: float = 0.02
 
     def probability(self, logit: Array) -> Array:
-        """The probability of a read."""
+        """Return the probability of a read for logits of a detection model."""
         sigmoid = 1.0 / (1.0 + np.exp(-np.maximum(logit, NEGLIGIBLE_LOGIT)))
         return np.asarray(self.false_read + (1.0 - self.false_read - self.miss) * sigmoid)
 
 
 def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
-    """The likelihood of ``hits`` in ``count`` rounds, with a floor for false reads and misses (see :mod:`factors.rfid.model`)."""
+    """Return the likelihood of ``hits`` (M,) in ``count`` (M,) rounds with logits (M,). ``floor``: probabilities of false reads
+    and misses, see :mod:`factors.rfid.model`."""
     q = np.clip(floor.probability(logit), 1e-12, 1.0 - 1e-12)
     by_logit = (q - floor.false_read) * (1.0 - floor.miss - q) / (1.0 - floor.false_read - floor.miss)
     return Terms(
@@ -128,7 +141,7 @@ def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
 
 
 def modelled(models: Sequence[DetectionModel], which: Sequence[int], pairs: TagPairs) -> Array:
-    """Logits (M,): antenna i has the model ``which[i]`` of ``models``."""
+    """Return the logits (M,) of ``pairs`` by detection models. Antenna i has the model ``models[which[i]]``."""
     out = np.empty(len(pairs.facing))
     mine = np.asarray(which)[pairs.antenna]
     for i, model in enumerate(models):

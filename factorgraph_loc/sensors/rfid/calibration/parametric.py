@@ -1,8 +1,7 @@
-"""Survey, mounting and detection model of RFID as one problem of maximal posterior density.
+"""Fits parametric detection models, and estimates survey and mounting together with a model, by maximal posterior density.
 
-The likelihood of reads and misses has a floor (:func:`~factorgraph_loc.sensors.rfid.calibration.pairs.terms`). The logit of a
-detection model is differentiated numerically by its parameters, and positions and facing of the tags by the survey's transform and
-the antennas' mounting.
+The likelihood of reads and misses includes false reads (:func:`~factorgraph_loc.sensors.rfid.calibration.pairs.terms`).
+Derivatives by parameters of a model, by the survey's transform and by the antennas' mounting are numerical.
 """
 
 import itertools
@@ -28,32 +27,37 @@ from factors.rfid.model import FEATURES, NEAR, BeamModel, DetectionModel, GridMo
 from factors.rfid.parameters import MOST_CERTAIN, OF_MODEL, rate_of
 from factors.se2 import Array, Integers
 
-FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)
+FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)  # features that depend on the facing
 EDGE = 5.0  # pseudo-rounds without reads at the maximum range, so that extrapolations do not grow with distance
-VAGUE = 1e3  # standard deviation of the prior of a constant without any
-STEP = 1e-4  # of numerical derivatives
-WINDOW = 10.0  # s; reads in different windows are independent
-MOST_PAIRS = 60000  # per log, for survey and mounting
-BEAM = {"p0": (0.05, 0.999), "r_max": (0.3, 2.0 * REACH), "s_r": (0.05, 5.0), "sigma_phi": (0.1, 9.0)}  # bounds
+VAGUE = 1e3  # standard deviation of a prior without information
+STEP = 1e-4  # step of numerical derivatives
+WINDOW = 10.0  # s; reads in different windows are treated as independent
+MOST_PAIRS = 60000  # largest number of pairs per log in the fit of survey and mounting
+# bounds of the parameters of a beam
+BEAM = {"p0": (0.05, 0.999), "r_max": (0.3, 2.0 * REACH), "s_r": (0.05, 5.0), "sigma_phi": (0.1, 9.0)}
 SURVEY = {"survey.x": 0.1, "survey.y": 0.1, "survey.heading": 0.05}  # m, rad; standard deviations of the priors
-COMMON = {"antennas.x": 0.05, "antennas.y": 0.05, "antennas.yaw": 0.15}  # of changes that all antennas have in common
-APART = 0.7  # times these: changes of each antenna
+# m, rad; standard deviations of the priors of changes that all antennas have in common
+COMMON = {"antennas.x": 0.05, "antennas.y": 0.05, "antennas.yaw": 0.15}
+APART = 0.7  # standard deviations of additional changes of each antenna, as a fraction of COMMON
 NO_FOCUS: Mapping[str, tuple[float, float]] = {}
 
 
 @dataclass(frozen=True)
 class Family:
-    """Detection models: ``built`` of values (P,) of ``parameters``. ``design``: of a linear logit, its derivatives (M, P) at
-    points (M, 3) and facings (M,)."""
+    """A family of detection models with P parameters.
+
+    ``built``: a function that returns the model for values (P,) of the parameters. ``design``: for models whose logit is linear
+    in the parameters, a function that returns its derivatives (M, P) at points (M, 3) and facings (M,).
+    """
 
     parameters: tuple[Parameter, ...]
     built: Callable[[Array], DetectionModel]
     design: Callable[[Array, Array], Array] | None = None
 
     def jacobian(self, values: Array, points: Array, facing: Array) -> Array:
-        """Derivatives (M, P), by the parameters with values ``values`` (P,), of the logit of the read probability.
+        """Return the derivatives (M, P) of the logit of a read by the parameters, at their ``values`` (P,).
 
-        It is that of tags at ``points`` (M, 3) [m] in the antenna's frame. ``facing`` (M,): cosine of the angle between the tag's
+        ``points`` (M, 3): positions of tags in the antenna's frame [m]. ``facing`` (M,): cosine of the angle between the tag's
         facing and the direction to the antenna.
         """
         if self.design is not None:
@@ -65,7 +69,8 @@ class Family:
 
 
 def features(points: Array, facing: Array) -> Array:
-    """The features (M, 11) of :data:`factors.rfid.model.FEATURES`."""
+    """Return the features (M, 11) of :data:`factors.rfid.model.FEATURES` for tags at ``points`` (M, 3) in the antenna's frame,
+    with ``facing`` (M,)."""
     x, y, z = points.T
     r = np.sqrt(x**2 + y**2 + NEAR**2)
     w, c = 1.0 - x / r, facing
@@ -73,7 +78,8 @@ def features(points: Array, facing: Array) -> Array:
 
 
 def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
-    """Logistic models. The prior of a coefficient is standard normal for a feature with unit spread in ``pairs``."""
+    """Return the family of logistic models. Each coefficient has a Gaussian prior with mean 0. Its standard deviation is the
+    reciprocal of the feature's standard deviation in ``pairs``, or very large for the constant."""
     every = _edged(pairs)
     scale = np.std(features(every.points, every.facing), axis=0)
     used = [i for i in range(len(FEATURES)) if i == 0 or (scale[i] > 1e-6 and (with_facing or i not in FACING))]
@@ -89,7 +95,7 @@ def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
 
 
 def beam(start: BeamModel) -> Family:
-    """Beams about ``start``, with its share of reads from behind."""
+    """Return the family of beams, with priors around ``start``. The factor ``behind`` is that of ``start``."""
     parameters = []
     for name, (low, high) in BEAM.items():
         mean = min(max(getattr(start, name), low), high)
@@ -98,7 +104,7 @@ def beam(start: BeamModel) -> Family:
 
 
 def scaled(start: GridModel) -> Family:
-    """Grids with the shape of ``start`` and another range and rate: see :mod:`factors.rfid.parameters`."""
+    """Return the family of grids that differ from ``start`` in range and read rate, see :mod:`factors.rfid.parameters`."""
     peak = min(start.peak, MOST_CERTAIN)
 
     def built(values: Array) -> GridModel:
@@ -112,21 +118,22 @@ def scaled(start: GridModel) -> Family:
 
 
 def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
-    """The models like a given one."""
+    """Return the family of models of the same kind as ``model``."""
     if isinstance(model, BeamModel):
         return beam(model)
     return scaled(model) if isinstance(model, GridModel) else logistic(pairs, with_facing=model.uses_facing)
 
 
 def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionModel, Posterior]:
-    """The model of maximal posterior density for ``pairs``."""
+    """Fit a detection model of a ``family`` to ``pairs``. Returns the model of maximal posterior density, and the posterior."""
     data = _edged(pairs) if family.design else pairs
     design = family.design(data.points, data.facing) if family.design else None
 
     def at(values: Array) -> LikelihoodTerms:
         logit = logits(family.built(values), data.points, data.facing)[0]
         jacobian = family.jacobian(values, data.points, data.facing) if design is None else design
-        return _evidence(logit, jacobian, data, floor, data.tag)  # some tags are stronger than others
+        # reads of a tag are correlated, because tags differ in strength
+        return _evidence(logit, jacobian, data, floor, data.tag)
 
     posterior = maximise(family.parameters, at)
     return family.built(posterior.values), posterior
@@ -135,8 +142,11 @@ def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionM
 def places_of(
     settings: RfidSettings, focus: Mapping[str, tuple[float, float]] = NO_FOCUS
 ) -> tuple[tuple[Parameter, ...], Array]:
-    """The changes of the survey and of each antenna, and the covariance of their priors: antennas have a change in common, and one
-    of their own if there are several. ``focus``: mean and standard deviation of changes of the survey and in common, from phases.
+    """Return the changes of the survey and of each antenna's mounting as parameters, and the covariance of their priors.
+
+    The change of an antenna is the sum of a change that all antennas have in common, and of its own change if there are several
+    antennas. ``focus``: means and standard deviations of changes by name, as estimated by phases, which replace the default
+    priors.
     """
     priors = {name: (0.0, sigma) for name, sigma in (SURVEY | COMMON).items()} | dict(focus)
     antennas = settings.all_antennas()
@@ -154,7 +164,8 @@ def places_of(
 
 
 def kind_of(place: Parameter) -> tuple[str, str]:
-    """The kind of a change of :func:`places_of`, a name in SURVEY or COMMON, and its antenna, or ""."""
+    """Return the kind of a parameter of :func:`places_of`, which is a name in SURVEY or COMMON, and the name of its antenna or
+    ""."""
     what, _, rest = place.name.partition(".")
     antenna, _, name = rest.rpartition(".")
     return f"{what}.{name}", antenna
@@ -169,8 +180,11 @@ def place(
     *,
     with_facing: bool,
 ) -> tuple[RfidSettings, SurveySettings, Posterior]:
-    """Survey and mounting of maximal posterior density, together with a logistic model of all antennas: the changed settings, and
-    the posterior of the changes."""
+    """Estimate survey and mounting together with a logistic model of all antennas, by maximal posterior density.
+
+    Returns the changed settings, the changed survey, and the posterior of the changes. ``focus``: see :func:`places_of`.
+    ``with_facing``: True if the model depends on the tags' facing.
+    """
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]
     places, prior = places_of(settings, focus)
@@ -192,7 +206,8 @@ def place(
                 antenna = kinds[i][1]
                 columns[:, i] = change * (data.antenna == names.index(antenna)) if antenna else change
         jacobian = np.hstack((columns, family.jacobian(values[number:], data.points, data.facing)))
-        return _evidence(logit, jacobian, data, floor, data.tag)  # some tags are stronger than others
+        # reads of a tag are correlated, because tags differ in strength
+        return _evidence(logit, jacobian, data, floor, data.tag)
 
     covariance = np.diag([p.sigma**2 for p in (*places, *family.parameters)])
     covariance[:number, :number] = prior
@@ -204,7 +219,7 @@ def place(
 def moved(
     settings: RfidSettings, survey: SurveySettings, places: Sequence[Parameter], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
-    """The rig's antennas and survey with ``changes`` (P,) of places."""
+    """Return settings and survey with ``changes`` (P,) of the parameters ``places`` added."""
     antennas = dict(settings.all_antennas())
     for place, change in zip(places, changes.tolist(), strict=True):
         antenna, name = kind_of(place)[1], place.name.rpartition(".")[2]
@@ -215,7 +230,7 @@ def moved(
             survey = new
         else:
             antennas[antenna] = new
-    # a preset has no positions that could be changed
+    # a preset cannot have changed positions, so its antennas are listed instead
     return settings.model_copy(update={"antennas": antennas, "preset": None}), survey
 
 
@@ -227,7 +242,8 @@ def pose_share(
     which: Sequence[int],
     floor: Floor,
 ) -> float:
-    """The share of independent information on the pose in the reads of unmerged rounds."""
+    """Return the fraction of the reads' information on the pose that is left after correlations within windows of time are
+    accounted for. ``logs``: unmerged rounds. ``which``: the index of the model of each antenna."""
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within, WINDOW)
     logit, columns = modelled(models, which, pairs), []
@@ -239,7 +255,8 @@ def pose_share(
 
 
 def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, block: Integers) -> LikelihoodTerms:
-    """The likelihood of reads; those of one ``block`` (M,) are correlated."""
+    """Return the likelihood of ``pairs`` with ``logit`` (M,) and its ``jacobian`` (M, P) by parameters. Reads with the same
+    number in ``block`` (M,) are correlated."""
     likelihood = terms(logit, pairs.hits, pairs.count, floor)
     information = jacobian.T @ (likelihood.information[:, None] * jacobian)
     scores = by_block(likelihood.gradient[:, None] * jacobian, block)
@@ -247,7 +264,7 @@ def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, bloc
 
 
 def _edged(pairs: TagPairs) -> TagPairs:
-    """The pairs, and pseudo-rounds without reads around the antenna at the maximum range."""
+    """Return the pairs and additional pseudo-rounds without reads, at the maximum range around the antenna."""
     axes = np.linspace(-np.pi, np.pi, 24, endpoint=False), (-1.0, 0.0, 1.0), np.linspace(-1.0, 1.0, 5)
     bearing, height, facing = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     edge = np.column_stack((REACH * np.cos(bearing), REACH * np.sin(bearing), height))

@@ -1,6 +1,7 @@
-"""Reads and misses of the antennas along the reference.
+"""Data for the calibration of RFID: the rounds of each antenna along the reference of a log, with their reads and misses.
 
-Rounds of an antenna at nearly the same pose are merged into k reads of n rounds, because they are correlated.
+Rounds of an antenna at nearly the same pose are correlated. They are merged into one row with the numbers of reads and of
+rounds.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from factorgraph_loc.text import listed
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
 
-CELL = (0.05, 0.05, 0.05, 1.0)  # m, m, rad, antennas; rounds in one cell are merged
-MOST_ROUNDS = 20.0  # weight limit per pose; otherwise a robot at rest would outweigh its whole drive
+CELL = (0.05, 0.05, 0.05, 1.0)  # m, m, rad, antenna index; rounds in the same cell are merged
+MOST_ROUNDS = 20.0  # largest weight of a pose; otherwise a robot at rest would dominate the data
 MIN_ROUNDS = 100
 
 Integers = NDArray[np.int64]
@@ -30,10 +31,11 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Rounds:
-    """K poses with antenna rounds, and T tags of the map that were read at least once in the log.
+    """K robot poses with rounds of one antenna each, and the T tags of the map that the log reads at least once.
 
-    ``t`` (K,) [s] and ``poses`` (K, 3) of the robot; ``antenna`` (K,): index in the rig; ``count`` (K,): weighted number of
-    inventory rounds; ``hits`` (K, T): number of rounds that read each tag. ``tags``: as surveyed; ``names``: T EPCs.
+    ``log``: the name of the log. ``t`` (K,): times [s]. ``poses`` (K, 3): of the robot. ``antenna`` (K,): index in the rig.
+    ``count`` (K,): weighted number of rounds. ``hits`` (K, T): weighted number of rounds that read each tag.
+    ``tags``: positions and facings as surveyed, without survey transform. ``names``: T EPCs.
     """
 
     log: str
@@ -46,16 +48,16 @@ class Rounds:
     names: tuple[str, ...]
 
     def part(self, keep: NDArray[np.bool_] | Integers) -> Rounds:
-        """The selected poses."""
+        """Return the selected poses with all tags."""
         columns = ("t", "poses", "antenna", "count", "hits")
         return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
 
 def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Rounds:
-    """The rounds of a log within the reference, without unknown EPCs and antennas.
+    """Return the rounds of a log within the reference. Unknown EPCs and antennas are omitted.
 
-    ``merged``: merge rounds at nearly the same pose. The pose is that at the middle of the reads. InputError if there are too few
-    rounds or read tags.
+    ``merged``: True to merge rounds at nearly the same pose. The pose of a round is that at the middle of its reads. Raises
+    InputError if there are too few rounds or too few tags that were read.
     """
     stream = log.streams["rfid"]
     assert isinstance(stream, RfidStream)
@@ -66,8 +68,8 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     antenna = np.array([antennas.get(stream.antenna[i], -1) for i in first], dtype=np.int64)
     if np.all(antenna < 0):
         raise InputError(
-            f"{log.name}: its antennas are {listed(dict.fromkeys(stream.antenna))}, those of the rig {listed(antennas)}: "
-            "give them the same names in [rfid.antennas]"
+            f"{log.name}: the log has the antennas {listed(dict.fromkeys(stream.antenna))}, the rig has {listed(antennas)}: "
+            "use the names of the log in [rfid.antennas]"
         )
     tags = tag_map(log.world, SurveySettings(), set(stream.epc))
     order = np.argsort(t, kind="stable")
@@ -76,8 +78,8 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
     order, poses = order[good], poses[good]
     if len(order) < MIN_ROUNDS or len(tags.names) < 2:
         raise InputError(
-            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas within the reference, where "
-            f"{len(tags.names)} tags of the map were read, expected {MIN_ROUNDS} rounds and 2 tags or more"
+            f"{log.name}: has {len(order)} inventory rounds of the rig's antennas within the reference, and reads of "
+            f"{len(tags.names)} tags of the map, expected at least {MIN_ROUNDS} rounds and 2 tags"
         )
     count, hits = np.ones(len(order)), stream.hits(tags.index)[order].astype(float)
     rounds = Rounds(log.name, t[order], poses, antenna[order], count, hits, tags.tags, tags.names)
@@ -85,7 +87,9 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
 
 
 def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) -> Array:
-    """Time (count,) from the middle of each round to its end; a typical one for rounds without reads."""
+    """Return the time (count,) [s] from the middle of the reads of each round to the end of the round. A round without reads
+    has the median time. ``age`` (N,), ``inverse`` (N,), ``read`` (N,): age [s], round index, and True for a read, of each
+    row."""
     oldest, youngest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(oldest, inverse[read], age[read])
     np.minimum.at(youngest, inverse[read], age[read])
@@ -97,7 +101,8 @@ def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) 
 
 
 def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integers]:
-    """For rows of ``coordinates`` (M, D) in cells of ``sizes`` (D,): the first row in each cell, and the cell of each row."""
+    """Assign rows of ``coordinates`` (M, D) to cells of ``sizes`` (D,). Returns the index of the first row in each cell, and
+    the cell number (M,) of each row."""
     keys = np.floor(coordinates / sizes).astype(np.int64)
     keys -= keys.min(axis=0)
     flat = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1))
@@ -108,11 +113,13 @@ def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integ
 def overdispersion(
     hits: Array, count: Array, p: Array, antenna: Integers, tag: Integers, block: Integers
 ) -> tuple[float, float]:
-    """The number of rounds with the information of an independent one, at least 1, and its standard error: by the scatter of each
-    tag's reads by each antenna in blocks of time, ``hits`` (M,) of ``count`` rounds with the probability ``p``.
+    """Return the overdispersion of reads, at least 1, and its standard error. It is the number of rounds with the information
+    of one independent round.
 
-    Unlike the gradient by the pose, this scatter hardly depends on trajectories that were estimated from the same reads. It is a
-    ratio of variances (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
+    ``hits``, ``count``, ``p`` (M,): reads, rounds, and predicted probability of a read in one round. ``antenna``, ``tag``,
+    ``block`` (M,): indices of antenna, tag and block of time. The overdispersion is the ratio of the variance of the reads of a
+    tag by an antenna in a block to that of independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section
+    4.5). It hardly depends on whether the trajectory was estimated from the same reads.
     """
     first, cell = cells(np.column_stack((block, tag, antenna)), (1.0, 1.0, 1.0))
     excess, variance = np.bincount(cell, hits - count * p), np.bincount(cell, count * p * (1.0 - p))
@@ -124,7 +131,7 @@ def overdispersion(
 
 
 def _merged(rounds: Rounds) -> Rounds:
-    """One round at the mean pose for all of an antenna in a cell of poses."""
+    """Merge the rounds of an antenna in each cell of poses into one row at their mean pose."""
     first, cell = cells(np.column_stack((rounds.poses, rounds.antenna)), CELL)
     size = np.bincount(cell).astype(float)
     weight = np.minimum(1.0, MOST_ROUNDS / size)

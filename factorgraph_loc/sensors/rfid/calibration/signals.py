@@ -1,9 +1,9 @@
-"""Fits of the signals of reads to logs with a reference: of the strength's model, and of the geometry by focusing the phases.
+"""Fits signals of reads to logs with a reference: the model of signal strength, and the geometry by phases.
 
-Along a reference trajectory the phases of one tag's reads within a short window agree after subtracting the phase of the path
-(:mod:`factors.rfid.signals`), if the geometry is right. Their agreement over a log determines the survey's transform and the common
-lever arm of the antennas, as in synthetic aperture radar. The peak is wide enough for a coarse grid search, because errors common
-to a window defocus slowly.
+Phases determine the survey's transform, and a shift that all antennas have in common (lever arm), as in synthetic aperture
+radar. With the correct geometry the phases of one tag's reads within a short window agree, after the phase of the path is
+subtracted (:mod:`factors.rfid.signals`). The estimate maximises this agreement over a log. A coarse grid search finds the
+maximum, because it is wide: errors that are common to a window reduce the agreement only slowly.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from factors.rfid.detection import TagArray
 from factors.rfid.signals import FEATURES, PhaseLikelihood, PhaseModel, PhaseReads, RssiReads, features
 from factors.se2 import Array
 
-ENOUGH_READS = 1000
-SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m; coarse search
-HEADINGS = (-0.05, -0.025, 0.0, 0.025, 0.05)  # rad
-THINNING = 6  # of the windows, in the coarse search
-BLOCKS = 8  # of windows; one is left out in each part of the jackknife
+ENOUGH_READS = 1000  # minimum number of reads with a phase
+SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m; shifts of the survey in the coarse search
+HEADINGS = (-0.05, -0.025, 0.0, 0.025, 0.05)  # rad; rotations of the survey in the coarse search
+THINNING = 6  # the coarse search uses one of so many windows
+BLOCKS = 8  # number of blocks of windows; each part of the jackknife omits one
 
 
 @dataclass(frozen=True)
 class PhaseFit:
-    """``survey``: transform of the survey; ``lever_arm`` (2,): correction of x and y [m] of every antenna; ``sigmas`` (5,):
-    standard deviations of the survey's x, y [m] and heading [rad] and of the lever arm's x, y [m]; ``agreement`` of the phases as
-    mean resultant length (0 to 1), and with the initial values; ``reads``: number of reads used.
+    """The geometry that phases determine.
 
-    The gain in untempered log-likelihood per read is kappa times the growth of the agreement.
+    ``survey``: the transform of the survey. ``lever_arm`` (2,): a correction of x and y [m] of every antenna.
+    ``sigmas`` (5,): standard deviations of the survey's x, y [m] and heading [rad], and of the lever arm's x, y [m].
+    ``agreement``, ``initial_agreement``: agreement of the phases with the result and with the initial values, as mean resultant
+    length (0 to 1). ``reads``: number of reads used.
     """
 
     survey: SurveySettings
@@ -54,10 +55,10 @@ class PhaseFit:
 
 
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
-    """Estimate survey and lever arm by focusing the phases of all ``logs``, in one world; ``survey``: initial value.
+    """Estimate survey and lever arm by the agreement of the phases of all ``logs``, which have the same world.
 
-    Standard deviations are those of the jackknife over blocks of time, which is robust to correlated reads. InputError if a log
-    has no reference, or there are too few reads with a phase near their tags.
+    ``survey``: initial value. Standard deviations are those of a jackknife over blocks of time, which is robust to correlated
+    reads. Raises InputError if a log has no reference, or if there are too few reads with a phase near their tags.
     """
     start = survey or SurveySettings()
     focus = _Focus.of(logs, rfid, start)
@@ -66,8 +67,8 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
     if coarse.count < ENOUGH_READS:
         names = listed(log.name for log in logs)
         expected = f"expected at least {ENOUGH_READS} within {focus.model.max_range:g} m of their tags"
-        raise InputError(f"{names}: hold {coarse.count} reads with a phase, {expected}")
-    # select again, because other reads are near their tags after the coarse search
+        raise InputError(f"{names}: {coarse.count} reads have a phase, {expected}")
+    # select the reads again, because other reads are near their tags after the coarse search
     fine = focus.near(coarse.climb(coarse.coarse(origin)))
     state = fine.climb(coarse.coarse(origin))
     parts = np.array([fine.without(block).climb(state) for block in range(BLOCKS)])
@@ -78,11 +79,12 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
 
 @dataclass(frozen=True)
 class _Focus:
-    """Reads along references, centred at the origin. States (5,): x, y, heading of the survey, lever arm x, y."""
+    """The agreement of phases along references as a function of a state (5,): x, y, heading of the survey, x and y of the lever
+    arm."""
 
     reads: PhaseReads
     model: PhaseModel
-    tags: TagArray  # as surveyed
+    tags: TagArray  # tags as surveyed, without survey transform
     initial: SurveySettings
 
     @classmethod
@@ -106,28 +108,28 @@ class _Focus:
         return self.initial.model_copy(update=dict(zip(("x", "y", "heading"), state[:3].tolist(), strict=True)))
 
     def near(self, state: Array) -> _Focus:
-        """The reads that are near their tags, in windows with enough of them."""
+        """Return the problem with only the reads that are near their tags, in windows with enough reads."""
         return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
 
     def without(self, block: int) -> _Focus:
-        """All but one block of windows."""
+        """Return the problem without the reads of one block of windows."""
         edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
         inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
         return replace(self, reads=self.reads.chosen(~inside))
 
     def agreement(self, state: Array) -> float:
-        """Mean resultant length of the phases (0 to 1)."""
+        """Return the agreement of the phases at a state, as mean resultant length (0 to 1)."""
         return 1.0 + float(self._likelihood(state).log_likelihood(self._pose(state)[None], self.reads)[0]) / self.count
 
     def coarse(self, origin: Array) -> Array:
-        """The best survey on a grid around ``origin``, from some of the windows."""
+        """Return the best state on a grid of surveys around ``origin``, from some of the windows."""
         some = replace(self, reads=self.reads.chosen(self.reads.windows % THINNING == 0))
         states = [origin + np.array((x, y, h, 0.0, 0.0)) for x, y, h in itertools.product(SHIFTS, SHIFTS, HEADINGS)]
         return max(states, key=some.agreement)
 
     def climb(self, state: Array) -> Array:
-        """The local maximum from ``state``."""
-        # steps in metres, with a lever of a few metres for angles, to scale all five states equally
+        """Return the local maximum of the agreement, starting from ``state``."""
+        # scale the heading by a lever of about 3 m, so that all five components have similar effects
         unit = np.array((1.0, 1.0, 0.3, 1.0, 1.0))
         result = scipy.optimize.minimize(
             lambda v: -self.agreement(v * unit), state / unit, options={"eps": 1e-5, "gtol": 1e-4}
@@ -135,7 +137,7 @@ class _Focus:
         return np.asarray(result.x * unit)
 
     def _pose(self, state: Array) -> Array:
-        """The pose of the world in the survey's frame."""
+        """Return the pose (3,) of the world in the frame of the survey."""
         return se2.inverse(self.survey(state).transform())
 
     def _likelihood(self, state: Array) -> PhaseLikelihood:
@@ -144,16 +146,16 @@ class _Focus:
         return PhaseLikelihood(replace(self.model, antennas=antennas), self.tags)
 
 
-ENOUGH_STRENGTHS = 200
-ITERATIONS = 30  # of the fit of the strength
-DOF = (1.0, 100.0)
+ENOUGH_STRENGTHS = 200  # minimum number of reads with a signal strength
+ITERATIONS = 30  # iterations of the fit of the strength
+DOF = (1.0, 100.0)  # bounds of the degrees of freedom
 
 
 def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiSettings:
-    """Fit the RSSI model (:mod:`factors.rfid.signals`) to all ``logs`` by maximum likelihood. InputError if a log has no
-    reference, or too few reads have an RSSI.
+    """Fit the model of signal strength (:mod:`factors.rfid.signals`) to all ``logs`` by maximum likelihood.
 
-    Signals below the reader's sensitivity are missing, so the path loss is flatter than in free space.
+    Signals below the reader's sensitivity are missing, so the fitted path loss is flatter than in free space. Raises InputError
+    if a log has no reference, or if too few reads have an RSSI.
     """
     names = {name: i for i, name in enumerate(rfid.all_antennas())}
     tables, values = list[Array](), list[Array]()
@@ -166,14 +168,15 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
         values.append(reads.rssi)
     if (count := sum(map(len, values))) < ENOUGH_STRENGTHS:
         raise InputError(
-            f"{listed(log.name for log in logs)}: hold {count} reads with an RSSI, expected at least {ENOUGH_STRENGTHS}"
+            f"{listed(log.name for log in logs)}: {count} reads have an RSSI, expected at least {ENOUGH_STRENGTHS}"
         )
     coefficients, sigma, dof = _student(np.concatenate(tables).reshape(-1, len(FEATURES)), np.concatenate(values))
     return RssiSettings.bounded(coefficients=tuple(coefficients.tolist()), sigma=sigma, dof=dof)
 
 
 def _student(x: Array, y: Array) -> tuple[Array, float, float]:
-    """Coefficients, scale and degrees of freedom, by conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
+    """Fit a linear model of ``y`` (N,) by features ``x`` (N, F) with Student-t noise. Returns coefficients (F,), scale and
+    degrees of freedom. The method is conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
     dof, weights = 5.0, np.ones(len(y))
     for _ in range(ITERATIONS):
         root = np.sqrt(weights)
@@ -182,7 +185,8 @@ def _student(x: Array, y: Array) -> tuple[Array, float, float]:
         sigma = math.sqrt(np.mean(weights * residuals**2))
 
         def cost(v: float, ratios: Array = residuals / sigma) -> float:
-            dof = math.exp(v)  # mean negative log density of the Student distribution
+            """Return the mean negative log density of the Student-t distribution with exp(v) degrees of freedom."""
+            dof = math.exp(v)
             scale = gammaln(dof / 2.0) - gammaln((dof + 1.0) / 2.0) + 0.5 * math.log(dof * math.pi)
             return float(scale + 0.5 * (dof + 1.0) * np.mean(np.log1p(ratios**2 / dof)))
 
