@@ -141,7 +141,7 @@ def test_a_scale_that_is_off_is_told(log, factors, what):
     scaled = replace(moved, v=moved.v / factors[0], w=moved.w / factors[1])
     off = replace(log, streams={"odometry": scaled})
     (line,) = motion_problems(off)
-    assert str(line).startswith(f"the reference {what} times as much as the odometry (scale_")
+    assert str(line).startswith(f"the reference {what} times as much as the odometry: set odometry.scale_")
     scales = OdometrySettings(scale_distance=factors[0], scale_rotation=factors[1])
     assert motion_problems(replace(off, rig=Rig(odometry=scales))) == []
 
