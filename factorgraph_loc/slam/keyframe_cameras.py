@@ -1,13 +1,13 @@
-"""Camera poses of the keyframes of a graph, for points that are triangulated from them.
+"""Camera poses of the keyframes of a graph, for the triangulation of points that are not in the graph yet ("waiting" points).
 
-The pose of a keyframe is that at the stamp of its image. If the time offset of the camera is estimated, the image was taken
-later. The robot then moves on with the odometry's velocity at the stamp.
+The pose of a keyframe in the graph is the pose at the stamp of its image. If the time offset of the camera is estimated, the image
+was taken later than its stamp. The camera pose then includes the motion of the robot with the odometry's velocity at the stamp.
 
-If no points of the graph determine the rotation, the last keyframes and their waiting points are adjusted locally. The error of the
-odometry may exceed the parallax of the points, and does so by far if wheels slip. Points seen from several keyframes determine the
-rotation better, even if their distances are unknown. The result is only a linearization point: the sightings enter the graph
-unchanged. Points are eliminated from each step (Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle Adjustment, a Modern Synthesis",
-2000).
+If too few points of the graph are visible to determine the newest pose, the last keyframes and the waiting points are adjusted
+together (local bundle adjustment). The odometry alone is not accurate enough: its error may exceed the parallax of the points, and
+does so by far if the wheels slip. Points observed from several keyframes determine the rotation better, even if their distances
+are unknown. The adjusted poses serve as initial values only. The observations of the points enter the graph unchanged. Points are
+eliminated from each step (Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle Adjustment, a Modern Synthesis", 2000).
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ from factors.odometry.factor import OdometryFactor, OdometryStack
 from factors.robust import huber_loss
 from factors.se2 import Array, Integers
 
-ANCHORED, SLACK = 4, 2.0  # points of the graph that determine a keyframe to so many pixels
+ANCHORED, SLACK = 4, 2.0  # so many visible points of the graph determine a keyframe, to an error of so many pixels
 HORIZON, BUNDLE = 60, 8  # keyframes for which sightings are kept, and keyframes that are adjusted together
-DISTANCE = 3.0  # m: first guess of how far points are away
-FEW, ENOUGH = 5, 8  # bounds of the number of points shared with the previous keyframe: a third of the points in view
+DISTANCE = 3.0  # m: initial value of the distance of points
+# consecutive keyframes must share a third of the points in view, but at least FEW and at most ENOUGH
+FEW, ENOUGH = 5, 8
 ITERATIONS = 30
-FITS, MOST = 3.0, 0.5  # standard deviations, and the share of a keyframe's sightings that must fit
-SLIPPED = 0.1  # rad: what points that move with the image for their nearness cannot explain
+FITS, MOST = 3.0, 0.5  # a sighting fits within so many standard deviations; so large a fraction per keyframe must fit
+SLIPPED = 0.1  # rad: a larger turn of the points relative to the odometry is not caused by the parallax of near points
 
 Waiting = Mapping[Hashable, Sequence[PointSighting]]
 State = tuple[Array, Array, Array]  # poses (N, 3) and tilts (N, 2) of keyframes, and points (P, 3)
@@ -50,10 +51,11 @@ def bundled(
     poses: Sequence[Array],
     waiting: Waiting,
 ) -> list[tuple[Array, Array]] | None:
-    """Adjusted poses (3,) and tilts (2,) of the last of consecutive ``keyframes``, while each shares points with the previous one.
+    """Adjust the last keyframes and the points that they observe. Returns pairs of pose (3,) and tilt (2,).
 
-    The initial values are ``poses``; the first pose is fixed. None with fewer than :data:`ENOUGH` points, or if most sightings of
-    a keyframe do not fit.
+    ``keyframes``: consecutive keyframes. Adjusted are the last of these, as far as each shares enough points with the previous one.
+    ``poses``: the initial poses of ``keyframes``. The first adjusted pose is fixed. ``waiting``: sightings by point.
+    Returns None if there are fewer than :data:`ENOUGH` points, or if most sightings of a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)
     shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
@@ -82,9 +84,9 @@ def bundled(
 def _adjusted(
     model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
 ) -> tuple[Sequence[Array], Array, Truths]:
-    """Adjusted poses (3,) and tilts (N, 2) of N keyframes, and which of the M sightings fit (M,).
+    """Return adjusted poses (3,) and tilts (N, 2) of N keyframes, and a mask (M,) of the sightings that fit the result.
 
-    If no step can be determined, poses and tilts keep their initial values.
+    ``often``: the M sightings, by point. Poses and tilts keep their initial values if no optimization step can be computed.
     """
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]
@@ -106,9 +108,10 @@ def _adjusted(
 
 @dataclass(frozen=True)
 class LocalBundle:
-    """The cost of consecutive poses with ``odometry`` between them, of the tilts of the robot, and of M pixels of points.
+    """The least-squares problem of a local bundle adjustment: consecutive poses, tilts of the robot, and points.
 
-    ``frames`` (M,), ``owners`` (M,): the pose and the point of each of the ``pixels`` (M, 2). The first pose is fixed.
+    ``odometry``: the factors between consecutive poses. ``pixels`` (M, 2): the observations of points.
+    ``frames`` (M,), ``owners`` (M,): indices of the pose and of the point of each observation. The first pose is fixed.
     """
 
     model: CameraModel
@@ -118,7 +121,8 @@ class LocalBundle:
     pixels: Array
 
     def linearize(self, state: State) -> tuple[Array, Array, Array]:
-        """Whitened, robustly weighted residuals (M, 2) of the pixels, their Jacobian, and the squares (M,) without weights."""
+        """Return the whitened, robustly weighted residuals (M, 2) of the pixels, their Jacobian, and the squared whitened residuals
+        (M,) without weights."""
         poses, tilts, points = state
         at = poses[self.frames], tilts[self.frames], points[self.owners], self.pixels
         model = self.model
@@ -128,14 +132,16 @@ class LocalBundle:
         return linear
 
     def cost(self, state: State) -> float:
-        """The robust cost."""
+        """Return the robust cost at ``state``: half the sum of squared whitened residuals, with Huber losses of the pixels."""
         poses, tilts, _ = state
         of_pixels = huber_loss(self.linearize(state)[2], self.model.robust).sum()
         return float(of_pixels + 0.5 * np.sum(tilts**2) / self.model.tilt**2) + self.odometry.cost(poses, np.zeros(0))
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """The state after a step, whose ``damping`` is a share of the curvature, and the largest component of the step; None
-        where the step is not determined."""
+        """Return the state after a Levenberg-Marquardt step, and the largest component of the step.
+
+        ``damping``: the factor of the Hessian's diagonal that is added to it. Returns None if the equations are singular.
+        """
         poses, tilts, points = state
         residual, jacobian, _ = self.linearize(state)
         jacobian = jacobian[..., :CONSTANTS]
@@ -178,14 +184,18 @@ class LocalBundle:
 
 
 def _seen_often(first: int, waiting: Waiting) -> list[list[PointSighting]]:
-    """The sightings from keyframe number ``first`` on of each point that was seen from :data:`FEWEST` of these."""
+    """Return the sightings of each waiting point from keyframe number ``first`` on. Points with fewer than :data:`FEWEST` of these
+    are left out."""
     return [sightings for w in waiting.values() if len(sightings := [s for s in w if s.keyframe >= first]) >= FEWEST]
 
 
 def _turned(
     model: CameraModel, poses: Sequence[Array], first: int, often: Sequence[Sequence[PointSighting]]
 ) -> list[Array]:
-    """The ``poses`` (3,) of keyframes from number ``first`` on, turned as points turn between them where these contradict."""
+    """Return ``poses`` (3,) with corrected turns between consecutive keyframes, of which ``first`` is the first number.
+
+    A turn is replaced by the median turn of the common points in the image if both differ by more than :data:`SLIPPED`.
+    """
     sides: list[dict[int, float]] = [{} for _ in poses]
     for i, sightings in enumerate(often):
         for s in sightings:
@@ -202,8 +212,11 @@ def _turned(
 
 
 class KeyframeCameras:
-    """``twists``: velocities (3,) of the robot at keyframes by their number, none if the time offset of the camera is not among
-    the ``estimated`` constants. ``anchored``: keyframes that points of the graph determine.
+    """Computes the camera poses of keyframes of a graph, for the triangulation of points.
+
+    ``estimated``: the estimated constants of the camera. ``twists``: the velocity (3,) of the robot at each keyframe, by number of
+    the keyframe; empty if the time offset of the camera is not estimated. ``anchored``, by number of the keyframe: True if visible
+    points of the graph determine the keyframe's pose.
     """
 
     def __init__(self, model: CameraModel, estimated: Estimated) -> None:
@@ -213,12 +226,12 @@ class KeyframeCameras:
         self.anchored: dict[int, bool] = {}
 
     def add(self, keyframe: Keyframe, graph: Graph) -> None:
-        """Add a keyframe whose odometry is still kept."""
+        """Add a new keyframe, while ``graph`` still stores the odometry at its time."""
         if self._offset is not None:
             self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 
     def anchor(self, keyframe: Keyframe, points: int) -> None:
-        """Store how many ``points`` of the graph a keyframe sees."""
+        """Store whether a keyframe is determined by the points of the graph. ``points``: how many of these it observes."""
         self.anchored[keyframe.index] = points >= ANCHORED
 
     def forget(self, first: int) -> None:
@@ -227,15 +240,18 @@ class KeyframeCameras:
         self.anchored = {number: anchored for number, anchored in self.anchored.items() if number >= first}
 
     def at_image(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """The pose of a keyframe when its image was taken, and its covariance with that of the offset."""
+        """Return the pose at the time when the image was taken, from the pose ``guess`` at the stamp of the image.
+
+        ``keyframe``: its number. The covariance of the returned pose includes that of the time offset.
+        """
         return self._moved(keyframe, guess, graph, 1.0)
 
     def at_stamp(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """The inverse of :meth:`at_image`."""
+        """Return the pose at the stamp of the image, from the pose ``guess`` at the time when the image was taken."""
         return self._moved(keyframe, guess, graph, -1.0)
 
     def pose(self, keyframe: int, graph: Graph) -> Array:
-        """The current pose (3,) of a keyframe of the graph when its image was taken."""
+        """Return the current estimate (3,) of the pose of a keyframe, by number, at the time when its image was taken."""
         pose = graph.current(graph.keyframes[keyframe].key)
         return self._moved(keyframe, (pose, np.zeros((3, 3))), graph, 1.0)[0]
 
@@ -253,10 +269,11 @@ class KeyframeCameras:
     def cameras(
         self, newest: Keyframe, pose: Array, names: Iterable[Hashable], waiting: Waiting, graph: Graph
     ) -> dict[int, KeyframeCamera]:
-        """The camera poses, by number, of the keyframes that see the ``waiting`` points ``names``.
+        """Return the camera poses, by number, of the keyframes that observe the points ``names``.
 
-        Each has the pixel errors that it causes in the ``newest`` keyframe, which is at ``pose`` (3,). Relative poses come from
-        points of the graph if these determine both keyframes, otherwise from odometry.
+        ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the sightings by point.
+        The ``slack`` of each camera pose is its error relative to the newest one, in pixels. The error is small if both keyframes
+        are determined by points of the graph. Otherwise it follows from the covariance of the odometry.
         """
         slacks = self._slacks(newest, graph)
         cameras = {newest.index: self._camera(pose, newest.index, slacks, graph)}
@@ -268,10 +285,11 @@ class KeyframeCameras:
     def bundled(
         self, newest: Keyframe, pose: Array, waiting: Waiting, tilt: float, graph: Graph
     ) -> tuple[dict[int, KeyframeCamera], Array] | None:
-        """The camera poses of the last keyframes by number, adjusted with the points ``waiting`` there, and the adjusted ``pose``
-        (3,) of the ``newest`` one. None if that is anchored, or if the points do not determine it.
+        """Return the adjusted camera poses of the last keyframes, by number, and the adjusted pose (3,) of the newest one.
 
-        ``tilt``: standard deviation [rad] of the floor.
+        ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the sightings of the points that are
+        adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch.
+        Returns None if points of the graph determine the newest keyframe already, or if the adjustment fails.
         """
         if self.anchored[newest.index]:
             return None
@@ -287,9 +305,10 @@ class KeyframeCameras:
         return KeyframeCamera.of(self._model, pose, slacks[keyframe], graph.values[tilt_key(keyframe)])
 
     def _slacks(self, newest: Keyframe, graph: Graph) -> dict[int, float]:
-        """The pixel error of the last keyframes relative to the newest."""
+        """Return the error of the last keyframes relative to the newest one, in pixels and by number of the keyframe."""
         slacks: dict[int, float] = {}
-        to_anchor = since = 0.0  # variance of the rotation from the newest to the first anchored keyframe, and since
+        # variance of the rotation between the newest and the last anchored keyframe, and before an earlier anchored keyframe
+        to_anchor = since = 0.0
         reached = False
         for index in range(newest.index, max(-1, newest.index - HORIZON), -1):
             if self.anchored.get(index, False):

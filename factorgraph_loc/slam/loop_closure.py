@@ -1,11 +1,11 @@
-"""Loop closure without a map: recognition of points of the graph that were last seen long ago.
+"""Loop closure without a map: recognition of points of the graph that were last observed long ago.
 
-About once a second an image is compared with the possibly visible ones of these points, without a predicted pose
-(Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The resulting pose must be on the floor. The points are
-matched again from that pose, and enough of the visible ones must match, in all parts of the image. Places in a building
-resemble each other. Therefore the poses of consecutive images must agree by odometry, within the possible drift of the track.
-Geometric verification and consistency over consecutive images: Cadena, Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics
-28(4), 2012.
+About once a second an image is compared with those of the old points that may be visible. Features are matched without a predicted
+pose (Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The resulting pose must be on the floor. The points are
+matched again with this pose as the prediction. Enough of the visible points must match, in all parts of the image. Places in a
+building resemble each other. Therefore the poses of consecutive images must agree with the odometry between them. Their distance
+from the estimated track must be a possible drift. Geometric verification and consistency over consecutive images: Cadena,
+Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics 28(4), 2012.
 """
 
 import math
@@ -27,22 +27,24 @@ from factors.camera.model import CameraModel
 from factors.se2 import Array
 
 INTERVAL = 0.9  # s between images that are compared
-SUCCESSIVE, BREAK = 3, 3.0  # images that must agree, and the maximum time [s] between them
-MOTION_SIGMAS = np.array((0.1, 0.1, 0.03))  # m, m, rad: standard deviations of the motion between two of their poses
-FEWEST = 15  # points that must be found
-LEAST_SHARE = 0.1  # of the visible ones
+SUCCESSIVE, BREAK = 3, 3.0  # number of consecutive images that must agree, and the maximum time [s] between two of them
+MOTION_SIGMAS = np.array((0.1, 0.1, 0.03))  # m, m, rad: errors allowed in the motion between two of these images
+FEWEST = 15  # least number of old points that must match
+LEAST_SHARE = 0.1  # least fraction of the visible old points that must match
 GRID, CELLS = (6, 4), 7  # cells of the image, and how many of them must contain a point
-# m, rad; and relative to the distance travelled: standard deviations of a track's drift in addition to its covariance
+# standard deviations of the track's drift in addition to its covariance: m, m, rad, and the same for each metre travelled
 DRIFT, DRIFT_PER_METRE = np.array((0.05, 0.05, 0.02)), np.array((0.003, 0.003, 0.0005))
 GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
-LARGEST_SHIFT, LARGEST_TURN = 1.0, 0.3  # m, rad: errors of a track for which its points are found
-FARTHEST = 15.0  # m
+LARGEST_SHIFT, LARGEST_TURN = 1.0, 0.3  # m, rad: largest errors of the track for which old points are still searched
+FARTHEST = 15.0  # m: largest distance of a point that is searched
 
 
 @dataclass(frozen=True)
 class OldPoints:
-    """``points`` (N) of the graph with a view each, and their ``keys``; positions may be outdated. ``travelled`` (N,): distance
-    travelled by the robot [m] when they were last seen.
+    """N points of the graph that were last observed long ago.
+
+    ``points``: their positions, which may be outdated, with the descriptor of one view of each point. ``keys``: their variables in
+    the graph. ``travelled`` (N,): the path length of the robot [m] from the start to the last observation of each point.
     """
 
     points: PointMap
@@ -52,7 +54,11 @@ class OldPoints:
 
 @dataclass(frozen=True)
 class Image:
-    """The image of a new ``keyframe`` at about ``guess``; ``travelled``: distance travelled [m]."""
+    """The image of a new keyframe.
+
+    ``frame``: its features. ``guess``: the predicted pose of ``keyframe`` and its covariance. ``travelled``: the path length of the
+    robot since the start [m].
+    """
 
     frame: CameraFrame
     keyframe: Keyframe
@@ -62,7 +68,11 @@ class Image:
 
 @dataclass(frozen=True)
 class Revisit:
-    """The ``pose`` (3,) where a keyframe was recognized, and the indices of the old points (M,) and of their features (M,)."""
+    """A keyframe whose image shows old points.
+
+    ``pose`` (3,): the pose of ``keyframe`` by these points. ``points`` (M,): indices of the recognized old points. ``features``
+    (M,): indices of their features in the image.
+    """
 
     keyframe: Keyframe
     pose: Array
@@ -71,36 +81,40 @@ class Revisit:
 
 
 class LoopClosure:
-    """Recognizes revisited places from consecutive images; see the module."""
+    """Recognizes revisited places from several consecutive images that agree."""
 
     def __init__(self) -> None:
-        self._found: list[Revisit] = []  # consecutive ones that agree
-        self._looked = -math.inf
+        self._agreeing: list[Revisit] = []  # revisits of the last consecutive images, which agree with each other
+        self._last_time = -math.inf  # of the last image that was compared
 
     def is_due(self, t: float) -> bool:
-        """Whether the image at time ``t`` is to be compared."""
-        return t >= self._looked + INTERVAL
+        """True if the last comparison is long enough ago to compare the image at time ``t`` [s]."""
+        return t >= self._last_time + INTERVAL
 
     def compare(
         self, model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]
     ) -> Revisit | None:
-        """The old points that an image shows, None if not certain. ``current``: the newest estimate of a variable by key."""
-        self._looked = image.keyframe.t
+        """Compare an image with the ``old`` points, and return the recognized ones.
+
+        ``current``: a function that returns the newest estimate of a variable of the graph, by key.
+        Returns None if no points are recognized, or if fewer than :data:`SUCCESSIVE` consecutive images agree.
+        """
+        self._last_time = image.keyframe.t
         revisit = _revisit(model, image, old, current)
         if revisit is None:
             return None
         agrees = False
-        if self._found and image.keyframe.t <= self._found[-1].keyframe.t + BREAK:
-            last = self._found[-1]
+        if self._agreeing and image.keyframe.t <= self._agreeing[-1].keyframe.t + BREAK:
+            last = self._agreeing[-1]
             went = se2.between(current(last.keyframe.key), image.guess[0])
             off = se2.log(se2.between(went, se2.between(last.pose, revisit.pose)))
             agrees = bool(np.sum((off / MOTION_SIGMAS) ** 2) < GATE)
-        self._found = [*self._found[1 - SUCCESSIVE :], revisit] if agrees else [revisit]
-        return revisit if len(self._found) == SUCCESSIVE else None
+        self._agreeing = [*self._agreeing[1 - SUCCESSIVE :], revisit] if agrees else [revisit]
+        return revisit if len(self._agreeing) == SUCCESSIVE else None
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """The result of one image, without the previous ones."""
+    """Return the old points that one image shows, or None. Previous images are not considered."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:
@@ -114,8 +128,8 @@ def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable
 
 
 def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tuple[Array, Integers, Integers] | None:
-    """A pose (3,) of the robot that is consistent with enough of the visible points, and matching ``points`` (M,) and features
-    (M,).
+    """Return the pose (3,) of the robot, computed from the ``points`` in an image, and the matches: indices of points (M,) and of
+    features (M,). Returns None if the pose is not on the floor, or if too few of the visible points match.
     """
     associator = Associator(points, model)
     somewhere = associator.relocalized(frame)
@@ -144,15 +158,18 @@ def _on_floor(
 
 
 def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
-    """Whether the track may have drifted from ``pose`` to ``guess`` over a distance ``travelled`` [m]."""
+    """True if the difference between ``pose`` (3,) and the track's pose ``guess`` is a possible drift over a path of length
+    ``travelled`` [m]."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_PER_METRE * travelled
     return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)
 
 
 def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truths:
-    """Which points (N,) the camera may see from the same side as before, if its pose is correct within :data:`LARGEST_SHIFT` and
-    :data:`LARGEST_TURN`.
+    """Return a mask (N,) of the points that may be visible and similar to their stored view.
+
+    The pose of ``camera`` may be wrong by :data:`LARGEST_SHIFT` and :data:`LARGEST_TURN`. A point is similar if it is observed from
+    about the same direction and distance as in its stored view.
     """
     rays, old_rays = points.positions - camera.position, points.positions - points.seen_from
     away, old_distance = np.linalg.norm(rays, axis=1), np.linalg.norm(old_rays, axis=1)
@@ -170,13 +187,14 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
 
 
 def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> PointMap:
-    """Some of the points at their newest estimates, with the viewpoints moved along."""
+    """Return the ``old`` points with the indices ``rows`` at their newest positions. The camera positions of their views are
+    shifted by the same amount."""
     points = old.points.chosen(rows)
     positions = np.array([current(old.keys[i]) for i in rows.tolist()])
     return replace(points, positions=positions, seen_from=points.seen_from + positions - points.positions)
 
 
 def _is_spread_out(model: CameraModel, pixels: Array) -> bool:
-    """Whether ``pixels`` (K, 2) are spread over the image."""
+    """True if ``pixels`` (K, 2) are in at least :data:`CELLS` cells of a grid over the image."""
     cells = np.floor(pixels / (model.width, model.height) * GRID)
     return len(np.unique(cells, axis=0)) >= CELLS

@@ -1,12 +1,14 @@
-"""The EKF of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011, section 5 and Algorithm 3): that of monoSLAM, Davison et al., 2007.
+"""The monoSLAM filter: an EKF of a robot with wheels and one camera, and of the points that the camera observes.
 
-The state has 13 values: position r^W and orientation q^WR of the robot's frame R, its velocity v^W in the world frame, and its
-turn rate w^R. Points that are not in the map follow. The error state has 12 values, as an orientation has three degrees of
-freedom. The camera is mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
+The filter is described by Raoui, Bouyakhf and Devy (ICINCO 2011, section 5 and Algorithm 3), "the paper" below. It derives from
+monoSLAM (Davison et al., 2007). The state of the robot has 13 values: position r^W and orientation q^WR of the robot's frame R,
+its velocity v^W in the world frame, and its turn rate w^R. The error state of the robot has 12 values, because an orientation has
+three degrees of freedom. The points that are not in the map follow. The camera is mounted on R by the rig's extrinsics, so R
+replaces the paper's camera frame.
 
-The robot has wheels: odometry replaces the constant-velocity prediction of x, y and heading. Height, roll and pitch stay near
-those of a robot on the floor. Map points are searched at their predicted pixels (:mod:`.monoslam_sighting`). Other points enter the
-state by inverse depth (:mod:`.monoslam_map`). RFID is ignored.
+Odometry replaces the paper's constant-velocity prediction of x, y and heading. Height, roll and pitch stay near those of a robot
+on the floor. Map points are searched at their predicted pixels (:mod:`.monoslam_sighting`). Other points are added to the state
+with an inverse depth (:mod:`.monoslam_map`). RFID measurements are ignored.
 """
 
 from __future__ import annotations
@@ -62,16 +64,20 @@ from factors.robust import huber_weight
 from factors.se2 import Array
 
 SETTLED = 1e-3  # m, rad: step of the iterated update below which it has converged
-RECENT = 5.0  # s: a point in the state that was not seen since may be hidden
+RECENT = 5.0  # s: a point in the state that was not seen for this time may be hidden
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
-SCALE = "scale_distance"  # the constant of the odometry
+SCALE = "scale_distance"  # the name of the odometry's constant that scales distances
 LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which the pose is unknown
 
 
 @dataclass(frozen=True)
 class UpdateRecord:
-    """``step``: from the previous record; ``covariance`` (12 + P, 12 + P): of ``robot`` and ``constants`` (P,) after the update.
-    ``relocalized``: the pose is independent of the past.
+    """The state of the robot after an update of the filter. The final trajectory is made from these records.
+
+    ``t`` [s]: the time of the update. ``step``: the prediction from the previous record to this one.
+    ``robot``, ``constants`` (P,): the state of the robot and the corrections of the odometry's constants after the update.
+    ``covariance`` (12 + P, 12 + P): the covariance of the errors of ``robot`` and ``constants``.
+    ``relocalized``: True if the pose comes from the image alone and is independent of the previous record.
     """
 
     t: float
@@ -83,7 +89,10 @@ class UpdateRecord:
 
 
 def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
-    """The records, smoothed with all later ones. Velocity and turn rate have no later influence and are not smoothed."""
+    """Smooth each record with all later records (Rauch, Tung, Striebel, 1965), and return the smoothed records.
+
+    Velocity and turn rate do not influence later records and are not smoothed.
+    """
     results = list(records[-1:])
     for next_record, record in zip(records[:0:-1], records[-2::-1], strict=True):
         results.append(record if next_record.relocalized else _smoothed(record, next_record, results[-1]))
@@ -91,7 +100,7 @@ def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
 
 
 def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
-    """The smoothed ``record``; ``later``: the smoothed ``next_record``."""
+    """Return ``record``, smoothed with ``later``, which is the smoothed ``next_record``."""
     total, known = len(record.covariance), next_record.step.transition.shape[1]
     transition = np.zeros((POSE, total))
     transition[:, :known] = next_record.step.transition[:POSE]
@@ -108,30 +117,34 @@ def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateReco
 
 
 class MonoslamSettings(FilterSettings):
-    """Settings of the monoSLAM filter. With points in the state the update is never iterated, which would make the filter
-    inconsistent, and the final trajectory is the causal one."""
+    """Settings of the monoSLAM filter.
+
+    If the filter estimates points, its update is never iterated, because iterations would make the filter inconsistent. Its final
+    trajectory is then the causal one, without smoothing.
+    """
 
     height_sigma: Annotated[float, Field(ge=1e-5, le=1.0), InUnit("m")] = 0.005
     """standard deviation of the height of a robot on a floor"""
     tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.005
     """standard deviation of roll and pitch of a robot on a floor"""
     landmarks: MapUse = "known"
-    """known takes the map's points and ignores others, extended estimates the others, unknown all: the default without a map"""
+    """known uses the map's points and ignores other points. extended also estimates the other points. unknown estimates all
+    points and ignores the map. Without a map, unknown is the default"""
     self_calibration: bool = True
-    """whether constants of the odometry with an uncertainty in the rig are states"""
+    """whether the filter estimates the constants of the odometry that have an uncertainty in the rig"""
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
     """largest number of points in the state"""
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20
-    """new points are added if fewer than these should be visible"""
+    """number of points of the state that should be visible in each image; new points are added if fewer are visible"""
     iterations: Annotated[int, Field(ge=1, le=20)] = 3
-    """linearizations of an update in a known map; 1 is the published update"""
+    """largest number of linearizations of an update in a known map; 1 is the published update"""
 
 
 class Monoslam(Filter):
-    """The EKF of the paper: one camera on a robot with wheels, which maps points during the run. See the module."""
+    """The monoSLAM filter: it localizes a robot with wheels and one camera, and can map points during the run."""
 
     modalities = frozenset({"camera"})
-    estimates_points = True  # with ``landmarks`` other than ``known``, those that the map lacks
+    estimates_points = True  # points that the map lacks, unless the setting ``landmarks`` is ``known``
     _state: SlamState
 
     def __init__(self, setup: Setup, settings: MonoslamSettings) -> None:
@@ -150,14 +163,15 @@ class Monoslam(Filter):
         self._origin: Origin | None = None
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian, or where an image says, if the heading is unknown."""
+        """Start from the Gaussian ``prior``. If its heading is unknown, start from the first image that is located in the map."""
         if prior.has_heading:
             super().initialize(prior)
         else:
             self._wait(prior.t)
 
     def learnt(self) -> Learnt:
-        """The constants of the odometry, and the points in the state, seen from above, without those of unknown depth."""
+        """Return the estimated constants of the odometry, and x and y of the points in the state. Points of unknown depth are left
+        out."""
         state: SlamState | None = self._state
         if state is None:
             return Learnt()
@@ -175,8 +189,8 @@ class Monoslam(Filter):
         return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
-        """The poses at the ticks, seen from above: smoothed (Rauch, Tung, Striebel, 1965) in a known map, else, or without
-        ``smooth``, the causal ones."""
+        """Return the planar poses at the ticks. In a known map they are smoothed with later images, unless the setting ``smooth``
+        is off. If points are estimated, they are the causal poses."""
         is_known = self._settings.landmarks == "known"
         records = smoothed(self._records) if self._smooth and is_known else self._records
         ticks = np.unique(np.array(self._ticks))
@@ -234,14 +248,18 @@ class Monoslam(Filter):
         self._state = replace(state, image_odometry=self._odometry)
 
     def _match(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
-        """The state before an image, and its matches. Without a map, the state is widened if wheels slipped by the image."""
+        """Return the state before an image, and the matches of the image. If points are estimated and the image shows that the
+        wheels slipped, the covariance of the state is increased first."""
         if self._settings.landmarks == "known" or state.image_odometry is None:
             return state, self._matcher.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.image_odometry, self._odometry))
         return self._matcher.unless_slipped(m, state, eye, *slip)
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
-        """The iterated Kalman update; beyond the gate the noise of a pixel is widened, and Huber weights are applied."""
+        """Return the state after the Kalman update by the matches. In a known map the update is iterated, with Huber weights.
+
+        The noise of a pixel outside the gate is increased.
+        """
         known = match.mapped, match.points, match.covariances
         zero = np.zeros(len(prior.covariance))
         sights = eye.all(prior, *known)
@@ -277,8 +295,10 @@ class Monoslam(Filter):
             self.diagnostics.add_residuals(f"camera.{name}", residual[:, i].tolist())
 
     def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
-        """Relocalize in the whole map if several images had no matches, or if the pose is very uncertain; whether that succeeded.
-        Points in the state are dropped with the old pose.
+        """Relocalize in the whole map if several images had no matches, or if the pose is very uncertain.
+
+        Returns the state, and True if relocalization succeeded. The new state then has no points, because the points belong to the
+        old pose.
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
         camera = self._matcher.relocated(m, eye) if lost >= LOST_AFTER or self._is_vague(state) else None
@@ -289,11 +309,11 @@ class Monoslam(Filter):
         return relocated, True
 
     def _is_vague(self, state: SlamState) -> bool:
-        """Whether the pose in a known map is too uncertain for linearization."""
+        """True if the map is known and the pose is too uncertain for a linearized update."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
-        """The state of a robot with the relocalized ``camera``; None if it would float or tilt."""
+        """Return the state of a robot with the relocalized ``camera``. Returns None if this robot would not stand on the floor."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
@@ -307,7 +327,8 @@ class Monoslam(Filter):
         return SlamState(robot, lost_state.constants, covariance, floor=lost_state.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
-        """The state after counting, deleting, converting (to x, y, z) and adding points."""
+        """Return the state after the management of its points: counts of matches, new points, deletion, and conversion of points to
+        x, y, z."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)
@@ -330,7 +351,8 @@ class Monoslam(Filter):
         return PoseEstimate(self._t, pose, covariance, "localized")
 
     def _pose_covariance(self, robot: RobotState, covariance: Array) -> Array:
-        """The covariance (6, 6) of a pose, including that of the start without a map, or of the camera's mounting in one."""
+        """Return the covariance (6, 6) of a pose. It includes the uncertainty of the camera's mounting or, if the map is unknown,
+        that of the start pose."""
         return covariance[:6, :6] + (self._mounting if self._origin is None else self._origin.of_pose(robot))
 
     def _record(self) -> UpdateRecord:

@@ -1,10 +1,11 @@
-"""Consistency of the monoSLAM filter without a map: the covariance belongs to an error that does not depend on the estimate.
+"""Consistency of the monoSLAM filter without a map: its covariance is updated in an error state that is invariant.
 
-Robot and points may be moved, turned or, up to the lever arm of the camera, enlarged together, and no image changes. A filter
-whose error state is relative to the estimate gains information on these directions each time the estimate moves (Huang,
-Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010). An error that is one common motion and enlargement
-of everything preserves these directions (motion: Barrau, Bonnabel, IEEE Transactions on Automatic Control 62(4), 2017). Changing
-to it before an update and back after it is a linear map of the covariance, applied by :func:`carried`.
+No image changes if robot and points are moved, turned or enlarged together (enlarged: up to the lever arm of the camera). These
+directions are unobservable. A filter whose error state is relative to the estimate gains false information on these directions
+each time the estimate moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010). An invariant
+error is one common motion and enlargement of robot and points. It preserves these directions (motion: Barrau, Bonnabel, IEEE
+Transactions on Automatic Control 62(4), 2017). To change to the invariant error before an update and back after the update is a
+linear map of the covariance. :func:`carried` applies this map.
 """
 
 import numpy as np
@@ -16,10 +17,11 @@ from factors.se2 import Array
 
 
 def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
-    """The covariance (12 + P + D, 12 + P + D) of ``posterior``, an update of ``prior``. The error is invariant and has the
-    covariance of the update.
+    """Return the covariance (12 + P + D, 12 + P + D) of ``posterior`` for an update in the invariant error of this module.
 
-    ``scale``: index of the constant that scales distances, or None.
+    ``prior``: the state before the update. ``posterior``: the state after an ordinary update, with its covariance.
+    ``scale``: the index of the odometry's constant that scales distances, or None if this constant is not estimated.
+    P is the number of constants of the odometry, and D the number of values of points.
     """
     covariance = posterior.covariance
     own, ours = prior.robot, posterior.robot
@@ -38,7 +40,8 @@ def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
 
 
 def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
-    """The difference between two states in the error (12 + P + D,) of a rotation (3,) of the world, without the rotation."""
+    """Return the change (12 + P + D, 3) of the Jacobian of the error by a rotation (3,) of the world, from ``prior`` to
+    ``posterior``. The rows of the robot's rotation are left zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros((len(posterior.covariance), 3))
     change[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)
@@ -54,7 +57,8 @@ def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
 
 
 def _by_scale(prior: SlamState, posterior: SlamState) -> Array:
-    """How the error (12 + P + D,) of one enlargement of the world differs between two states; the scale itself is left out."""
+    """Return the change (12 + P + D,) of the derivative of the error by an enlargement of the world, from ``prior`` to
+    ``posterior``. The row of the scale itself is left zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros(len(posterior.covariance))
     change[SHIFT] = ours.rotation.T @ (ours.position - own.position)

@@ -13,12 +13,13 @@ from factorgraph_loc.slam.monoslam_state import Eye, MapPoint, SlamState
 from factors.camera import inverse_depth
 from factors.se2 import Array, Integers
 
-INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0  # 1/m, of a new point: so vague that many of them do not give the scale
-FEWEST_TRIALS, LEAST_FOUND = 8, 0.5  # a point that was predicted this often is kept if this fraction was found
+# 1/m: prior of a new point. It is so vague that the priors of many points together do not determine the scale
+INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0
+FEWEST_TRIALS, LEAST_FOUND = 8, 0.5  # after so many predictions, a point is deleted if a smaller fraction was matched
 
 
 def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
-    """The state with a new point, seen at ``pixel`` (2,)."""
+    """Return the state with a new ``point``, which the camera observes at ``pixel`` (2,)."""
     position, rotation = eye.pose(state.robot)
     ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, INVERSE_DEPTH)
     by_pose = by_camera @ eye.lift
@@ -35,7 +36,8 @@ def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> Sla
 
 
 def settled(state: SlamState, eye: Eye) -> SlamState:
-    """The state with points converted to x, y, z where the depth is known well enough (linearity index)."""
+    """Convert points from inverse depth to x, y, z if their depth is certain enough for this, by the linearity index of Civera et
+    al. Returns the new state."""
     position, _ = eye.pose(state.robot)
     rays = [i for i, p in enumerate(state.points) if p.ray]
     if not rays:
@@ -62,7 +64,10 @@ def settled(state: SlamState, eye: Eye) -> SlamState:
 
 
 def counted(state: SlamState, expected: Sequence[int], matched: Collection[int], t: float) -> SlamState:
-    """The state with updated counts of the points ``expected`` to be found and ``matched`` at ``t``."""
+    """Return the state with updated counts of an image at time ``t`` [s].
+
+    ``expected``: indices of the points that should be visible in the image. ``matched``: indices of the points that were matched.
+    """
     points = list(state.points)
     for i in expected:
         hit = i in matched
@@ -72,8 +77,10 @@ def counted(state: SlamState, expected: Sequence[int], matched: Collection[int],
 
 
 def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
-    """The state without points that are often not found or beyond infinity, and the number of these. If more than ``most``
-    remain, those not seen for longest are removed too.
+    """Delete points that are often not matched, and points with a negative inverse depth.
+
+    Returns the new state and the number of these points. If more than ``most`` points remain, the points that were not matched
+    for longest are deleted too. These are not counted.
     """
     failed = {
         i
@@ -88,12 +95,12 @@ def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
 
 
 def _is_beyond_infinity(state: SlamState, place: int) -> bool:
-    """Whether an inverse depth is significantly negative."""
+    """True if the inverse depth at index ``place`` of ``state.values`` is below zero by more than two standard deviations."""
     return bool(state.values[place] < -2.0 * np.sqrt(state.covariance[state.base + place, state.base + place]))
 
 
 def without(state: SlamState, which: Collection[int]) -> SlamState:
-    """The state without the points ``which``."""
+    """Return the state without the points with the indices ``which``."""
     if not which:
         return state
     kept = np.repeat([i not in which for i in range(len(state.points))], [p.size for p in state.points])

@@ -1,8 +1,9 @@
-"""Motion of the monoSLAM filter's robot between two times: odometry in x, y and heading; the floor bounds the other values.
+"""The motion model of the monoSLAM filter. Odometry predicts x, y and heading; the floor bounds height, roll and pitch.
 
-Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on Pattern Analysis and Machine
-Intelligence 29(6), 2007. The error state has 12 values. The first six are rotation and translation (3,) of the pose in the
-robot's frame, as in ``gtsam.Pose3``. The velocity (3,) in the world frame and the turn rate (3,) in the robot's frame follow.
+The state is that of Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on Pattern Analysis
+and Machine Intelligence 29(6), 2007. The error state has 12 values. The first six are rotation (3,) and translation (3,) of the
+pose in the robot's frame, as in ``gtsam.Pose3``. The velocity (3,) in the world frame and the turn rate (3,) in the robot's frame
+follow.
 """
 
 from __future__ import annotations
@@ -16,19 +17,21 @@ import numpy as np
 from factors.camera.model import PLANAR
 from factors.se2 import Array
 
-ROBOT = 12  # values of the error state
+ROBOT = 12  # number of values of the robot's error state
 TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 UPRIGHT = [0, 1, 5]  # the components bounded by the floor: roll, pitch, height
-NO_VELOCITY = [8, 9, 10]  # their velocities
-SETTLING, UNEVEN = 1.0, 3.0  # s, time constant of the return to the floor; where its unevenness is learnt
+NO_VELOCITY = [8, 9, 10]  # the velocities of height, roll and pitch
+# s, time constants of the return of roll, pitch and height to zero: fixed tilt sigma; tilt sigma learnt from images
+SETTLING, UNEVEN = 1.0, 3.0
 SHORTEST = 1e-3  # s, shortest interval for the computation of a velocity
 
 
 @dataclass(frozen=True)
 class RobotState:
-    """The 13 values of a robot, with a rotation in place of the quaternion.
+    """Pose and velocity of a robot in space.
 
-    In the world frame: ``position`` (3,) [m], ``rotation`` (3, 3), ``velocity`` (3,) [m/s]. In the robot's: ``rate`` (3,) [rad/s].
+    In the world frame: ``position`` (3,) [m], ``rotation`` (3, 3) from robot to world, ``velocity`` (3,) [m/s].
+    In the robot's frame: ``rate`` (3,), the turn rate [rad/s].
     """
 
     position: Array
@@ -37,7 +40,7 @@ class RobotState:
     rate: Array
 
     def plus(self, error: Array) -> RobotState:
-        """The state perturbed by an error (12,)."""
+        """Return the state perturbed by an ``error`` (12,) of the error state."""
         return RobotState(
             self.position + self.rotation @ error[SHIFT],
             orthonormal(self.rotation @ exp(error[TURN])),
@@ -54,8 +57,10 @@ class RobotState:
 
 @dataclass(frozen=True)
 class Step:
-    """A prediction: the resulting ``robot``, the ``transition`` (12, 12 + P) of its error and that of P constants of the odometry,
-    and the added ``noise`` (12, 12).
+    """A prediction of the filter from one time to a later one.
+
+    ``robot``: the predicted state. ``transition`` (12, 12 + P): the Jacobian of its error with respect to the error of the earlier
+    state and of the P constants of the odometry. ``noise`` (12, 12): the covariance that the motion adds.
     """
 
     robot: RobotState
@@ -63,7 +68,8 @@ class Step:
     noise: Array
 
     def carried(self, covariance: Array) -> Array:
-        """The predicted ``covariance`` (12 + P + D, 12 + P + D) of an error state with constants and points."""
+        """Return the predicted covariance. ``covariance`` (12 + P + D, 12 + P + D): that of robot, P constants of the odometry, and
+        D values of points before the step."""
         known = self.transition.shape[1]
         carried = self.transition @ covariance[:known]
         result = covariance.copy()
@@ -74,19 +80,25 @@ class Step:
         return result
 
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
-        """This step followed by another, of the robot alone."""
+        """Return this step followed by another step, which does not depend on the constants of the odometry.
+
+        ``transition``, ``noise`` (12, 12): those of the other step. ``robot``: the state after the other step.
+        """
         return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The start of a run without a map: ``robot`` then, and the covariance (6, 6) of its pose, common to all later poses."""
+    """The start of a run without a map. Its uncertainty is not part of the state, but is added to estimates.
+
+    ``robot``: the state at the start. ``covariance`` (6, 6): of the start pose, in the robot's frame.
+    """
 
     robot: RobotState
     covariance: Array
 
     def of_pose(self, robot: RobotState) -> Array:
-        """Its contribution to the covariance (6, 6) of a later pose."""
+        """Return the contribution of the start's covariance to the covariance (6, 6) of a later pose, which ``robot`` has."""
         turn = robot.rotation.T @ self.robot.rotation
         back = robot.rotation.T @ (self.robot.position - robot.position)
         adjoint = np.zeros((6, 6))
@@ -95,22 +107,23 @@ class Origin:
         return np.asarray(adjoint @ self.covariance @ adjoint.T)
 
     def of_point(self, point: Array) -> Array:
-        """Its contribution to the covariance (3, 3) of a ``point`` (3,)."""
+        """Return the contribution of the start's covariance to the covariance (3, 3) of a ``point`` (3,) in the world frame."""
         rotation = self.robot.rotation
         jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
         return np.asarray(jacobian @ self.covariance @ jacobian.T)
 
 
 def standstill(robot: RobotState) -> Step:
-    """The step of no motion, to a second measurement at the same time."""
+    """Return the step of a robot that does not move, for a second measurement at the same time."""
     return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
 
 
 def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: Array, dt: float) -> Step:
-    """Motion that odometry measured over ``dt``. It replaces velocity and turn rate, and their noise (reading 4 of the paper).
+    """Return the step of a robot that moves as measured by odometry. Velocity and turn rate are set to those of the odometry.
 
-    ``delta`` (3,): x, y and heading of the end in the frame of the start, with ``covariance`` (3, 3) of a perturbation there;
-    ``by_constants`` (3, P): its derivative by constants.
+    ``robot``: the state at the start. ``delta`` (3,): pose of the end in the frame of the start, as x [m], y [m], heading [rad].
+    ``covariance`` (3, 3): of a perturbation of the end in its own frame. ``by_constants`` (3, P): the derivative of this
+    perturbation by the P constants of the odometry. ``dt`` [s]: the duration.
     """
     dt = max(dt, SHORTEST)
     turn, ahead = about_z(float(delta[2])), np.array((delta[0], delta[1], 0.0))
@@ -129,10 +142,10 @@ def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: A
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
-    """A step of a robot on the floor, for small tilts.
+    """Return ``step`` followed by the return of height, roll and pitch towards zero, for a robot on a floor and small tilts.
 
-    Height, roll and pitch have no velocity. They follow a stationary process about zero with these standard deviations and the
-    time constant ``settling`` [s].
+    Height, roll and pitch follow a stationary process about zero and have no velocity. ``height_sigma`` [m] and ``tilt_sigma``
+    [rad] are its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: the duration of ``step``.
     """
     keep = math.exp(-dt / settling)
     robot = step.robot
@@ -151,17 +164,20 @@ def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, 
 
 
 def heading_of(robot: RobotState) -> Array:
-    """The rotation (3, 3) of a level robot with the same heading."""
+    """Return the rotation (3, 3) of a level robot with the same heading as ``robot``."""
     return about_z(math.atan2(robot.rotation[1, 0], robot.rotation[0, 0]))
 
 
 def seen_from_above(robot: RobotState, covariance: Array) -> tuple[Array, Array]:
-    """x, y and heading (3,) of the robot and their covariance (3, 3), from that of its pose (6, 6)."""
+    """Return the planar pose (3,) of a robot, as x, y and heading, and its covariance (3, 3).
+
+    ``covariance`` (6, 6): that of the robot's pose in space, in the robot's frame.
+    """
     rotation = robot.rotation
     x, y = rotation[0, 0], rotation[1, 0]
     jacobian = np.zeros((3, 6))
     jacobian[:2, 3:] = rotation[:2]
-    # a small rotation (a, b, c) moves the first axis by c times the second minus b times the third
+    # a small rotation (a, b, c) moves the robot's x axis by c times its y axis minus b times its z axis
     across = np.array((-y, x)) / max(x * x + y * y, 1e-12)
     jacobian[2, 1], jacobian[2, 2] = -across @ rotation[:2, 2], across @ rotation[:2, 1]
     pose: Array = np.array((robot.position[0], robot.position[1], np.arctan2(y, x)))

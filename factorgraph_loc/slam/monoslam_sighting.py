@@ -2,10 +2,10 @@
 
 Active search: a point of the state is searched in the 99 % ellipse of its innovation (Davison et al., 2007, see
 :mod:`~factorgraph_loc.slam.monoslam_motion`, section III.E). Outliers are rejected by consensus: each single match corrects the
-prediction, and the correction with the most agreement of other matches defines the inliers (Civera, Grasa, Davison, Montiel,
-"1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010). The corrected pixels follow from the innovation
-covariance, so that all matches are tried, not a random sample. Each inlier must be inside the gate of a prediction from all other
-inliers.
+prediction, and the correction that most other matches agree with defines the inliers (Civera, Grasa, Davison, Montiel, "1-Point
+RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010). The corrected pixels are computed from the innovation
+covariance. This is fast enough to try all matches, not a random sample. Finally each inlier is predicted from all other inliers.
+It is rejected if it is outside the gate of this prediction.
 """
 
 from collections.abc import Sequence
@@ -33,13 +33,17 @@ from factors.camera.model import PLANAR
 from factors.se2 import Array, Integers
 from factors.update import GATE
 
-CLEARANCE = 15.0  # px between a new point and all others
-FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # named points that must agree in relocalization, and their fraction
-FEWEST_MATCHES = 3  # that must agree
+CLEARANCE = 15.0  # px: smallest distance in the image between a new point and all other points
+FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # relocalization by named points: least number and least fraction of inliers
+FEWEST_MATCHES = 3  # with fewer matches, none is rejected
 
 
 def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
-    """Which of K matches are inliers, all if there are few. ``residual`` (K, 2) [px]: measured minus predicted."""
+    """Return a mask (K,) of the matches that are inliers. With fewer than :data:`FEWEST_MATCHES` matches, all are inliers.
+
+    ``residual`` (K, 2) [px]: measured minus predicted pixels. ``innovation``: their covariance without noise. ``noise``
+    (K, 2, 2) [px^2]: the covariances of the pixel noise.
+    """
     count = len(residual)
     right = np.ones(count, dtype=bool)
     if count < FEWEST_MATCHES:
@@ -52,21 +56,25 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     gains = blocks @ np.linalg.inv(each)[None]
     corrected = residual[:, None] - np.einsum("jiab,ib->jia", gains, residual)
     covariances = each[:, None] - gains @ blocks.transpose(0, 1, 3, 2)
-    # rounding must not leave less than the noise
+    # despite rounding errors, the variances must not be smaller than those of the noise
     covariances[..., 0, 0] = np.maximum(covariances[..., 0, 0], noise[:, None, 0, 0])
     covariances[..., 1, 1] = np.maximum(covariances[..., 1, 1], noise[:, None, 1, 1])
     distances = squared(corrected.reshape(-1, 2), covariances.reshape(-1, 2, 2)).reshape(count, count)
     i = np.arange(count)
     distances[i, i], covariances[i, i] = squared(residual, each), each
     inside = distances < GATE
-    # a match of a very uncertain point has no information, and agrees with everything
+    # a very uncertain point agrees with every correction: such an agreement has a low score
     information = np.log(np.linalg.det(each)[:, None] / np.linalg.det(covariances))
     best = int(np.argmax(np.where(inside, GATE - distances + information, 0.0).sum(axis=0)))
     return _confirmed(residual, total, inside[:, best])
 
 
 def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
-    """The ``right`` matches (K,) inside the gate of a prediction from the other ones; the worst is removed first."""
+    """Return a mask (K,) of the matches of the mask ``right`` that agree with a prediction from the other matches of ``right``.
+
+    The worst match is removed first, until all agree. ``residual`` (K, 2): measured minus predicted pixels. ``total``
+    (2K, 2K): the innovation covariance with noise.
+    """
     rows = np.flatnonzero(right)
     count = len(rows)
     values = (2 * rows[:, None] + np.arange(2)).ravel()
@@ -74,7 +82,7 @@ def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
     while count >= FEWEST_MATCHES:
         i = np.arange(count)
         own = np.linalg.inv(information.reshape(count, 2, count, 2)[i, :, i, :])
-        off = own @ (information @ pixels).reshape(count, 2, 1)  # from the prediction by the others
+        off = own @ (information @ pixels).reshape(count, 2, 1)  # relative to this prediction
         distances = squared(off[..., 0], own)
         worst = int(np.argmax(distances))
         if distances[worst] < GATE:
@@ -90,11 +98,13 @@ def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
 
 @dataclass(frozen=True)
 class Match:
-    """The inlier pixels (K, 2), of points ``mapped`` in the state, then of ``points`` (P, 3) of the map with covariances
-    ``covariances`` (P, 3, 3).
+    """The inlier matches of an image: M points of the state and then P points of the map.
 
-    ``tempering``: exponent of the likelihood. ``taken``: their rows of the image, including rejected ones. ``expected``: points
-    of the state that should have been found. ``wanted``: 0 if too few were predicted to conclude anything from missing matches.
+    ``pixels`` (M + P, 2): the matched pixels. ``mapped``: indices of the M points of the state.
+    ``points`` (P, 3): positions of the points of the map. ``covariances`` (P, 3, 3): theirs, or None if they are negligible.
+    ``taken``: rows of the image that are matched. ``expected``: indices of the points of the state that should be matched.
+    ``wanted``: number of map points that should be matched; 0 if they are too few to conclude that the pose is lost.
+    ``tempering``: the exponent of the likelihood of map points, at most 1, because their errors are correlated.
     """
 
     pixels: Array
@@ -108,7 +118,11 @@ class Match:
 
 
 class FeatureMatcher:
-    """Matches features; ``use`` of the map as of :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`."""
+    """Matches the pixels of an image with points of the map and of the filter's state.
+
+    ``use``: the points to match. ``known`` matches points of the map only, ``unknown`` points of the state only, ``extended``
+    both.
+    """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics, use: MapUse) -> None:
         self._diagnostics = diagnostics
@@ -128,14 +142,16 @@ class FeatureMatcher:
             self._has_uncertain_points = worst > (EXACT * self.eye.model.sigma / self.eye.model.fx) ** 2
 
     def match(self, m: Pixels, state: SlamState, eye: Eye) -> Match:
-        """The pixels that belong to points; outliers are removed and counted as rejected."""
+        """Return the matches of a measurement. Outliers are removed and counted as rejected."""
         return self._named(m, m.names, state, eye) if m.frame is None else self._searched(m.frame, state, eye)
 
     def unless_slipped(
         self, m: Pixels, state: SlamState, eye: Eye, added: Array, rarity: float
     ) -> tuple[SlamState, Match]:
-        """The state and :meth:`match`. If the pixels show that wheels slipped, ``added`` (3, 3) is added to the covariance of x, y
-        and heading. ``rarity``: minus the logarithm of the probability of slip.
+        """Return the state and the result of :meth:`match`. If the pixels show that the wheels slipped, the state is less certain.
+
+        ``added`` (3, 3): the covariance of x, y and heading that slip adds. ``rarity``: minus the logarithm of the probability of
+        slip. The wheels slipped if the log-likelihood ratio of the pixels exceeds ``rarity``.
         """
         slipped, diagnostics = state.widened(added), self._diagnostics
         added_before, noted = diagnostics.added, diagnostics.record()
@@ -149,9 +165,11 @@ class FeatureMatcher:
         return state, self.match(m, state, eye)
 
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
-        """Rows of an image that may become points, at a distance from matched and predicted pixels.
+        """Return the rows of an image that may become new points of the state.
 
-        They are unmatched features with a track in the previous image (``tracks``), or names unknown to map and state.
+        If the measurement has features, these are unmatched features with a track in the previous image (``tracks``). They have a
+        distance from matched and predicted pixels. If the measurement has names, these are the names that are neither in the map
+        nor in the state.
         """
         if m.frame is None:
             known_names = {p.name for p in state.points}
@@ -167,7 +185,7 @@ class FeatureMatcher:
         return chosen
 
     def in_view(self, state: SlamState, eye: Eye, since: float) -> int:
-        """The number of points of the state that should be visible, of those seen after ``since``."""
+        """Return the number of points of the state that should be visible and were last matched at ``since`` [s] or later."""
         lately = [i for i, p in enumerate(state.points) if p.t >= since]
         return len(_visible(eye, eye.mapped(state, lately))[1])
 
@@ -201,7 +219,8 @@ class FeatureMatcher:
         return replace(self._match(m.pixels, outside, known, which, wanted), tempering=eye.model.tempering)
 
     def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
-        """The camera pose from this image and the map alone; None if they do not determine it."""
+        """Return the camera pose, computed from this image and the map without a prediction. Returns None if it is not
+        determined."""
         if m.frame is not None:
             relocated = None if self._associator is None else self._associator.relocalized(m.frame)
             return None if relocated is None else relocated[0]
@@ -215,7 +234,7 @@ class FeatureMatcher:
         return place.camera
 
     def _known(self, m: CameraFrame, state: SlamState, eye: Eye) -> tuple[list[tuple[int, int]], int]:
-        """Matches of features and map points, and how many were predicted."""
+        """Return pairs (feature, point of the map) that match, and the number of map points that should be matched."""
         if self._associator is None:
             if not self._grows:
                 self._diagnostics.ignore("camera", len(m.pixels))
@@ -226,7 +245,7 @@ class FeatureMatcher:
         associations = self._associator.guided(m, eye.predicted(state))
         if associations.rejected:
             self._diagnostics.reject(DISAGREES, associations.rejected)
-        # one that is left out must not become a new point
+        # if new points are added, keep all matches: a feature that matches the map must not become a new point
         chosen = spread_out(m.pixels[associations.features], len(associations) if self._grows else MOST)
         return list(
             zip(associations.features[chosen].tolist(), associations.points[chosen].tolist(), strict=True)
@@ -235,7 +254,7 @@ class FeatureMatcher:
     def _agreeing(
         self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """The inliers of pairs (row of the image, point of the state)."""
+        """Return those of the pairs ``ours`` (row of the image, point of the state) that are inliers."""
         if not ours:
             return ours
         sights = eye.mapped(state, [p for _, p in ours])
@@ -245,14 +264,14 @@ class FeatureMatcher:
     def _agreeing_known(
         self, pixels: Array, known: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """The inliers of pairs (row of the image, point of the map)."""
+        """Return those of the pairs ``known`` (row of the image, point of the map) that are inliers."""
         if len(known) < FEWEST:
             return known
         points = self._map.positions[[p for _, p in known]]
         noise = eye.known(state.robot, points, self._covariances([p for _, p in known])).noise
         try:
             right = consensus.agreeing(eye.model, eye.predicted(state), points, pixels[[i for i, _ in known]], noise)
-        except np.linalg.LinAlgError:  # of a meaningless prediction
+        except np.linalg.LinAlgError:  # the prediction is not finite or its covariance is singular
             right = np.zeros(len(known), dtype=bool)
         return self._kept(known, right)
 
@@ -285,13 +304,16 @@ class FeatureMatcher:
 
 
 def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
-    """Those in front of the camera and inside its image."""
+    """Return the predicted pixels of the points in front of the camera and inside its image, and their indices in ``sights``."""
     inside = np.flatnonzero((sights.depths > 0.0) & eye.model.contains(sights.pixels))
     return sights[inside], inside
 
 
 def _slip(match: Match, state: SlamState, eye: Eye, added: Array) -> float:
-    """The log-likelihood ratio of pixels for a pose with the ``added`` covariance (3, 3), relative to one without it."""
+    """Return the log-likelihood ratio of the matched pixels for slip of the wheels, relative to no slip.
+
+    ``added`` (3, 3): the covariance of x, y and heading that slip adds.
+    """
     sights = eye.all(state, match.mapped, match.points, match.covariances)
     covariance = Innovation.of(sights, state.covariance).total(sights.noise)
     # all points of unknown depth have the same initial depth: their errors are common, as after a slip

@@ -1,7 +1,8 @@
 """The state of the monoSLAM filter (robot and points), predicted pixels, and the Kalman update.
 
-The update is in covariance form: of the 12 + D error values, only the columns of the robot's pose and of observed points enter
-the innovation. The noise of outliers is widened, as in :mod:`~factors.update`.
+The error state has 12 values of the robot, P constants of the odometry, and D values of points. The update is in covariance form.
+Only the robot's pose and the observed points have columns in the Jacobian of the innovation. The noise of outliers is increased,
+as in :mod:`~factors.update`. K is the number of pixels.
 """
 
 from __future__ import annotations
@@ -35,14 +36,17 @@ from factors.motion import ChainState
 from factors.se2 import Array, Integers
 from factors.update import GATE
 
-POSE = 6  # first values of the error state: those of the pose
-VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s at the start
+POSE = 6  # the first six values of the error state are those of the pose
+VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s: standard deviations at the start
 
 
 @dataclass(frozen=True)
 class MapPoint:
-    """A point in the state, with six values (``ray``) or three. ``descriptor`` (D,): of a feature, else None. ``expected``,
-    ``matched``: number of times it should have been found, and was; ``t`` [s]: the last time it was found.
+    """A point in the state of the filter. Its values are in :class:`SlamState`.
+
+    ``ray``: True if the point has six values (inverse depth), False if it has three (x, y, z).
+    ``descriptor``: the descriptor of a feature, None for a point with a name only. ``t`` [s]: the last time it was matched.
+    ``expected``, ``matched``: the number of images in which it should have been matched, and in which it was matched.
     """
 
     name: str
@@ -59,11 +63,14 @@ class MapPoint:
 
 @dataclass(frozen=True)
 class SlamState:
-    """``robot``, corrections ``constants`` (P,) of the odometry's constants, and ``values`` (D,) of ``points`` one after the other;
-    ``covariance`` (12 + P + D, 12 + P + D) of the error state.
+    """The state of the filter.
 
-    ``tracks``: in the newest image; ``met``: number of points so far; ``lost``: consecutive images without a match;
-    ``image_odometry``: the odometry at the newest image; ``floor``: how level it is, if that is learnt.
+    ``robot``: the state of the robot. ``constants`` (P,): corrections of the odometry's constants.
+    ``covariance`` (12 + P + D, 12 + P + D): the covariance of the error state.
+    ``points``, ``values`` (D,): the points of the state, and their values one point after the other.
+    ``tracks``: the numbers of the feature tracks of the newest image. ``met``: the number of points added since the start.
+    ``lost``: the number of consecutive images without a match. ``image_odometry``: the odometry at the newest image.
+    ``floor``: the estimated standard deviation of the robot's tilt, or None if it is not estimated.
     """
 
     robot: RobotState
@@ -96,40 +103,42 @@ class SlamState:
         )
 
     def sway(self, usual: float) -> tuple[float, float]:
-        """Standard deviation of the tilt [rad], ``usual`` where no floor is learnt, and its time constant [s]."""
+        """Return the standard deviation of the tilt [rad] and its time constant [s]. ``usual``: the standard deviation if none is
+        estimated."""
         return (usual, SETTLING) if self.floor is None else (self.floor.sigma, UNEVEN)
 
     def widened(self, planar: Array) -> SlamState:
-        """The state of a robot whose x, y and heading are less certain, by ``planar`` (3, 3)."""
+        """Return the state with ``planar`` (3, 3) added to the covariance of x, y and heading in the robot's frame."""
         covariance = self.covariance.copy()
         covariance[np.ix_(PLANAR, PLANAR)] += planar
         return replace(self, covariance=covariance)
 
     def moved(self, step: Step) -> SlamState:
-        """The state after a prediction, which changes the robot alone."""
+        """Return the state after a prediction. The points do not move."""
         return replace(self, robot=step.robot, covariance=step.carried(self.covariance))
 
 
 def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
-    """The state ``posterior`` with an update of how level the floor is.
+    """Return the state ``posterior`` with an updated standard deviation of the robot's tilt.
 
-    The evidence is the change of tilt since the last image. Points lean with the robot that observed them first. ``t`` [s]: time of
-    the image.
+    ``prior``, ``posterior``: the states before and after the update by an image at time ``t`` [s]. The evidence is the change of
+    tilt since the previous image, because the position of a point has the error of the tilt from which it was first observed.
     """
     if prior.floor is None or prior.image_odometry is None or t <= prior.image_odometry.t:
         return replace(posterior, floor=prior.floor)
     sigma = prior.floor.sigma
-    share = -math.expm1(-2.0 * (t - prior.image_odometry.t) / UNEVEN)  # of the variance of the tilt that is new
+    share = -math.expm1(-2.0 * (t - prior.image_odometry.t) / UNEVEN)  # fraction of the tilt's variance that is new
     was, now = (positive.inverse(s.covariance[:2, :2]) for s in (prior, posterior))
     gained, known = now - was, prior.covariance[:2, :2] - share * sigma**2 * np.eye(2)
-    weight = np.linalg.inv(np.eye(2) + gained @ known)  # of the evidence for the new part
+    weight = np.linalg.inv(np.eye(2) + gained @ known)  # the part of the evidence that concerns the new tilt
     covariance = positive.inverse(share * weight @ gained + np.eye(2) / sigma**2)
     tilt = math.sqrt(share) * covariance @ weight @ now @ (tilt_of(posterior.robot) - tilt_of(prior.robot))
     return replace(posterior, floor=prior.floor.learnt(tilt, covariance, sigma)[0])
 
 
 def of_mounting(camera: CameraSettings) -> Array:
-    """The covariance (6, 6) of the robot's pose for an exact pose of the camera, from the uncertainty of the mounting."""
+    """Return the covariance (6, 6) of the robot's pose that the uncertainty of the camera's mounting causes, in the robot's
+    frame."""
     u, lever = camera.uncertainty, np.eye(6)
     lever[SHIFT, TURN] = cross(camera.model().position)
     return (lever * np.square((u.roll, u.pitch, u.yaw, u.x, u.y, u.z))) @ lever.T
@@ -137,9 +146,13 @@ def of_mounting(camera: CameraSettings) -> Array:
 
 @dataclass(frozen=True)
 class Sights:
-    """K predicted pixels: ``pixels`` (K, 2), ``depths`` (K,), and Jacobians with respect to the robot's pose (K, 2, 6) and the
-    point's own values (K, 2, 6). ``sizes`` (K,): number of these values; 0 for a map point, which is not in the state.
-    ``starts`` (K,): index of the point's values in the error state. ``noise`` (K, 2, 2) [px^2]: of pixel and map.
+    """The predicted pixels of K points, with Jacobians.
+
+    ``pixels`` (K, 2) [px]. ``depths`` (K,): in front of the camera if positive; scaled by the inverse depth where the point has
+    one.
+    ``by_pose`` (K, 2, 6): Jacobian with respect to the robot's pose. ``by_point`` (K, 2, 6): with respect to the point's values.
+    ``starts`` (K,): index of the point's first value in the error state. ``sizes`` (K,): number of the point's values; 0 for a
+    point of the map, which is not in the state. ``noise`` (K, 2, 2) [px^2]: covariance of pixel noise and map errors.
     """
 
     pixels: Array
@@ -157,7 +170,8 @@ class Sights:
         return Sights(*(getattr(self, name)[rows] for name in Sights.__dataclass_fields__))
 
     def columns(self) -> tuple[Integers, Array]:
-        """The Jacobian (2K, C) with respect to the C values of the error state it depends on, and their indices."""
+        """Return the indices (C,) of the values of the error state that the pixels depend on, and the Jacobian (2K, C) of the
+        pixels with respect to these values."""
         own = np.unique(self.starts[self.sizes > 0], return_index=True, return_inverse=True)
         where, first, which = own
         sizes = self.sizes[self.sizes > 0][first]
@@ -172,7 +186,11 @@ class Sights:
 
 @dataclass(frozen=True)
 class Eye:
-    """A camera: its ``model``, and the Jacobian (6, 6) of its perturbation with respect to that of the robot."""
+    """The camera on the robot. It predicts the pixels of points from a state.
+
+    ``model``: its calibration. ``lift`` (6, 6): Jacobian of a perturbation of the camera's pose with respect to a perturbation of
+    the robot's pose, each in its own frame.
+    """
 
     model: CameraModel
     lift: Array
@@ -182,15 +200,16 @@ class Eye:
         return Eye(model, lift(model))
 
     def pose(self, robot: RobotState) -> tuple[Array, Array]:
-        """Position and rotation of the camera in the world."""
+        """Return position (3,) and rotation (3, 3) of the camera in the world frame."""
         return mounted(self.model, robot.position, robot.rotation)
 
     def predicted(self, state: SlamState) -> CameraPose:
-        """The pose of the camera with its covariance."""
+        """Return the predicted pose of the camera with its covariance."""
         return CameraPose(*self.pose(state.robot), self.lift @ state.covariance[:POSE, :POSE] @ self.lift.T)
 
     def known(self, robot: RobotState, points: Array, covariances: Array | None) -> Sights:
-        """Predicted pixels of map ``points`` (K, 3) with covariances ``covariances`` (K, 3, 3); None: exact."""
+        """Return the predicted pixels of map points with positions ``points`` (K, 3) and ``covariances`` (K, 3, 3). None means
+        exact positions."""
         position, rotation = self.pose(robot)
         pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]
@@ -202,7 +221,7 @@ class Eye:
         return Sights(pixels, depths, by_pose, np.zeros_like(by_pose), nothing, nothing, noise)
 
     def mapped(self, state: SlamState, which: Sequence[int]) -> Sights:
-        """Predicted pixels of the points ``which`` of the state."""
+        """Return the predicted pixels of the points of the state with the indices ``which``."""
         position, rotation = self.pose(state.robot)
         count, starts = len(which), state.starts()[list(which)]
         rays = np.array([state.points[i].ray for i in which], dtype=bool)
@@ -224,7 +243,7 @@ class Eye:
         return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + state.base, sizes, noise)
 
     def all(self, state: SlamState, which: Sequence[int], points: Array, covariances: Array | None) -> Sights:
-        """Predicted pixels (K, 2) of points of the state, then of the map."""
+        """Return the predicted pixels of the points ``which`` of the state, followed by those of map points as in :meth:`known`."""
         first, second = self.mapped(state, which), self.known(state.robot, points, covariances)
         if not len(first) or not len(second):
             return first if len(first) else second
@@ -234,8 +253,11 @@ class Eye:
 
 @dataclass(frozen=True)
 class Innovation:
-    """``carried`` (12 + D, 2K): covariance of state and predicted pixels; ``jacobian`` (2K, C) with respect to the ``columns``
-    (C,) of the error state; ``covariance`` (2K, 2K) of the innovation, without noise.
+    """The covariance of K predicted pixels, for a Kalman update.
+
+    ``carried`` (12 + P + D, 2K): the covariance between the error state and the predicted pixels.
+    ``jacobian`` (2K, C), ``columns`` (C,): the Jacobian of the pixels, and the indices of its columns in the error state.
+    ``covariance`` (2K, 2K) [px^2]: the covariance of the predicted pixels, without pixel noise.
     """
 
     carried: Array
@@ -250,13 +272,13 @@ class Innovation:
         return Innovation(carried, jacobian, columns, jacobian @ carried[columns])
 
     def each(self, noise: Array) -> Array:
-        """The innovation covariance (K, 2, 2) of each pixel, with ``noise`` (K, 2, 2)."""
+        """Return the innovation covariances (K, 2, 2) of the single pixels, including ``noise`` (K, 2, 2)."""
         k = np.arange(len(noise))
         blocks = self.covariance.reshape(2 * noise.shape[:2])
         return np.asarray(blocks[k, :, k, :] + noise)
 
     def total(self, noise: Array) -> Array:
-        """The innovation covariance (2K, 2K), with ``noise`` (K, 2, 2)."""
+        """Return the innovation covariance (2K, 2K) of all pixels, including ``noise`` (K, 2, 2)."""
         total = self.covariance.copy()
         blocks = total.reshape(2 * noise.shape[:2])
         k = np.arange(len(noise))
@@ -264,29 +286,36 @@ class Innovation:
         return total
 
     def root(self, noise: Array) -> Array:
-        """The Cholesky factor (2K, 2K) of :meth:`total`."""
+        """Return the Cholesky factor (2K, 2K) of the innovation covariance, including ``noise`` (K, 2, 2)."""
         return positive.root(self.total(noise))
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
-        """:meth:`root`, and its inverse times ``carried`` transposed."""
+        """Return the Cholesky factor L (2K, 2K) of the innovation covariance, and L^-1 times ``carried`` transposed. The gain of
+        the update is the transpose of the latter times L^-1."""
         root = self.root(noise)
         return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
 
 
 def squared(residual: Array, covariance: Array) -> Array:
-    """Squared Mahalanobis distances (K,) of ``residual`` (K, 2) with ``covariance`` (K, 2, 2)."""
+    """Return the squared Mahalanobis distances (K,) of ``residual`` (K, 2) for the covariances ``covariance`` (K, 2, 2)."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     x, y = residual[:, 0], residual[:, 1]
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))
 
 
 def starting(sigmas: Array) -> Array:
-    """The covariance (12 + P, 12 + P) of a start, except for the pose; ``sigmas`` (P,): of the constants."""
+    """Return the covariance (12 + P, 12 + P) of the error state at the start, with zeros for the pose.
+
+    ``sigmas`` (P,): the standard deviations of the odometry's constants.
+    """
     motion = np.array([0.0] * POSE + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3)
     return np.diag(np.concatenate((motion, sigmas)) ** 2)
 
 
 def widened(noise: Array, residual: Array, innovation: Innovation) -> Array:
-    """The ``noise`` (K, 2, 2), widened beyond the gate by the squared excess."""
+    """Return ``noise`` (K, 2, 2) with larger covariances for the pixels outside the gate of the innovation.
+
+    If the squared Mahalanobis distance of a ``residual`` (K, 2) is r times the gate, with r > 1, its noise is multiplied by r^2.
+    """
     excess = np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE)
     return np.asarray(noise * (excess**2)[:, None, None])

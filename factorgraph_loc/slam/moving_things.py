@@ -1,11 +1,13 @@
-"""Tracks on moving things: a second motion in the image, in addition to that of the wheel odometry.
+"""Detection of feature tracks on moving objects, such as people, by comparison with the wheel odometry.
 
-The odometry predicts the pixel of a static point, up to the unknown distance of the point. Images up to :data:`MAX_TIME` apart
-are compared, since a moving thing agrees with the odometry now and then.
+The odometry predicts the pixel of a static point, up to the unknown distance of the point. Tracks that do not fit this prediction
+may be on a moving object. Images up to :data:`MAX_TIME` apart are compared, because a moving object may agree with the odometry
+for a short time.
 
-Wheels seldom slip. If they do, all static points move in the image as if the robot had turned by another angle. Tracks that seem
-to agree with the odometry then agree with that turn, too. If some tracks agree only with the odometry, the other tracks belong to
-a moving thing, even if they are the majority.
+A slip of the wheels also makes tracks disagree with the odometry. In this case all static points move in the image as if the robot
+had turned by another angle. The tracks that happen to agree with the odometry then agree with this other turn, too. But if some
+tracks agree with the odometry and not with the other turn, the disagreeing tracks belong to a moving object. This holds even if
+they are the majority.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -23,28 +25,36 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 MAX_TIME = 2.0  # s between two images that are compared
-ENOUGH = 8  # tracks that agree with the wheels alone
-EXPLAINED = 0.8  # share of the others that another turn explains
-TURNS, TURN_SIGMA = np.linspace(-0.6, 0.6, 61), 0.01  # rad: other turns that are tried, and error of the nearest one
-FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m, and how many distances of a point are tried
+ENOUGH = 8  # least number of tracks that agree with the odometry and not with another turn
+EXPLAINED = 0.8  # least fraction of the disagreeing tracks that another turn must explain
+# rad: additional turns that are tried, and their standard deviation
+TURNS, TURN_SIGMA = np.linspace(-0.6, 0.6, 61), 0.01
+FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m: bounds of a point's distance; number of distances that are tried
 
 
 class MovingThings:
-    """Remembers the last images, and which tracks stand still; ``moving``: the tracks of these images on moving things."""
+    """Classifies feature tracks as static or moving, from the images of the last :data:`MAX_TIME` seconds.
+
+    ``moving``: the names of the tracks on moving objects.
+    """
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
         self._images: list[tuple[Keyframe, Mapping[Hashable, Array]]] = []
         self.moving: set[Hashable] = set()
-        self._steady: set[Hashable] = set()  # tracks that agreed with the wheels
-        self._doubts = False
+        self._steady: set[Hashable] = set()  # tracks that agreed with the odometry
+        self._doubts = False  # True while the newest image has tracks on moving objects
 
     def is_static(self, name: Hashable) -> bool:
-        """Whether a track is static. While something moves, such a track must have agreed with the odometry."""
+        """True if a track is static. While the image shows moving objects, only tracks that agreed with the odometry are static."""
         return name not in self.moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
-        """Learn from the tracks ``names``, seen at ``pixels`` (K, 2) from a keyframe."""
+        """Update the classification with a new image.
+
+        ``keyframe``: the keyframe of the image. ``names``: its K tracks. ``pixels`` (K, 2): their pixels. ``graph``: supplies the
+        odometry between keyframes.
+        """
         new_pixels = dict(zip(names, pixels, strict=True))
         self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]
         for old_keyframe, old_pixels in reversed(self._images):
@@ -57,7 +67,8 @@ class MovingThings:
         self._doubts = not self.moving.isdisjoint(names)
 
     def _compare(self, old: Mapping[Hashable, Array], new: Mapping[Hashable, Array], step: Increment) -> None:
-        """Learn from the common tracks of two images, pixels by name, and the ``step`` of the odometry between these."""
+        """Update the classification with two images. ``old``, ``new``: the pixel of each track by name. ``step``: the motion of the
+        odometry between the images."""
         common = [name for name in new if name in old]
         if not common:
             return
@@ -73,9 +84,13 @@ class MovingThings:
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
-    """Whether pairs of pixels (K, 2) fit the turn that explains most of the pairs that do not fit the ``step`` of the odometry.
+    """Search another turn of the robot that explains the tracks that disagree with the odometry. Returns a mask (K,) of the tracks
+    that fit this turn.
 
-    None does if most fit the step (``right``), or if no turn explains :data:`EXPLAINED` of the others.
+    ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion of the odometry between the images.
+    ``right`` (K,): mask of the tracks that agree with ``step``.
+    The result is False everywhere if most tracks agree with ``step``, or if no turn explains the fraction :data:`EXPLAINED` of the
+    disagreeing tracks.
     """
     best, unexplained = right, ~right
     if 2 * np.count_nonzero(unexplained) >= len(right):
@@ -92,10 +107,11 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
 
 
 def fitting(model: CameraModel, first: Array, second: Array, step: Increment) -> Truths:
-    """Whether pairs of pixels (K, 2) fit a ``step`` of the robot between them, for some distance of the point.
+    """Return a mask (K,) of the tracks that fit a motion ``step`` of the robot, if the distance of the point is chosen freely.
 
-    Two distances are tried: that where the rays are nearest to each other, and the best one for an error of the step
-    (Gauss-Newton).
+    ``first``, ``second`` (K, 2): the pixels of K tracks before and after the motion. Two distances are tried. The first is where
+    the rays are nearest to each other. The second is a Gauss-Newton step from there, which considers the covariance of the
+    motion.
     """
     first_rays, second_rays = (rays(model, pixels) @ model.rotation.T for pixels in (first, second))
     camera = lifted(model, step.delta, step.covariance)

@@ -1,7 +1,8 @@
-"""Delayed initialization of points that the map lacks: sightings are collected until they determine the point.
+"""Delayed initialization of points that the map lacks: sightings are collected until they determine the position of the point.
 
-The sightings must come from :data:`FEWEST` keyframes with enough parallax for the errors of pixels and poses. Their rays must
-intersect in front of the camera, with small residuals. A sighting that contradicts the others is dropped.
+A sighting is one observation of a point from a keyframe. At least :data:`FEWEST` sightings are needed. Their parallax must be large
+compared with the errors of pixels and poses. Their rays must intersect in front of the camera, with small residuals. A sighting
+that contradicts the other sightings is dropped.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from factors.camera.model import CameraModel
 from factors.camera.triangulation_kernels import MIN_PARALLAX
 from factors.se2 import Array
 
-FEWEST, MAX_WAITING = 3, 10  # sightings of one point
-MAX_SPREAD = 0.15  # standard deviation of an initial point, relative to its least depth
+FEWEST, MAX_WAITING = 3, 10  # least number of sightings of a point, and the number of newest sightings that are stored
+MAX_SPREAD = 0.15  # largest standard deviation of a new point, relative to its least depth in the images
 GATE = 0.999  # probability of the chi-square test of the residuals
 PATIENCE = 20  # keyframes after which a point not seen again is dropped
 UPRIGHT = np.zeros(2)
@@ -29,7 +30,8 @@ UPRIGHT = np.zeros(2)
 
 @dataclass(frozen=True, slots=True)
 class PointSighting:
-    """A point seen from keyframe ``keyframe`` at ``pixel`` (2,), in the direction ``ray`` (3,) of the camera frame."""
+    """An observation of a point from a keyframe. ``keyframe``: its number. ``pixel`` (2,): the observed pixel. ``ray`` (3,): the
+    unit vector from the camera to the point, in the camera frame."""
 
     keyframe: int
     pixel: Array
@@ -37,16 +39,29 @@ class PointSighting:
 
 
 def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[PointSighting]:
-    """The sightings at ``pixels`` (K, 2) from a keyframe."""
+    """Return the sightings of K points at ``pixels`` (K, 2) from the keyframe with number ``keyframe``."""
     rays = reprojection.rays(model, pixels)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     return list(map(PointSighting, repeat(keyframe), pixels, rays))
 
 
+@dataclass(frozen=True)
+class ChosenSightings:
+    """N sightings from a keyframe. ``rows``: their rows in the measurement. ``names``: the name of each point, or the number of its
+    track. ``pixels`` (N, 2): the observed pixels."""
+
+    rows: list[int]
+    names: list[Hashable]
+    pixels: Array
+    sightings: list[PointSighting]
+
+
 @dataclass(frozen=True, slots=True)
 class KeyframeCamera:
-    """Camera pose of a keyframe: ``centre`` (3,) and ``rotation`` (3, 3) in the world, and the pixel error ``slack`` [px] that
-    its uncertainty causes.
+    """The camera pose of a keyframe.
+
+    ``centre`` (3,), ``rotation`` (3, 3): position and orientation of the camera in the world frame. ``slack`` [px]: the pixel error
+    that the uncertainty of the pose causes.
     """
 
     centre: Array
@@ -55,13 +70,17 @@ class KeyframeCamera:
 
     @classmethod
     def of(cls, model: CameraModel, pose: Array, slack: float, tilt: Array = UPRIGHT) -> KeyframeCamera:
-        """The camera of a robot at ``pose`` (3,) with this ``tilt`` (2,) [rad]."""
+        """Return the camera pose of a robot at the planar ``pose`` (3,) with ``tilt`` (2,), its roll and pitch [rad]."""
         return cls(*reprojection.camera_pose(model, pose, tilt), slack)
 
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """A point's ``position`` (3,), ``covariance`` (3, 3) for exact poses, and squared whitened residuals (M,) of its sightings."""
+    """A triangulated point.
+
+    ``position`` (3,): in the world frame. ``covariance`` (3, 3): of the position, if the camera poses are exact. ``squared`` (M,):
+    squared whitened residuals of the sightings.
+    """
 
     position: Array
     covariance: Array
@@ -69,37 +88,43 @@ class TriangulatedPoint:
 
 
 class NewPoints:
-    """The collected sightings of points that are not initialized yet, ``waiting`` by name or number of the point."""
+    """Collects the sightings of points until the points can be triangulated.
+
+    ``waiting``: the sightings of each point that is not triangulated yet, by its name or by the number of its track.
+    """
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
         self.waiting: dict[Hashable, list[PointSighting]] = {}
 
     def count(self, name: Hashable) -> int:
-        """The number of collected sightings of a point."""
+        """Return the number of collected sightings of a point."""
         return len(self.waiting.get(name, ()))
 
     def add(self, name: Hashable, sighting: PointSighting) -> None:
-        """Add a sighting; the oldest ones are dropped."""
+        """Add a sighting of the point ``name``. If the point then has more than :data:`MAX_WAITING`, the oldest is dropped."""
         waiting = self.waiting.setdefault(name, [])
         waiting.append(sighting)
         del waiting[:-MAX_WAITING]
 
     def those(self, trusted: Callable[[Hashable], bool]) -> Mapping[Hashable, Sequence[PointSighting]]:
-        """The collected sightings of ``trusted`` points."""
+        """Return the collected sightings of the points for which ``trusted`` returns True."""
         return {name: sightings for name, sightings in self.waiting.items() if trusted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
-        """Drop the points that were last seen long before a keyframe, and the ``wrong`` ones."""
+        """Drop the points ``wrong``, and those without a sighting in the last :data:`PATIENCE` keyframes before number
+        ``keyframe``."""
         since = keyframe - PATIENCE
         self.waiting = {k: v for k, v in self.waiting.items() if v[-1].keyframe >= since and k not in wrong}
 
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
-        """Remove and return at most ``most`` determined points of ``names``, with the used sightings.
+        """Triangulate the points ``names``, and stop collecting those with a result.
 
-        ``places``: camera poses of keyframes, None for a keyframe that nothing can be added to.
+        ``places``: a function that returns the camera pose of a keyframe by number, or None for a keyframe that accepts no factors.
+        ``most``: the largest number of results.
+        Returns for each triangulated point its name, the point, and the consistent sightings.
         """
         determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}
@@ -127,7 +152,7 @@ def has_parallax(
     last: PointSighting,
     last_camera: KeyframeCamera,
 ) -> bool:
-    """Cheap test whether two rays alone nearly determine the point."""
+    """True if the angle between the rays of two sightings is large enough for a triangulation. This is a cheap first test."""
     sigma = math.hypot(model.sigma, max(first_camera.slack, last_camera.slack)) / model.fx
     angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
     return float((first_camera.rotation @ first.ray) @ (last_camera.rotation @ last.ray)) < math.cos(angle)
@@ -136,9 +161,10 @@ def has_parallax(
 def agreed(
     model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
-    """The point of ``sightings`` from ``places``, and its consistent sightings; None if they do not determine it.
+    """Triangulate a point without outliers. Returns the point and its consistent sightings.
 
-    Sightings that contradict the point are removed one by one, such that the remaining ones agree best.
+    ``places``: the camera pose of each of the ``sightings``. While the residuals are too large, the sighting is removed whose
+    removal leaves the smallest residuals. Returns None if the remaining sightings do not determine the point.
     """
     sightings, places = list(sightings), list(places)
     point = triangulate(model, sightings, places)
@@ -158,17 +184,17 @@ def agreed(
 
 
 def _fits(point: TriangulatedPoint, sightings: Sequence[PointSighting]) -> bool:
-    """Whether the errors of the ``sightings`` of a point may be noise."""
+    """True if the residuals of a point and its ``sightings`` pass a chi-square test."""
     return bool(point.squared.sum() < chi_squared.quantile(GATE, 2 * len(sightings) - 3))
 
 
 def triangulate(
     model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> TriangulatedPoint | None:
-    """Triangulate the point of M ``sightings`` from ``places``: minimise the squared residuals in the images.
+    """Triangulate a point from M ``sightings``, with minimal squared residuals in the images.
 
-    The residuals are infinite where the rays do not intersect in front of the camera. None if the rays are nearly parallel, or do
-    not determine the point to :data:`MAX_SPREAD` times its least depth.
+    ``places``: the camera pose of each sighting. A residual is infinite if the point is not in front of the camera. Returns None if
+    the rays are nearly parallel, or if the standard deviation exceeds :data:`MAX_SPREAD` times the least depth.
     """
     is_determined, *result = kernels.triangulated(
         reprojection.lens_of(model),

@@ -1,4 +1,4 @@
-"""Mapping from images in a graph: points that are estimated."""
+"""The mapper of a factor graph that estimates points from images during a run."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from factors.camera.model import CameraModel
 from factors.camera.point import PointFactor
 from factors.graph import Values, gather
 
-KEYFRAME_INTERVAL = 0.5  # s between images that become keyframes for points that are estimated
-LEAST_COMMON = 0.3  # least share of an image's features in the last keyframe; below it the image becomes a keyframe
+KEYFRAME_INTERVAL = 0.5  # s: longest time between two images that become keyframes
+LEAST_COMMON = 0.3  # an image becomes a keyframe if it shares a smaller fraction of its features with the last keyframe
 
 
 class PointMapper(UnknownPoints):
-    """A mapper of points in images, which need keyframes of their own."""
+    """Adds the points of images to a factor graph as variables. It decides which images become keyframes."""
 
     fewest, horizon, estimates = FEWEST, HORIZON, True
     rejected = "camera: not where it was seen"
@@ -35,13 +35,13 @@ class PointMapper(UnknownPoints):
         self.knows_scale = len(camera.points.map) > 0
         self._things = MovingThings(model)
         self._taken = -math.inf
-        self._tracks: set[Hashable] = set()  # of the last keyframe, without those on things that move
+        self._tracks: set[Hashable] = set()  # of the last keyframe, without those on moving objects
 
     def is_due(self, m: Pixels) -> bool:
         return m.t - self._taken >= KEYFRAME_INTERVAL or self._has_lost_features(m)
 
     def _has_lost_features(self, m: Pixels) -> bool:
-        """Whether an image has little in common with that of the last keyframe."""
+        """True if an image has too few feature tracks in common with the image of the last keyframe."""
         if m.frame is None or not self._tracks:
             return False
         tracks = set(m.frame.tracks.tolist()) - self._things.moving
@@ -74,7 +74,7 @@ class PointMapper(UnknownPoints):
 
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:
-    """The mapper of a run."""
+    """Return the mapper of a run. It maps nothing if the run has no camera, or if only points of the map are used."""
     camera = next((sensor for sensor in sensors.values() if isinstance(sensor, CameraSensor)), None)
     if camera is None or settings.landmarks == "known":
         return Mapper()

@@ -1,8 +1,9 @@
-"""The views of each point of a graph: the last one, and earlier ones for a map.
+"""Views of the points of a graph. A view is the descriptor of a point in one image, with the position of the camera.
 
-A point with a lost track is matched by the descriptor of its last view. The nearest descriptor in the ellipse predicted from pose
-and point is accepted if it is clearly nearer than the second (:func:`factorgraph_loc.vision.matching.match`). Wrong matches
-are rejected later, by consensus with other points.
+The last view of a point is needed to find the point again after its track was lost. Earlier views are stored for the map. A lost
+point is searched in the ellipse predicted from pose and point. The feature with the nearest descriptor is accepted if it is clearly
+nearer than the second (:func:`factorgraph_loc.vision.matching.match`). Wrong matches are rejected later, by consensus with other
+points.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,16 +23,18 @@ from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, camera_pose, linearize_in_space
 from factors.se2 import Array
 
-VIEW_DISTANCE, VIEWS = 0.5, 4  # m travelled between views that a map keeps, and their number for each point
-NOISE = 3.0  # px: of the predicted pixel of a lost point, in addition to the error of the pose
-FARTHEST = 15.0  # m of its depth
+VIEW_DISTANCE, VIEWS = 0.5, 4  # m travelled between two views of a point in a map, and largest number of its views
+NOISE = 3.0  # px: standard deviation of the predicted pixel of a lost point, in addition to the error of the pose
+FARTHEST = 15.0  # m: largest depth of a lost point that is searched
 
 
 @dataclass(frozen=True, slots=True)
 class PointView:
-    """A view of a point: the feature's ``descriptor`` (D,), and the camera position ``seen_from`` (3,).
+    """A view of a point in the image of a keyframe.
 
-    ``travelled`` [m]: distance travelled by the robot until the view. ``keyframe``: its key; ``guess``: of its pose.
+    ``descriptor`` (D,): the descriptor of the feature. ``seen_from`` (3,): the camera position in the world frame.
+    ``travelled`` [m]: the path length of the robot from the start to this view.
+    ``keyframe``: the key of the keyframe's pose. ``guess``: the estimate of this pose at that time, with its covariance.
     """
 
     descriptor: NDArray[Any]
@@ -42,7 +45,7 @@ class PointView:
 
 
 class PointViews:
-    """The last view of each point, by key, by a camera ``model``; others are there for the map at the end."""
+    """The last view of each point, by the point's key. Earlier views are stored for the map at the end of a run."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
@@ -57,7 +60,11 @@ class PointViews:
         return self._views[key]
 
     def keep(self, point: int, frame: CameraFrame, row: int, travelled: float, keyframe: int, guess: Guess) -> None:
-        """Store the view of a ``point`` from the feature ``row`` of a frame, taken at a ``keyframe``."""
+        """Store a view of the point with the key ``point``.
+
+        ``row``: the feature of the point in ``frame``. ``travelled`` [m]: the path length of the robot since the start.
+        ``keyframe``, ``guess``: the key and the estimated pose of the keyframe of the image.
+        """
         self._feature = frame.feature
         seen_from = camera_pose(self._model, guess[0])[0]
         view = PointView(frame.descriptors[row], seen_from, travelled, keyframe, guess)
@@ -73,8 +80,10 @@ class PointViews:
     def refound(
         self, camera: CameraPose, points: Sequence[int], positions: Array, frame: CameraFrame, rows: Sequence[int]
     ) -> list[tuple[int, int]]:
-        """Pairs of a point, by its index in ``points`` (N,) with ``positions`` (N, 3), and its match in the ``rows`` of a frame
-        from about ``camera``.
+        """Search lost points in an image. Returns pairs of an index in ``points`` and a row of ``frame``.
+
+        ``camera``: the predicted camera pose. ``points``: keys of N points. ``positions`` (N, 3): their estimates. ``rows``: the
+        features of ``frame`` that may be matched.
         """
         if not len(points) or not rows:
             return []
@@ -92,22 +101,27 @@ class PointViews:
         return [(int(near[a]), rows[b]) for a, b in matches.indices.tolist()]
 
     def forget(self, points: Iterable[int]) -> None:
-        """Forget the views of these points, by key."""
+        """Delete the views of the points with the keys ``points``."""
         for point in points:
             self._views.pop(point, None)
             self._earlier.pop(point, None)
 
     def map_of(self, names: Sequence[str], keys: Sequence[int], positions: Array, covariances: Array) -> PointMap:
-        """A map of the points, with their last views, in the given order."""
+        """Return a map of points with their last views.
+
+        ``names``, ``keys``, ``positions`` (N, 3), ``covariances`` (N, 3, 3): those of N points, in the order of the map.
+        """
         views = [(i, self._views[key]) for i, key in enumerate(keys) if key in self._views]
         return self._with_views(PointMap.of(tuple(names), positions, covariances), views)
 
     def settled(
         self, points: PointMap, keys: Sequence[int], values: Mapping[int, Array], pose_covariances: Mapping[int, Array]
     ) -> PointMap:
-        """The map of the points ``keys`` with all their views at the poses of their keyframes, which are among ``values``.
+        """Return the map ``points`` with all stored views, at the final poses of their keyframes.
 
-        ``pose_covariances``: body-frame covariances of these poses by key, of the common error of all points of a view.
+        ``keys``: the keys of the points. ``values``: final estimates by key, which include the poses of keyframes.
+        ``pose_covariances``: body-frame covariances of these poses by key. The error of a pose is common to all points that were
+        observed from it.
         """
         rows = [
             (i, view)
@@ -132,7 +146,7 @@ class PointViews:
         return replace(self._with_views(points, rows), seen_from=seen_from, common=common)
 
     def _with_views(self, points: PointMap, rows: Sequence[tuple[int, PointView]]) -> PointMap:
-        """The map with these views, each with the number of its point."""
+        """Return the map ``points`` with views. ``rows``: pairs of the index of a point and one of its views."""
         if not rows:
             return points
         return replace(

@@ -1,7 +1,9 @@
-"""Detection of slip of the wheels between two keyframes, from recently seen points of the graph.
+"""Detection of wheel slip between two keyframes, from recently observed points of the graph.
 
-A factor that chooses the likelier of two noises (Olson, Agarwal, International Journal of Robotics Research 32(7), 2013) has many
-optima, and a graph of points converges to wrong ones. The noise is therefore chosen once, before the keyframe enters the graph.
+If the wheels slipped, the odometry between the keyframes gets a larger noise. The noise is chosen once, before the keyframe is
+added to the graph. The alternative is a factor that chooses the likelier of two noises in each iteration (Olson, Agarwal,
+International Journal of Robotics Research 32(7), 2013). Such a factor has many optima, and a graph of points converges to wrong
+ones.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,8 +20,9 @@ from factors.camera.model import CameraModel
 from factors.motion import Increment, propagate
 from factors.se2 import Array
 
-ENOUGH = 6  # points that must agree
-COMMON_COVARIANCE = np.diag((0.02, 0.02, 0.005)) ** 2  # m, rad: error that all points may have in common
+ENOUGH = 6  # least number of points that must agree with each other
+# m^2, rad^2: covariance of an error that all points have in common
+COMMON_COVARIANCE = np.diag((0.02, 0.02, 0.005)) ** 2
 
 
 def unless_slipped(
@@ -29,10 +32,12 @@ def unless_slipped(
     slip: Callable[[Increment], tuple[Array, float]],
     observed: tuple[Array, Array, Array, Array],
 ) -> Guess:
-    """The ``guess`` of the pose of a new keyframe; if wheels slipped on the step to it, both are less certain from now on.
+    """Return the predicted pose of a new keyframe. If the image shows that the wheels slipped, its covariance is increased.
 
-    ``slip``: see :class:`~factorgraph_loc.sensors.motion.Motion`. ``observed``: points (K, 3), their pixels (K, 2), their
-    covariances (K, 3, 3), and those (K, 2, 2) of the pixels [px^2].
+    In this case also the covariance of ``keyframe.from_previous``, the motion since the previous keyframe, is increased in place.
+    ``guess``: the predicted pose and its covariance. ``slip``: a function of a motion. It returns the covariance (3, 3) that slip
+    adds, and minus the logarithm of the probability of slip. ``observed``: the positions (K, 3) of observed points, their pixels
+    (K, 2), the covariances (K, 3, 3) of the positions, and those (K, 2, 2) of the pixels [px^2].
     """
     step = keyframe.from_previous
     if step is None or keyframe.factor is not None or len(observed[0]) < ENOUGH:
@@ -45,9 +50,10 @@ def unless_slipped(
 
 
 def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
-    """The covariance (3, 3), slip included, of the motion to the ``newest`` of the ``keyframes``; None if its step is unknown.
+    """Return the covariance (3, 3) of the odometry from an earlier keyframe to the ``newest`` one, including detected slip.
 
-    The motion starts at the last keyframe at or before ``t`` [s], or ``most`` steps ago.
+    The earlier keyframe is the last one at or before the time ``t`` [s], but at most ``most`` keyframes before ``newest``.
+    Returns None if there is no odometry from the keyframe before ``newest``.
     """
     steps: list[Increment] = []
     while newest.t > t and newest.from_previous is not None and len(steps) < most:
@@ -62,14 +68,15 @@ def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, m
 def _evidence(
     model: CameraModel, pose: Array, covariances: tuple[Array, Array], observed: tuple[Array, Array, Array, Array]
 ) -> float:
-    """The log-likelihood ratio of the image at ``pose`` (3,) for the second of two covariances (3, 3), relative to the first."""
+    """Return the log-likelihood ratio of an image for the second of two ``covariances`` (3, 3) of the predicted ``pose`` (3,),
+    relative to the first. Returns 0 if too few points agree. ``observed``: see :func:`unless_slipped`."""
     points, pixels, of_points, noise = observed
     agrees = agreeing(model, lifted(model, pose, covariances[1]), points, pixels, noise)
     if np.count_nonzero(agrees) < ENOUGH:
         return 0.0
     factor = ReprojectionFactor(model, points[agrees], pixels[agrees], point_covariances=of_points[agrees])
     update = image_update(factor, pose, covariances[1], ITERATIONS, SETTLED)
-    # information of the image only
+    # the information that the image alone adds
     posterior = positive.inverse(update.covariance)
     gained = positive.inverse(positive.nearest(posterior - positive.inverse(covariances[1])))
     off, gained = gained @ posterior @ update.delta, gained + COMMON_COVARIANCE
@@ -77,6 +84,7 @@ def _evidence(
 
 
 def more_probable(off: Array, covariances: tuple[Array, Array]) -> float:
-    """The log-likelihood ratio of an error ``off`` (D,) for the second of two covariances (D, D), relative to the first."""
+    """Return the log-likelihood ratio of an error ``off`` (D,) for the second of two ``covariances`` (D, D), relative to the
+    first."""
     fits = [positive.squared(off, covariance) + np.linalg.slogdet(covariance)[1] for covariance in covariances]
     return 0.5 * float(fits[0] - fits[1])

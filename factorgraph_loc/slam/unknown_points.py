@@ -1,8 +1,9 @@
-"""Points that the map lacks, as variables of a graph.
+"""Points that the map lacks, as variables of a factor graph.
 
-Their pixels enter the graph at keyframes only. Sightings are collected first (:mod:`.new_points`); once the point is determined
-it becomes a variable, with all of them as factors. From then on its inlier pixels correct the newest keyframe and become factors
-too. A track whose pixels are outliers :data:`STRIKES` times in a row is separated from the point.
+Their pixels are added to the graph at keyframes only. The sightings of a point are collected first (:mod:`.new_points`). Once they
+determine the point, it becomes a variable, and each of its sightings becomes a factor. From then on the inlier pixels of the point
+correct the newest keyframe and become factors too. If a track is an outlier :data:`STRIKES` times in a row, it is no longer used
+for the point.
 """
 
 import math
@@ -22,7 +23,7 @@ from factorgraph_loc.slam.keyframe_cameras import HORIZON, SLACK, KeyframeCamera
 from factorgraph_loc.slam.loop_closure import Image, LoopClosure, OldPoints
 from factorgraph_loc.slam.moving_things import MovingThings
 from factorgraph_loc.slam.new_points import FEWEST as FEWEST_SIGHTINGS
-from factorgraph_loc.slam.new_points import NewPoints, PointSighting, sightings_of
+from factorgraph_loc.slam.new_points import ChosenSightings, NewPoints, PointSighting, sightings_of
 from factorgraph_loc.slam.point_views import PointViews
 from factorgraph_loc.slam.slipping import moved_since, unless_slipped
 from factorgraph_loc.vision.consensus import FEWEST, GATE, CameraPose, Truths, agreeing
@@ -38,21 +39,20 @@ from factors.camera.point import PointFactor, PointPrior
 from factors.graph import VectorPriorFactor, point_key, tilt_key
 from factors.se2 import Array
 
-PER_KEYFRAME, MOST_WAITING = 40, 160  # maximum number of estimated points per keyframe, and of points waiting
-STRIKES = 2
+PER_KEYFRAME, MOST_WAITING = 40, 160  # largest number of estimated points per keyframe, and of other points
+STRIKES = 2  # consecutive outliers
 LEVEL = np.zeros(2)  # no tilt
 PRIOR_SIGMA = 30.0  # m: weak prior of a point, about the size of a building
-SEARCH_TIME = 10.0  # s for which a lost point is searched: after that, too many others in a building look like it
-LEAST_INLIERS = 0.5  # fraction of inliers required of points not seen for longer: similar descriptors agree by chance
-RECENT = 5.0  # s: the error of a point seen since is correlated with that of the track
-REVISITED = 6  # features of points not seen for longer that are accepted together, even if the others disagree
+SEARCH_TIME = 10.0  # s for which a lost point is searched: later, too many other points resemble it
+RECENT = 5.0  # s: the error of a point observed within this time is correlated with the error of the track
+LEAST_INLIERS = 0.5  # required fraction of inliers among points not observed recently: descriptors may agree by chance
+REVISITED = 6  # so many inliers among features not observed recently are accepted, even if recent points disagree
 
 
 @dataclass
 class _Point:
-    """A point of the graph: the time of its last sighting, the information (3, 3) of its sightings for exact poses, and the
-    number of consecutive outliers.
-    """
+    """A point of the graph. ``key``: its variable. ``last`` [s]: the time of its last sighting. ``information`` (3, 3): the
+    information of its sightings, for exact poses. ``strikes``: the number of consecutive outliers."""
 
     key: int
     last: float
@@ -63,7 +63,8 @@ class _Point:
 
 @dataclass(frozen=True)
 class _NewImage:
-    """A new ``keyframe`` with its measurement ``m``, the graph, and its ``addition``; ``model``: the camera, with its estimates."""
+    """The image ``m`` of a new keyframe. ``addition``: receives new factors and variables of ``graph``. ``model``: the camera, with
+    the current estimates of its constants."""
 
     m: Pixels
     keyframe: Keyframe
@@ -72,32 +73,22 @@ class _NewImage:
     model: CameraModel
 
 
-@dataclass(frozen=True)
-class _ChosenSightings:
-    """N sightings from a keyframe: the ``rows`` of the measurement, the ``names`` of the points, and their ``pixels`` (N, 2)."""
-
-    rows: list[int]
-    names: list[Hashable]
-    pixels: Array
-    sightings: list[PointSighting]
-
-
 class UnknownPoints(Mapper):
-    """The points of a graph by name, and those waiting. ``estimated``: camera constants that are variables."""
+    """Adds the points of images to a graph as variables. ``estimated``: the camera constants that the graph estimates."""
 
     def __init__(self, model: CameraModel, diagnostics: Diagnostics, estimated: Estimated = NOTHING) -> None:
         self.model, self.diagnostics, self.estimated = model, diagnostics, estimated
         self._lens = reprojection.lens_of(model)
         self._floor = TiltScale.guessed(model.tilt)
         self._points: dict[Hashable, _Point] = {}
-        self._astray: list[_Point] = []  # in the graph, but no longer seen under their name
-        self._gone: list[_Point] = []  # that have left the graph
-        self._count = 0  # of all points that ever were in the graph
+        self._astray: list[_Point] = []  # points of the graph whose tracks are no longer used
+        self._gone: list[_Point] = []  # points that were removed from the graph
+        self._count = 0  # number of points that were ever added to the graph
         self._new, self._views = NewPoints(model), PointViews(model)
         self._cameras = KeyframeCameras(model, estimated)
         self._loops = LoopClosure()
         self._distance_travelled = 0.0  # m
-        self._again_as: dict[Hashable, Hashable] = {}  # names of points that new tracks continue
+        self._names_by_track: dict[Hashable, Hashable] = {}  # for points that were found again by another track
 
     def take_rows(
         self,
@@ -109,10 +100,10 @@ class UnknownPoints(Mapper):
         addition: Addition,
         movers: MovingThings,
     ) -> Guess:
-        """Turn ``rows`` of what is seen from a new keyframe into factors and variables, and return its pose, corrected by the
-        points.
+        """Add the ``rows`` of a measurement from a new keyframe to the graph. Returns the pose ``guess``, corrected by points.
 
-        The covariance is not reduced: the points are as uncertain as the poses that observed them.
+        The covariance of the pose is not reduced, because the points are as uncertain as the poses that observed them.
+        ``addition``: receives the new factors and variables. ``movers``: the tracks on moving objects.
         """
         model = self.model
         constants = graph.mapped_constants
@@ -123,49 +114,53 @@ class UnknownPoints(Mapper):
         guess = self._cameras.at_image(keyframe.index, guess, graph)
         if keyframe.from_previous is not None:
             self._distance_travelled += float(np.hypot(*keyframe.from_previous.delta[:2]))
-        # those that have been followed for longest come first
+        # the longest tracks come first
         rows = list(rows) if m.frame is None else sorted(rows, key=m.frame.tracks.__getitem__)
-        names = self._named(m, rows, lifted(model, *guess), graph)
+        names = self._names_of(m, rows, lifted(model, *guess), graph)
         certain = self._revisited(image, guess, rows, names)
         chosen = self._chosen(image, rows, names)
-        guess, count = self._see_again(image, guess, chosen, certain)
-        pose = self._begin(image, guess, chosen, PER_KEYFRAME - count, movers)
+        guess, count = self._observe_points(image, guess, chosen, certain)
+        pose = self._add_points(image, guess, chosen, PER_KEYFRAME - count, movers)
         return self._cameras.at_stamp(keyframe.index, (pose, guess[1]), graph)
 
-    def _chosen(self, image: _NewImage, rows: Sequence[int], names: Sequence[Hashable]) -> _ChosenSightings:
-        """Those of the rows with these ``names`` that are used, spread over the image."""
+    def _chosen(self, image: _NewImage, rows: Sequence[int], names: Sequence[Hashable]) -> ChosenSightings:
+        """Select rows that are spread over the image. ``names``: the name of the point of each of the ``rows``."""
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         pixels = np.asarray(image.m.pixels[list(rows)], dtype=float)
         chosen = spread_out(pixels, PER_KEYFRAME + MOST_WAITING, priority).tolist()
         pixels = pixels[chosen]
         sightings = sightings_of(self.model, image.keyframe.index, pixels)
-        return _ChosenSightings([rows[i] for i in chosen], [names[i] for i in chosen], pixels, sightings)
+        return ChosenSightings([rows[i] for i in chosen], [names[i] for i in chosen], pixels, sightings)
 
-    def _see_again(
-        self, image: _NewImage, guess: Guess, chosen: _ChosenSightings, certain: set[int]
+    def _observe_points(
+        self, image: _NewImage, guess: Guess, chosen: ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
-        """Add the observations of points that are in the graph: the guess, corrected by them, and their number. Those in the rows
-        ``certain`` are identified without doubt."""
+        """Add the observations of points of the graph. Returns the pose ``guess``, corrected by these points, and their number.
+
+        ``certain``: the rows whose points were recognized by a loop closure.
+        """
         m, keyframe = image.m, image.keyframe
         old = [i for i, name in enumerate(chosen.names) if name in self._points]
         old = [old[i] for i in spread_out(chosen.pixels[old], PER_KEYFRAME).tolist()]
         names = [chosen.names[i] for i in old]
         known = np.array([chosen.rows[i] in certain for i in old], dtype=bool)
         points = [self._points[name] for name in names]
-        guess, tilt, sigma, right = self._placed(image, points, chosen.pixels[old], guess, known)
-        self._tilts(image, tilt, sigma)
+        guess, tilt, sigma, right = self._corrected(image, points, chosen.pixels[old], guess, known)
+        self._add_tilt(image, tilt, sigma)
         if m.frame is not None:
-            self._remember(m.frame, [chosen.rows[i] for i in old], names, right, keyframe.key, guess)
+            self._store_views(m.frame, [chosen.rows[i] for i in old], names, right, keyframe.key, guess)
         for i, agrees in zip(old, right.tolist(), strict=True):
-            self._again(image, chosen.names[i], chosen.sightings[i], agrees, guess[0])
+            self._add_observation(image, chosen.names[i], chosen.sightings[i], agrees, guess[0])
         self._cameras.anchor(keyframe, int(np.count_nonzero(right)))
         return guess, len(old)
 
-    def _begin(
-        self, image: _NewImage, guess: Guess, chosen: _ChosenSightings, most: int, movers: MovingThings
+    def _add_points(
+        self, image: _NewImage, guess: Guess, chosen: ChosenSightings, most: int, movers: MovingThings
     ) -> Array:
-        """Collect the sightings of other points, and make variables of at ``most`` this many that are determined now. Returns the
-        pose (3,) of the keyframe, adjusted where the points of the graph do not determine it."""
+        """Collect the sightings of points that are not in the graph, and add at ``most`` this many determined points to the graph.
+
+        Returns the pose (3,) of the keyframe. It is adjusted if the points of the graph do not determine it.
+        """
         m, keyframe, graph, addition = image.m, image.keyframe, image.graph, image.addition
         fresh = [i for i, name in enumerate(chosen.names) if name not in self._points]
         for i in fresh:
@@ -191,17 +186,17 @@ class UnknownPoints(Mapper):
             prior = PointPrior.of(pose, point.position, PRIOR_SIGMA)
             addition.hang(keyframe, Node((keyframe.key, key), prior, 3))
             for sighting in sightings:
-                self._hang(image, graph.keyframes[sighting.keyframe], key, sighting)
+                self._add_factor(image, graph.keyframes[sighting.keyframe], key, sighting)
         return pose
 
-    def _named(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
-        """The name of each row: of a feature, the number of its track, or of the track that its point was added with."""
+    def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
+        """Return the name of the point of each row. The point of a feature has the number of the track that it was added with."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
-        gone = self._points.keys() - set(tracks)  # the track that a point was added with may itself return
-        self._again_as = {track: name for track, name in self._again_as.items() if name in gone}
-        names: list[Hashable] = [self._again_as.get(track, track) for track in tracks]
+        gone = self._points.keys() - set(tracks)  # the track that a point was added with may appear again
+        self._names_by_track = {track: name for track, name in self._names_by_track.items() if name in gone}
+        names: list[Hashable] = [self._names_by_track.get(track, track) for track in tracks]
         assigned = set(names)
         lately = [name for name, point in self._points.items() if m.t - point.last < SEARCH_TIME]
         lost = [name for name in lately if name not in assigned and self._points[name].key in self._views]
@@ -217,12 +212,12 @@ class UnknownPoints(Mapper):
         return names
 
     def _follow(self, track: Hashable, name: Hashable) -> None:
-        """Assign the point ``name`` to ``track`` and to no other."""
-        self._again_as = {new_track: of for new_track, of in self._again_as.items() if of != name}
-        self._again_as[track] = name
+        """Assign the point ``name`` to ``track``, and to no other track."""
+        self._names_by_track = {new_track: of for new_track, of in self._names_by_track.items() if of != name}
+        self._names_by_track[track] = name
 
     def _revisited(self, image: _NewImage, guess: Guess, rows: Sequence[int], names: list[Hashable]) -> set[int]:
-        """The ``rows`` of an image that certainly show points last seen long ago; ``names`` are updated to those of the points."""
+        """Recognize points last observed long ago (loop closure). Returns their rows, and writes their names into ``names``."""
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
         if frame is None or not self._loops.is_due(image.m.t):
             return set()
@@ -250,7 +245,7 @@ class UnknownPoints(Mapper):
                 self._follow(int(frame.tracks[row]), old[which])
         return certain
 
-    def _remember(
+    def _store_views(
         self,
         frame: CameraFrame,
         rows: Sequence[int],
@@ -259,17 +254,17 @@ class UnknownPoints(Mapper):
         keyframe: int,
         guess: Guess,
     ) -> None:
-        """Store the views of points in these ``rows`` from a ``keyframe``, by its key; a track that was wrongly assigned to one is
-        separated."""
+        """Store the views of the points ``names`` in the ``rows`` of a frame. ``right``: mask of the inliers. ``keyframe``: key of
+        its pose. An outlier's track is separated from the point if it is not the track that the point was added with."""
         for row, name, agrees in zip(rows, names, right.tolist(), strict=True):
             if agrees:
                 point = self._points[name].key
                 self._views.keep(point, frame, row, self._distance_travelled, keyframe, guess)
-            elif self._again_as.pop(int(frame.tracks[row]), None) is not None:
-                self._points[name].strikes -= 1  # not the fault of the point
+            elif self._names_by_track.pop(int(frame.tracks[row]), None) is not None:
+                self._points[name].strikes -= 1  # the track was wrong: this outlier does not count
 
     def leave(self, t: float) -> list[int]:
-        """Remove the points last seen before ``t``, and return their keys."""
+        """Remove the points last observed before the time ``t`` [s] from the graph, and return their keys."""
         gone = [point for point in (*self._points.values(), *self._astray) if point.last < t]
         self._points = {name: point for name, point in self._points.items() if point.last >= t}
         self._astray = [point for point in self._astray if point.last >= t]
@@ -277,14 +272,14 @@ class UnknownPoints(Mapper):
         return [point.key for point in gone]
 
     def keep_only(self, keys: set[int]) -> None:
-        """Remove the points of the graph without these ``keys``, and all waiting ones."""
+        """Delete all points whose key is not in ``keys``, and all collected sightings of points that are not in the graph."""
         self._views.forget({point.key for point in (*self._points.values(), *self._astray)} - keys)
         self._points = {name: point for name, point in self._points.items() if point.key in keys}
         self._astray = [point for point in self._astray if point.key in keys]
         self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def forget(self, first: Keyframe) -> list[int]:
-        """Forget the keyframes before the ``first``, and the points that have left the graph and were not seen since.
+        """Delete the data of keyframes before ``first``, and of removed points that were not observed from ``first`` or later.
         Returns the keys of these points."""
         forgotten = [point.key for point in self._gone if point.last < first.t]
         self._gone = [point for point in self._gone if point.last >= first.t]
@@ -293,8 +288,8 @@ class UnknownPoints(Mapper):
         return forgotten
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        """All points that were ever in the graph and are not forgotten, under the first of their keys; features with some views.
-        ``values`` and ``covariances`` include those of keyframes."""
+        """Return a map of all stored points, including those removed from the graph. If a point has several keys, the first is
+        used. ``values``, ``covariances``: estimates by key, of points and keyframes. Returns None if there are no points."""
         keys: dict[str, int] = {}
         for point in sorted((*self._points.values(), *self._astray, *self._gone), key=lambda point: point.key):
             if point.key in values:
@@ -305,8 +300,8 @@ class UnknownPoints(Mapper):
         points = PointMap.of(tuple(keys), positions, of_points)
         return self._views.settled(points, tuple(keys.values()), values, covariances)
 
-    def _tilts(self, image: _NewImage, tilt: Array, sigma: float) -> None:
-        """Make a variable of the ``tilt`` of the robot at a new keyframe, of a floor that is level to ``sigma`` [rad]."""
+    def _add_tilt(self, image: _NewImage, tilt: Array, sigma: float) -> None:
+        """Add the robot's ``tilt`` (2,) at a new keyframe as a variable with prior zero and standard deviation ``sigma`` [rad]."""
         keyframe, graph = image.keyframe, image.graph
         key = tilt_key(keyframe.index)
         if key in graph.values:
@@ -316,14 +311,15 @@ class UnknownPoints(Mapper):
         native = gtsam.PriorFactorVector(key, LEVEL, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
         image.addition.hang(keyframe, Node((key,), VectorPriorFactor(LEVEL, sigmas), 2, native))
 
-    def _placed(
+    def _corrected(
         self, image: _NewImage, points: list[_Point], pixels: Array, guess: Guess, known: Truths
     ) -> tuple[Guess, Array, float, Truths]:
-        """The pose corrected by points of the graph, the tilt (2,) of the robot with its prior standard deviation, and whether each
-        point is an inlier.
+        """Correct the pose ``guess`` by observed ``points`` of the graph. Returns pose, tilt (2,) of the robot, prior standard
+        deviation of the tilt, and a mask of the inliers.
 
-        Points not seen for long must agree with each other, but not with the rest, as the track has drifted since. A few points
-        cannot confirm each other, and are used only if they have names: a wrong one may agree with an uncertain pose.
+        Recent points and old points are tested separately, because the track has drifted since the old ones. A few points cannot
+        confirm each other. They are used only if they have names, because a wrong feature may agree with an uncertain pose.
+        ``known``: mask of the points recognized by a loop closure.
         """
         model, keyframe, graph, named = image.model, image.keyframe, image.graph, image.m.names is not None
         sigma = self._floor.sigma
@@ -335,15 +331,12 @@ class UnknownPoints(Mapper):
         _, _, by_point = reprojection.linearize_in_space(model, camera.position, camera.rotation, positions)
         noise = (model.sigma**2 + SLACK**2) * np.eye(2) + by_point @ covariances @ by_point.transpose(0, 2, 1)
         recent = np.array([keyframe.t - point.last < RECENT for point in points])
-        level, observed = (
-            replace(model, tilt=sigma),
-            (positions[recent], pixels[recent], covariances[recent], noise[recent]),
-        )
-        guess = unless_slipped(level, keyframe, guess, graph.motion.slip, observed)
+        observed = positions[recent], pixels[recent], covariances[recent], noise[recent]
+        guess = unless_slipped(replace(model, tilt=sigma), keyframe, guess, graph.motion.slip, observed)
         since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
-        near = guess if since is None else (guess[0], since)  # of a pose among the points that were seen since
+        near = guess if since is None else (guess[0], since)  # covariance relative to the recent points
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
-        # a name needs one other to confirm it
+        # a named point needs one other point that confirms it
         revisited = max(2 if named else REVISITED, math.ceil(LEAST_INLIERS * np.count_nonzero(~recent & ~known)))
         for which, enough in ((recent, FEWEST), (~recent & ~known, revisited)):
             agrees = np.zeros(len(points), dtype=bool)
@@ -358,7 +351,7 @@ class UnknownPoints(Mapper):
                 factor = replace(factor, model=replace(model, tilt=unlevel))
                 update = image_update(factor, *guess, ITERATIONS, SETTLED)
                 pose = se2.compose(guess[0], se2.exp(update.delta))
-                if which is recent and jumps(near, pose):  # a few wrong points agree, too
+                if which is recent and jumps(near, pose):  # a few wrong points may agree by chance
                     continue
                 placed, self._floor, sigma = (pose, guess[1]), floor, unlevel
                 tilt = sigma * factor.levelled([pose])[1]
@@ -371,8 +364,10 @@ class UnknownPoints(Mapper):
             right |= agrees
         return placed, tilt, sigma, right
 
-    def _again(self, image: _NewImage, name: Hashable, sighting: PointSighting, agrees: bool, pose: Array) -> None:
-        """Add an observation of a point that is in the graph already."""
+    def _add_observation(
+        self, image: _NewImage, name: Hashable, sighting: PointSighting, agrees: bool, pose: Array
+    ) -> None:
+        """Add an observation of the point ``name`` of the graph, or count an outlier if ``agrees`` is False."""
         point = self._points[name]
         if not agrees:
             self.diagnostics.reject("camera: does not agree with the others")
@@ -387,10 +382,10 @@ class UnknownPoints(Mapper):
         point.strikes, point.last = 0, image.keyframe.t
         _, _, by_point, _ = reprojection.linearize(image.model, pose, position[None])
         point.information += by_point[0].T @ by_point[0] / image.model.sigma**2
-        self._hang(image, image.keyframe, point.key, sighting)
+        self._add_factor(image, image.keyframe, point.key, sighting)
 
-    def _hang(self, image: _NewImage, keyframe: Keyframe, key: int, sighting: PointSighting) -> None:
-        """Add the factor of a ``sighting`` of a point from a keyframe."""
+    def _add_factor(self, image: _NewImage, keyframe: Keyframe, key: int, sighting: PointSighting) -> None:
+        """Add the factor of a ``sighting`` of the point with this ``key`` from ``keyframe``."""
         constants = image.graph.mapped_constants
         keys = (keyframe.key, *(() if constants is None else (constants,)), tilt_key(keyframe.index), key)
         twist = self._cameras.twists.get(keyframe.index)

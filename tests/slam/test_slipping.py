@@ -168,7 +168,7 @@ def placed(moved, last, step=KNOWN):
     none = np.zeros(len(FEW), dtype=bool)
     named = SimpleNamespace(names=tuple("abcd"))
     image = SimpleNamespace(m=named, keyframe=keyframes[1], graph=graph, model=MODEL)
-    (pose, _), _, _, right = points._placed(image, known, pixels, GUESS, none)
+    (pose, _), _, _, right = points._corrected(image, known, pixels, GUESS, none)
     return pose, np.count_nonzero(right)
 
 
