@@ -1,8 +1,8 @@
 """Bundle adjustment of points and cameras in one GTSAM graph.
 
-After Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000: projection factors with Huber
-loss, a prior on each camera pose, Levenberg-Marquardt. Outliers are removed and the rest is adjusted again. Covariances come
-from the Schur complement on the cameras, which are few compared to the points.
+The graph has projection factors with a Huber loss and a prior on each camera pose. It is solved by Levenberg-Marquardt (Triggs,
+McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000). Outliers are removed, and the remaining
+observations are adjusted again. Covariances are computed by the Schur complement on the cameras, which are fewer than the points.
 """
 
 from __future__ import annotations
@@ -21,27 +21,29 @@ from factorgraph_loc.vision.consensus import Truths
 from factors.camera.model import CameraModel, undistorted
 from factors.se2 import Array, Integers
 
-ROUNDS = 3
-# standard deviations of a pixel beyond which an observation is an outlier, in the first round and later
+ROUNDS = 3  # largest number of adjustments; outliers are removed after each one
+# an observation is an outlier beyond so many standard deviations of a pixel: after the first adjustment, and later
 LOOSE, OUTLIER = 6.0, 3.5
 ITERATIONS = 20
-RELATIVE, ABSOLUTE = 1e-4, 1e-4  # decrease of the cost at which to stop
+RELATIVE, ABSOLUTE = 1e-4, 1e-4  # the optimization ends if the cost decreases by less
 FOCAL_SIGMA, ASPECT_SIGMA = 0.1, 0.005  # standard deviations of an unknown focal length and of fx / fy, relative
 CENTRE_SIGMA = 0.01  # standard deviation of an unknown principal point, relative to the focal length
 LENS_SIGMA = (0.1, 0.1, 0.003, 0.003)  # standard deviations of an unknown distortion
 FIXED = 1e-5  # standard deviation of the known calibration constants
 POINT_SIGMA = 1000.0  # m, prior standard deviation of a point
-CHUNK = 500  # points per computation of covariances
+CHUNK = 500  # number of points whose covariances are computed at once, to limit the memory
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Result of :func:`adjust`: ``model`` (with the adjusted constants, if they were variables), ``cameras``, and ``points``
-    (T, 3) [m] of ``tracks`` without outliers; ``old`` (T,): indices of the points in the input. ``errors`` (N, 2) [px]: of the
-    observations.
+    """The result of a bundle adjustment with F cameras, T points and N observations.
 
-    ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first; ``point_covariances`` (T, 3,
-    3) [m^2]: marginals, including the uncertainty of the cameras but not of the constants.
+    ``model``: the camera's calibration, adjusted if that was requested. ``cameras``: the adjusted poses.
+    ``tracks``: the observations without outliers. ``points`` (T, 3) [m]: the adjusted positions of their points.
+    ``old`` (T,): the index of each point in the input. ``errors`` (N, 2) [px]: the residuals, predicted minus measured.
+    ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first.
+    ``point_covariances`` (T, 3, 3) [m^2]: of the points. Both include the uncertainty of cameras and points, but not that of the
+    calibration.
     """
 
     model: CameraModel
@@ -65,10 +67,12 @@ def adjust(
     lens: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:
-    """Adjust ``points`` (T, 3) and ``cameras``, whose prior poses have ``covariances`` (F, 6, 6), see :class:`Bundle`.
+    """Adjust points and camera poses.
 
-    ``focal``: whether to estimate the focal lengths; ``lens``: and the principal point and the distortion, if it is Brown's. Raises
-    RuntimeError if the graph cannot be solved.
+    ``cameras``, ``covariances`` (F, 6, 6): the prior poses and their covariances, in the cameras' own frames, rotation first.
+    ``tracks``: the observations. ``points`` (T, 3): the initial positions. ``focal``: estimate the focal lengths too. ``lens``:
+    estimate the focal lengths, the principal point and the distortion (Brown's model) too. ``progress``: is called with the
+    fraction done. Raises RuntimeError if the graph cannot be solved.
     """
     old = np.arange(len(points))
     fixed = gtsam.NonlinearFactorGraph()
@@ -93,7 +97,8 @@ def adjust(
 
 
 def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
-    """Observations (N,) with residuals of at most ``limit`` standard deviations, of points that retain two of them or more."""
+    """Return a mask (N,) of the observations whose residual is at most ``limit`` standard deviations. A point with fewer than two
+    such observations has none."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     count = np.bincount(tracks.track[right], minlength=tracks.count)
@@ -103,8 +108,10 @@ def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array
 def marginals(
     model: CameraModel, cameras: Cameras, information: Array, tracks: Tracks, points: Array
 ) -> tuple[Array, Array]:
-    """Marginal covariances of the cameras (F, 6, 6) and points (T, 3, 3), linearised at the input; ``information`` (F, 6, 6):
-    of the cameras' priors.
+    """Return the marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised at the given poses and
+    points.
+
+    ``information`` (F, 6, 6): the inverse covariances of the cameras' prior poses.
     """
     count, total = len(cameras), tracks.count
     _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
@@ -114,7 +121,7 @@ def marginals(
     of_cameras = np.array(information)
     np.add.at(of_cameras, tracks.frame, np.einsum("nij,nik->njk", by_camera, by_camera))
     inverse = np.linalg.inv(of_points)
-    # minus the change (3, 6) of a point's best position by its camera's perturbation, for each observation
+    # for each observation, minus the derivative (3, 6) of the point's optimal position by the perturbation of the camera
     gains = np.einsum("nij,nkj,nkl->nil", inverse[tracks.track], by_point, by_camera)
     gain = _sparse(gains, tracks.track, tracks.frame, (3 * total, 6 * count))
     cross = _sparse(np.einsum("nki,nkj->nij", by_camera, by_point), tracks.frame, tracks.track, (6 * count, 3 * total))
@@ -135,13 +142,13 @@ def pose3(position: Array, rotation: Array) -> gtsam.Pose3:
 
 
 def robust_noise(model: CameraModel) -> Any:
-    """Pixel noise with Huber loss."""
+    """Return GTSAM's noise model of a pixel, with a Huber loss."""
     huber = gtsam.noiseModel.mEstimator.Huber.Create(model.robust)
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, model.sigma))
 
 
 def _unknown_constants(model: CameraModel, *, lens: bool) -> Array:
-    """The covariance (9, 9) of (fx, fy, skew, cx, cy, k1, k2, p1, p2) if only a data sheet is available."""
+    """Return the prior covariance (9, 9) of (fx, fy, skew, cx, cy, k1, k2, p1, p2) for a calibration from a data sheet."""
     covariance = FIXED**2 * np.eye(9)
     focal = np.array((model.fx, model.fy))
     covariance[:2, :2] += FOCAL_SIGMA**2 * np.outer(focal, focal) + ASPECT_SIGMA**2 * np.diag(focal**2)
@@ -163,7 +170,7 @@ def _optimized(
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.push_back(fixed)
     pinhole, pixels = model, tracks.pixels
-    if not model.is_brown:  # GTSAM has no such lens
+    if not model.is_brown:  # GTSAM does not support this distortion: adjust undistorted pixels of a pinhole camera
         pinhole = replace(model, distortion=(0.0,) * 4, fisheye=False)
         pixels = undistorted(model, pixels) * (model.fx, model.fy) + (model.cx, model.cy)
     calibration = pinhole.calibration()
@@ -194,7 +201,8 @@ def _optimized(
 
 
 def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:
-    """The sparse block matrix with ``blocks`` (N, r, c) at block indices ``rows`` and ``columns``."""
+    """Return the sparse matrix of ``shape`` with ``blocks`` (N, r, c) at the block rows ``rows`` (N,) and block columns ``columns``
+    (N,). Blocks at the same place are added."""
     _, height, width = blocks.shape
     i = np.broadcast_to(height * rows[:, None, None] + np.arange(height)[:, None], blocks.shape)
     j = np.broadcast_to(width * columns[:, None, None] + np.arange(width), blocks.shape)

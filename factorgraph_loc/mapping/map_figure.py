@@ -17,13 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FAR = 10.0  # median absolute deviations beyond which points are not drawn
+FAR = 10.0  # points farther from the median than so many median absolute deviations are not drawn
 LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Plot given and learnt tags as :func:`figure` does, labelled by the end of the EPC, with the candidates of ambiguous tags
-    and given tags that were not located.
+    """Plot a new map of tags, with the given map and the trajectory. Tags are labelled by the last characters of their EPC.
+
+    In addition to :func:`figure`, candidate positions of ambiguous tags are drawn, and given tags that were not located.
     """
     out = figure(log, made.made, made.poses, LABEL)
     axis = out.axes[0]
@@ -47,7 +48,11 @@ def dropped_figure(
     poses: Array,
     walls: Sequence[tuple[float, ...]] = (),
 ) -> Figure:
-    """Plot tags at their ``places`` (2,) by EPC, those that are ``dead`` crossed out, and the trajectory ``poses`` (N, 3)."""
+    """Plot a map of tags with those that are believed dead crossed out.
+
+    ``places``: the position (2,) of each tag by EPC. ``dead``: the EPCs of dead tags. ``poses`` (N, 3): the trajectory. ``walls``:
+    (x1, y1, x2, y2) of each wall.
+    """
     kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
     out, axis = _from_above(f"{log}: dead tags of the map", (np.array(list(places.values())), poses[:, :2]), walls)
     axis.plot(*poses[:, :2].T, color="0.75", linewidth=1.0, label="trajectory", zorder=1)
@@ -61,7 +66,11 @@ def dropped_figure(
 
 
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
-    """Plot given landmarks, learnt ones with 2-sigma ellipses, and the trajectory ``poses`` (N, 3) in the map's frame."""
+    """Plot a new map of landmarks with 2-sigma ellipses, the landmarks of the given map, and the trajectory.
+
+    ``log``: the name of the log. ``poses`` (N, 3): the trajectory in the frame of the new map. ``label``: the number of last
+    characters of a landmark's name that are shown; 0 shows the whole name.
+    """
     given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
     learnt = [e for e in made.entries if e.learnt is not None]
     places = np.array([e.learnt.position for e in learnt if e.learnt is not None]).reshape(-1, 2)
@@ -85,9 +94,12 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
 
 
 def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tuple[float, ...]] = ()) -> Figure:
-    """Plot points from above, coloured by height, and the camera positions ``cameras`` (F, 3)."""
+    """Plot a map of points from above, coloured by height.
+
+    ``log``: the name of the log. ``cameras`` (F, 3): the camera positions. ``walls``: (x1, y1, x2, y2) of each wall.
+    """
     off = np.abs(points.positions - np.median(points.positions, axis=0))
-    # a few distant points would shrink all others
+    # a few distant points would make the scale of the plot too small
     shown = points.positions[np.all(off <= np.maximum(FAR * np.median(off, axis=0), 1.0), axis=1)]
     out, axis = _from_above(f"{log}: map of {len(points)} points", (shown[:, :2], cameras[:, :2]), walls)
     axis.plot(*cameras[:, :2].T, color=COLOURS[1], linewidth=1.0, label="camera", zorder=3)
@@ -98,7 +110,8 @@ def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tup
 
 
 def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float, ...]] = ()) -> tuple[Figure, Axes]:
-    """A figure in the shape of all ``places`` (N, 2), with walls, and its only axes."""
+    """Create a figure with one pair of axes, in the shape of the area of all ``places`` (N, 2), and draw the walls. Returns figure
+    and axes."""
     width, depth = np.maximum(np.ptp(np.concatenate(places), axis=0), 1.0)
     out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), title)
     axis: Axes = axes[0, 0]
@@ -110,5 +123,5 @@ def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float
 
 
 def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
-    """Whether a given landmark is in the new map's frame: a given map that could not be aligned is not."""
+    """True if the given position of a landmark is in the frame of the new map. It is not if the given map could not be aligned."""
     return made.judged or verdict == "given"

@@ -1,14 +1,14 @@
-"""Maps of identified landmarks from the landmarks that a run estimated, and comparison with a given map.
+"""Maps of identified landmarks that a run estimated, and their comparison with a given map.
 
 A run without a map has a frame of its own. Its landmarks are aligned with those of a given map by one rotation and translation.
-The alignment is robust, as some given landmarks may be wrong. It starts with sample consensus over pairs of landmarks (Fischler
-and Bolles, "Random sample consensus", 1981). The cost is truncated (Torr and Zisserman, "MLESAC", 2000) and scaled by the least
-median of squares (Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5). Weighted least squares on
-the inliers follow; inliers are selected again after each iteration.
+The alignment is robust, because some given landmarks may be wrong. It starts with sample consensus over pairs of landmarks
+(Fischler and Bolles, "Random sample consensus", 1981). The cost is truncated (Torr and Zisserman, "MLESAC", 2000) and scaled by
+the least median of squares (Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5). Weighted least
+squares on the inliers follow. The inliers are selected again in each iteration.
 
-The covariances of the run include the drift between its start and the landmarks. It is common to all landmarks and removed by
-the alignment. The covariances are therefore scaled by the variance of unit weight of the inliers (Koch, "Parameter Estimation
-and Hypothesis Testing in Linear Models", 1999).
+The covariances of the run include the drift between its start and the landmarks. This part is common to all landmarks, and the
+alignment removes it. The covariances are therefore scaled by the variance of unit weight of the inliers (Koch, "Parameter
+Estimation and Hypothesis Testing in Linear Models", 1999).
 """
 
 from collections import Counter
@@ -29,10 +29,10 @@ from factors import positive, se2
 from factors.se2 import Array
 
 GATE = 13.816  # 99.9 % of chi-square with two degrees of freedom
-MEDIAN = 1.386  # 50 % of the same
+MEDIAN = 1.386  # 50 % of chi-square with two degrees of freedom
 TOLERANCE = 0.15  # m; a smaller deviation of a landmark is never significant
-# verdicts on landmarks that are not wrong, and how a summary counts them
-UNSEEN = "not seen"  # verdict
+UNSEEN = "not seen"  # the verdict on a given landmark without measurements in the log
+# verdicts on landmarks that are not wrong, and their text in a summary
 VERDICTS = {
     "agrees": "agreeing with the given one",
     "given": "as given",
@@ -40,18 +40,20 @@ VERDICTS = {
     UNSEEN: "not seen",
     "not judged": "not judged",
 }
-MIN_COMMON = 3  # landmarks: two can always be aligned with two others at the same distance
+MIN_COMMON = 3  # landmarks in both maps: with two, a wrong one could not be detected
 UNJUDGED = ": it is not judged; the new map is in the frame of the run's start"  # end of a note
-FACTORS = (0.01, 4.0)  # bounds of the variance factor
-MAX_PAIRS = 5000  # if there are more, this many are drawn at random
+FACTORS = (0.01, 4.0)  # bounds of the factor by which covariances are scaled
+MAX_PAIRS = 5000  # if there are more pairs of landmarks, this many are drawn at random
 MAX_ITERATIONS = 20
 CONVERGED = 1e-9  # m and rad
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One landmark: its ``given`` position (2,) or None; its ``learnt`` position in the new map's frame or None; and the
-    verdict, ``flagged`` if the given position is wrong.
+    """One landmark in the comparison of a new map with a given map.
+
+    ``landmark``: its name. ``given``: its position (2,) in the given map, or None. ``learnt``: its estimate in the frame of the new
+    map, or None. ``verdict``: the result of the comparison, such as "agrees". ``flagged``: True if the given position is wrong.
     """
 
     landmark: str
@@ -62,23 +64,24 @@ class Entry:
 
     @property
     def distance(self) -> float | None:
-        """Distance between the given and the learnt position [m]."""
+        """Distance [m] between the given and the learnt position, or None if one of both is missing."""
         if self.given is None or self.learnt is None:
             return None
         return float(np.hypot(*(self.learnt.position - self.given)))
 
     @property
     def sigma(self) -> float | None:
-        """Standard deviation [m] of the learnt position in its least certain direction."""
+        """Standard deviation [m] of the learnt position in its least certain direction, or None if nothing was learnt."""
         return None if self.learnt is None else float(positive.worst_sigma(self.learnt.covariance))
 
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """A map, and how it was made.
+    """A new map of landmarks, and its comparison with the given map.
 
-    ``frame`` (3,): pose of the run's frame in the map's. ``judged``: whether the log's map was compared with it, so that both
-    have one frame. ``notes`` for the user.
+    ``world``: the new map. ``entries``: one per landmark of both maps. ``frame`` (3,): the pose of the run's frame in the frame of
+    the new map. ``judged``: True if the new map was compared with the given map; both then have the same frame. ``notes``: messages
+    for the user.
     """
 
     world: World
@@ -89,7 +92,7 @@ class LandmarkMap:
 
     @property
     def unseen(self) -> tuple[str, ...]:
-        """Names of the landmarks that were not seen, whose given positions are kept."""
+        """Names of the given landmarks without measurements. The new map has their given positions."""
         return tuple(entry.landmark for entry in self.entries if entry.verdict == UNSEEN)
 
     @property
@@ -98,7 +101,7 @@ class LandmarkMap:
         return tuple(entry.landmark for entry in self.entries if entry.flagged)
 
     def summary(self, what: str = "landmarks") -> str:
-        """A summary in one sentence."""
+        """Return a summary in one sentence. ``what``: the plural noun for the mapped objects."""
         counts = Counter("flagged" if entry.flagged else entry.verdict for entry in self.entries)
         text = f"{len(self.world.landmarks)} {what} are in the new map"
         parts = [f"{counts[verdict]} {VERDICTS[verdict]}" for verdict in VERDICTS if counts[verdict]]
@@ -109,9 +112,11 @@ class LandmarkMap:
 
 @dataclass(frozen=True)
 class Alignment:
-    """``pose`` (3,) that moves points onto targets, its ``covariance`` (3, 3) of (x, y, angle), and the number of inliers.
+    """The alignment of a new map with a given map.
 
-    ``factor``: scale of the points' covariances.
+    ``pose`` (3,): the transform from the frame of the new map to that of the given map. ``covariance`` (3, 3): of its x, y and
+    angle.
+    ``inliers``: the number of landmarks that agree. ``factor``: the covariances of the new landmarks must be multiplied by it.
     """
 
     pose: Array
@@ -126,18 +131,19 @@ IN_FRAME = Alignment(np.zeros(3), np.zeros((3, 3)), 0, 1.0)
 def make_map(
     log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = False, in_frame: bool = False
 ) -> LandmarkMap:
-    """Make a map of the ``learnt`` landmarks of a run on ``log``.
+    """Make a map of the ``learnt`` landmarks, which a run on ``log`` estimated.
 
-    ``extend``: the run used the log's map and learnt what it lacks; its landmarks do not change. Otherwise the run used no
-    map. If the log has one, the learnt landmarks are aligned with it (unless they are ``in_frame`` already) and its landmarks
-    are judged. A given landmark is wrong if it is more than ``TOLERANCE`` from the learnt one and the squared Mahalanobis
-    distance exceeds ``GATE``. Its covariance is the sum of those of the learnt landmark, the alignment and the survey.
+    ``extend``: True if the run used the log's map and estimated only the landmarks that it lacks. The given landmarks then stay
+    unchanged. False if the run used no map. If the log has a map, the learnt landmarks are aligned and compared with it.
+    ``in_frame``: True if the learnt landmarks are in the frame of the log's map already and need no alignment.
 
+    A given landmark is wrong if two conditions are met. Its distance from the learnt landmark is more than ``TOLERANCE``. The
+    squared Mahalanobis distance exceeds ``GATE``, with the covariances of the learnt landmark, the alignment and the survey.
     Raises RunFailedError if nothing was learnt.
     """
     if not learnt and not extend:
         raise RunFailedError(
-            f"{log.name}: the sightings along the odometry determine no position of a landmark, so none was mapped"
+            f"{log.name}: odometry and sightings determine the position of no landmark, so none was mapped"
         )
     given = log.world.landmarks
     common = [name for name in given if name in learnt]
@@ -147,7 +153,7 @@ def make_map(
     if not given:
         return _assemble(log, learnt, np.zeros(3), {}, notes=not_located(log, learnt))
     if len(common) < MIN_COMMON and not in_frame:
-        few = "only {mapped} of the given map's landmarks were mapped, expected {least} or more to compare"
+        few = "only {mapped} of the given map's landmarks were mapped, a comparison needs {least} or more"
         return _unjudged(log, learnt, notice("few_mapped", few + UNJUDGED, len(common), MIN_COMMON))
     points = [learnt[name] for name in common]
     targets = np.array([log.world.position(name) for name in common])
@@ -166,16 +172,18 @@ def make_map(
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
-    """The rotation and translation that align more than half of K ``points`` with their ``targets`` (K, 2).
+    """Align K points with their targets by one rotation and translation, robust to wrong targets. K must be at least
+    ``MIN_COMMON``.
 
-    ``surveys`` (K, 2, 2): covariances of the targets. K must be at least ``MIN_COMMON``.
+    ``points``: the estimated landmarks. ``targets`` (K, 2), ``surveys`` (K, 2, 2): their given positions, and the covariances of
+    these.
     """
     positions = np.array([p.position for p in points])
     covariances = np.array([p.covariance for p in points])
     count = len(points)
 
     def errors(pose: Array) -> tuple[Array, Array, Array]:
-        """Errors (K, 2), the inverses (K, 2, 2) of their covariances, and squared Mahalanobis distances (K,)."""
+        """Return errors (K, 2), the inverses (K, 2, 2) of their covariances, and squared Mahalanobis distances (K,)."""
         turn = _rotation(pose)
         information = np.linalg.inv(turn @ covariances @ turn.T + surveys)
         error = se2.transform_from(pose, positions) - targets
@@ -187,7 +195,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))
 
     def cost(pose: Array) -> float:
-        """Truncated cost; errors below the tolerance count as within the gate."""
+        """Return the truncated cost of an alignment. An error below the tolerance is never an outlier."""
         error, _, squared = errors(pose)
         tolerated = GATE * np.sum(error**2, axis=1) / TOLERANCE**2
         return float(np.minimum(np.minimum(squared / factor, tolerated), GATE).sum())
@@ -209,7 +217,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
 
 
 def _pairs(count: int) -> list[list[int]]:
-    """All pairs of ``count`` landmarks, or ``MAX_PAIRS`` of them drawn with a fixed seed."""
+    """Return all pairs of ``count`` indices. If there are more than ``MAX_PAIRS``, return so many that are drawn at random."""
     if count * (count - 1) // 2 <= MAX_PAIRS:
         return [list(pair) for pair in combinations(range(count), 2)]
     rng = np.random.default_rng(0)
@@ -217,7 +225,7 @@ def _pairs(count: int) -> list[list[int]]:
 
 
 def _moved(point: LearntPoint, alignment: Alignment) -> LearntPoint:
-    """A learnt point in the given map's frame, with the uncertainty of the alignment."""
+    """Transform a learnt point to the given map's frame. Its covariance then includes the uncertainty of the alignment."""
     turn = _rotation(alignment.pose)
     (jacobian,) = _by_alignment(alignment.pose, point.position[None])
     covariance = alignment.factor * turn @ point.covariance @ turn.T + jacobian @ alignment.covariance @ jacobian.T
@@ -230,7 +238,8 @@ def _rotation(pose: Array) -> Array:
 
 
 def _by_alignment(pose: Array, positions: Array) -> Array:
-    """Jacobians (K, 2, 3) of aligned positions with respect to the alignment (x, y, angle)."""
+    """Return the Jacobians (K, 2, 3) of the transformed ``positions`` (K, 2) with respect to x, y and angle of the alignment
+    ``pose``."""
     x, y = (se2.transform_from(pose, positions) - pose[:2]).T
     jacobian = np.zeros((len(positions), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
@@ -239,7 +248,7 @@ def _by_alignment(pose: Array, positions: Array) -> Array:
 
 
 def _differ(point: LearntPoint, landmark: Landmark) -> bool:
-    """Whether a learnt point differs significantly from a landmark."""
+    """True if the position of a learnt point differs significantly from that of a given landmark."""
     error = point.position - np.array((landmark.x, landmark.y))
     covariance = point.covariance + landmark.spread()
     return bool(np.hypot(*error) > TOLERANCE and error @ np.linalg.solve(covariance, error) > GATE)
@@ -258,7 +267,7 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
 
 
 def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: Notice) -> LandmarkMap:
-    """The map in the frame of the start, without the given one, which cannot be aligned with it."""
+    """Make a map in the frame of the run's start, for a given map that cannot be aligned. ``note``: tells the user why."""
     notes = [note, *not_located(log, learnt)]
     return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
 
@@ -274,10 +283,15 @@ def _assemble(
     judged: bool = False,
     notes: Sequence[Notice] = (),
 ) -> LandmarkMap:
-    """The map with the landmarks of the given one in their order, then the new ones; those in ``keep`` are the given ones."""
+    """Build the new map: first the landmarks of the given map in their order, then the new ones.
+
+    ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new map's frame.
+    ``verdicts``: by name, "new" if missing. ``keep``: names of the landmarks whose given position is used. ``flagged``: names of
+    the landmarks whose given position is wrong.
+    """
     entries, landmarks = [], {}
     sensors = [log.rig.of(BearingRangeSettings, name) for name in log.rig.names("bearing_range")]
-    level = sensors[0].z if sensors else 0.0  # a landmark of unknown height is level with the sensor
+    level = sensors[0].z if sensors else 0.0  # a landmark of unknown height gets the height of the sensor
     for name in (*log.world.landmarks, *sorted(set(learnt) - set(log.world.landmarks), key=_natural)):
         point = learnt.get(name)
         entries.append(Entry(name, log.world.position(name), point, verdicts.get(name, "new"), name in flagged))
@@ -292,5 +306,5 @@ def _assemble(
 
 
 def _natural(name: str) -> tuple[int, str]:
-    """Sort key: 10 after 9, names without numbers after those with numbers."""
+    """Return a sort key for names: numbers by value (10 after 9), then all other names."""
     return (int(name), "") if name.isdecimal() else (10**9, name)

@@ -1,8 +1,8 @@
 """Maps of 3-D points from images with known camera poses.
 
-Keyframes are chosen. Features are matched near epipolar lines and chained into tracks. Tracks with enough parallax are
-triangulated, and points and cameras are adjusted together. Points with enough observations and small enough covariances are kept,
-with descriptors from a few directions.
+The steps are these. Keyframes are selected. Their features are matched near epipolar lines, and matches are chained into tracks.
+Tracks with enough parallax are triangulated. Points and cameras are adjusted together. Points with enough observations and small
+enough covariances become points of the map, with descriptors from a few directions.
 """
 
 from __future__ import annotations
@@ -43,17 +43,18 @@ from factors.positive import worst_sigma
 from factors.se2 import Array, Integers
 
 MOST_KEYFRAMES = 600
-WIDER = 1.3  # factor on the distance of keyframes, until there are not too many
-DEPTH = 2.0  # m, typical depth at which a camera's translation is converted to pixels
-GATE = 3.0  # standard deviations of the distance to an epipolar line
-NARROW, WIDE = 3.0, 25.0  # px, bounds of that gate
-MAX_GAP = 0.5  # s between stamps of a reference, beyond which it is not interpolated
+WIDER = 1.3  # while there are more keyframes, the distance between keyframes is multiplied by this factor
+DEPTH = 2.0  # m: typical depth of points, for the pixel error that a wrong camera position causes
+GATE = 3.0  # matches must be nearer to the epipolar line than so many standard deviations
+NARROW, WIDE = 3.0, 25.0  # px: bounds of this gate
+MAX_GAP = 0.5  # s: a reference is not interpolated between stamps that are farther apart
 ASKEW, AFLOAT = 0.003, 0.003  # rad, m: standard deviations of tilt and height of a robot on the floor
 
 
 @dataclass(frozen=True, eq=False)
 class PosedFrames:
-    """F frames with features, and their ``cameras``; ``covariances`` (F, 6, 6) in the cameras' own frames, rotation first."""
+    """F images with known camera poses. ``frames``: their features. ``cameras``: their camera poses. ``covariances`` (F, 6, 6): of
+    perturbations in the cameras' own frames, rotation first."""
 
     frames: list[CameraFrame]
     cameras: Cameras
@@ -64,34 +65,38 @@ class PosedFrames:
 
 
 class PointSettings(FileModel):
-    """How points are mapped, and which of them are kept."""
+    """Settings of the mapping of points: keyframes, calibration, and the conditions for points of the map."""
 
     distance: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.1
-    """distance between keyframes; 0 for all frames"""
+    """distance between keyframes; 0 uses all frames"""
     angle: Annotated[float, Field(ge=0.0, le=3.2), InUnit("rad")] = 0.1
-    """angle between keyframes; 0 for all frames"""
+    """angle between keyframes; 0 uses all frames"""
     focal: bool = False
     """whether to adjust the focal length"""
     lens: bool = False
     """whether to adjust focal length, principal point and distortion"""
     observations: Annotated[int, Field(ge=2, le=1000)] = 3
-    """number of keyframes that a point must be seen in"""
+    """least number of keyframes in which a point must be observed"""
     parallax: Annotated[float, Field(ge=1e-4, le=3.0), InUnit("rad")] = PARALLAX
-    """smallest angle between the rays to a point"""
+    """least angle between two rays to a point"""
     sigma: Annotated[float, Field(ge=1e-6, le=100.0), InUnit("m")] = 0.2
     """largest standard deviation of a point, in its worst direction"""
     views: Annotated[int, Field(ge=1, le=100)] = 4
-    """number of keyframes whose descriptors a point keeps, at most"""
+    """largest number of descriptors of a point in the map, each from another keyframe"""
     most: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
-    """number of points in the map, at most: the best determined ones, in as many places as possible; by default all"""
+    """largest number of points in the map; in each part of space the points with the smallest covariances are kept. Without this
+    setting all points are kept"""
 
 
 @dataclass(frozen=True)
 class PointReport:
-    """Counts at each stage; errors of the kept observations: root mean square and median absolute value [px] of their
-    coordinates; medians of the parallax [rad] and of the points' worst standard deviation [m]; median corrections of the camera
-    poses, ``shifted`` [m] and ``turned`` [rad]; the ``focal`` length fx [px]; ``fused``: number of points that an
-    extended map had already.
+    """Statistics of a map of points.
+
+    ``keyframes``, ``pairs``, ``tracks``, ``triangulated``, ``points``, ``observations``: the counts after each step.
+    ``rms``, ``mad`` [px]: root mean square and median absolute value of the pixel errors of the kept observations.
+    ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard deviation in the worst direction.
+    ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses. ``focal`` [px]: the focal length fx.
+    ``fused``: the number of points that the extended map contained already.
     """
 
     keyframes: int
@@ -112,7 +117,8 @@ class PointReport:
 
 @dataclass(frozen=True, eq=False)
 class MadePoints:
-    """The map, the adjusted ``cameras`` of its keyframes, the camera ``model``, and the report."""
+    """A new map of points. ``points``: the map. ``cameras``: the adjusted poses of its keyframes. ``model``: the calibration of the
+    camera, adjusted if that was requested. ``report``: statistics."""
 
     points: PointMap
     cameras: Cameras
@@ -126,9 +132,11 @@ def map_points(
     settings: PointSettings | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> MadePoints:
-    """Make a map of the points seen in ``posed`` frames.
+    """Make a map of points from images with known camera poses, ``posed``.
 
-    ``progress`` is called with the fraction done. Raises RunFailedError if no point is observed from several places.
+    ``progress``: is called with the fraction done. Raises RunFailedError if no point is observed from several places, if points and
+    cameras cannot be adjusted, or if no point fulfils the settings. Raises InputError if the settings adjust a calibration with an
+    unsupported distortion.
     """
     settings = settings or PointSettings()
     posed = posed[chosen_keyframes(posed, settings)]
@@ -140,14 +148,14 @@ def map_points(
         progress(0.7 * min(1.0, (begin + 50) / len(pairs)))
     tracks = chained(posed.frames, matches)
     triangulated = triangulate(model, posed.cameras, tracks)
-    # until all is adjusted, the rays contain the errors of the poses
+    # before the adjustment, the residuals also contain the errors of the camera poses: allow the epipolar gate
     good = triangulated.good(tracks, replace(model, sigma=gate / GATE), settings.parallax)
     if not good.any():
         raise RunFailedError("no feature was matched between images from several places, so no point was mapped")
     total, (chosen, old) = tracks.count, tracks.kept(good[tracks.track])
     if (settings.focal or settings.lens) and not model.is_brown:
         raise InputError(
-            "focal and lens adjust a lens of distortion_model plumb_bob with four numbers: remove focal and lens"
+            "focal and lens can adjust only a camera with distortion_model plumb_bob and four numbers: remove focal and lens"
         )
     try:
         adjusted = bundle.adjust(
@@ -166,7 +174,7 @@ def map_points(
 
 
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
-    """Indices of the keyframes, with a spacing that bounds their number."""
+    """Return the indices of the frames that become keyframes. The spacing of the settings is increased if there are too many."""
     filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])
     distance, angle = settings.distance, settings.angle
     while True:
@@ -177,7 +185,7 @@ def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
 
 
 def epipolar_gate(model: CameraModel, covariances: Array) -> float:
-    """Gate [px] on the distance from an epipolar line, given the cameras' ``covariances`` (F, 6, 6)."""
+    """Return the largest distance [px] of a match from its epipolar line, for camera poses with ``covariances`` (F, 6, 6)."""
     turn, shift = (np.median(np.trace(covariances[:, i : i + 3, i : i + 3], axis1=1, axis2=2)) / 3.0 for i in (0, 3))
     sigma = np.sqrt(2.0 * (model.sigma**2 + model.fx**2 * (turn + shift / DEPTH**2)))
     return float(np.clip(GATE * sigma, NARROW, WIDE))
@@ -186,7 +194,10 @@ def epipolar_gate(model: CameraModel, covariances: Array) -> float:
 def point_map(
     posed: PosedFrames, cameras: Cameras, tracks: Tracks, points: Array, covariances: Array, views: int
 ) -> PointMap:
-    """The map of ``points`` (T, 3), each with the descriptors of at most ``views`` observations."""
+    """Return a map of T points, each with the descriptors of at most ``views`` observations.
+
+    ``points`` (T, 3), ``covariances`` (T, 3, 3): positions. ``cameras``, ``tracks``: camera poses and observations.
+    """
     shown = _different_views(cameras, tracks, points, views)
     views_of = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
     return PointMap(
@@ -203,7 +214,10 @@ def point_map(
 def _made(
     posed: PosedFrames, adjusted: Bundle, settings: PointSettings, pairs: int, total: int, triangulated: int
 ) -> MadePoints:
-    """The map of the points that fulfil the settings, and the report."""
+    """Return the map of the points that fulfil the settings, with its statistics.
+
+    ``pairs``, ``total``, ``triangulated``: the numbers of compared pairs of keyframes, of tracks, and of triangulated points.
+    """
     kept, points, covariances, angles = _kept(adjusted, settings)
     errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
     shift = np.linalg.norm(adjusted.cameras.positions - posed.cameras.positions, axis=1)
@@ -228,7 +242,7 @@ def _made(
 
 
 def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Array, Array]:
-    """Tracks, positions, covariances and parallaxes of the points that fulfil the settings."""
+    """Return tracks, positions (T, 3), covariances (T, 3, 3) and parallaxes (T,) [rad] of the points that fulfil the settings."""
     tracks, points, covariances = adjusted.tracks, adjusted.points, adjusted.point_covariances
     angles = parallax(adjusted.cameras, points, tracks)
     good = (
@@ -238,16 +252,18 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
     )
     if not good.any():
         raise RunFailedError(
-            f"none of {len(points)} points is seen in {settings.observations} keyframes and known to {settings.sigma:g} m"
+            f"none of {len(points)} points is seen in {settings.observations} keyframes with a standard deviation of at most "
+            f"{settings.sigma:g} m and a parallax of at least {settings.parallax:g} rad"
         )
     kept, old = tracks.kept(good[tracks.track])
     return kept, points[old], covariances[old], angles[old]
 
 
 def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int) -> Integers:
-    """Observations (V,), at most ``views`` of each point.
+    """Select at most ``views`` observations of each point, from viewpoints that differ. Returns their indices (V,).
 
-    The first is nearest to their mean. The next ones differ most, in direction or log distance, from the chosen ones.
+    The first selected observation is nearest to the mean of direction and logarithmic distance. Each further one differs most from
+    the observations that are selected already.
     """
     chosen: list[int] = []
     order = np.argsort(tracks.track, kind="stable")
@@ -268,30 +284,37 @@ def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int
 
 
 def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) -> PosedFrames:
-    """The frames of a log with features, at the poses of its reference.
+    """Return the images of a log with camera poses from the log's reference trajectory.
 
-    ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations about and along each axis for a reference without
-    covariances. Frames outside of the reference or in its gaps are omitted. Raises InputError if a camera, features or a
-    reference are missing, or no frame remains.
+    Images before or after the reference or in its gaps are left out. ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations
+    of the camera poses about and along each axis. They are used if the reference has no covariances.
+    Raises InputError if the log has no camera, no features or no reference with headings, or if no image remains.
     """
     t, all_frames = frames_of(log)
     if log.rig.find(CameraSettings) is None:
-        raise InputError(f"{log.name}: its rig has no [camera], expected focal length and mounting")
+        raise InputError(f"{log.name}: its rig has no section [camera]: add it with focal length and mounting")
     model = log.rig.of(CameraSettings).model()
     usual = np.diag(np.repeat(np.square((turn_sigma, shift_sigma)), 3))
     if log.reference is None or not log.reference.has_heading:
-        raise InputError(f"{log.name}: has no reference with headings that says where its images were taken")
+        raise InputError(
+            f"{log.name}: has no reference with headings, which is needed for the camera poses of its images"
+        )
     poses = log.reference.at(t, max_gap=MAX_GAP)
     inside = np.asarray(np.isfinite(poses).all(axis=1))
     cameras, covariances = _on_robot(model, log.reference, t[inside], poses[inside], usual)
     frames = [frame for frame, keep in zip(all_frames, inside.tolist(), strict=True) if keep]
     if not any(len(frame.pixels) for frame in frames):
-        raise InputError(f"{log.name}: none of its {len(t)} images has features and a pose of the reference")
+        raise InputError(
+            f"{log.name}: none of its {len(t)} images has both features and a pose of the reference at its time"
+        )
     return PosedFrames(frames, cameras, covariances)
 
 
 def _on_robot(model: CameraModel, reference: Trajectory, t: Array, poses: Array, usual: Array) -> tuple[Cameras, Array]:
-    """Cameras of a robot on the floor at ``poses`` (F, 3), and their covariances."""
+    """Return the camera poses of a robot on the floor at ``poses`` (F, 3), and their covariances (F, 6, 6).
+
+    ``t`` (F,) [s]: the times of the poses. ``usual`` (6, 6): the covariance for a reference without covariances.
+    """
     places = [camera_pose(model, pose) for pose in poses]
     cameras = Cameras(
         np.array([p for p, _ in places]).reshape(-1, 3), np.array([r for _, r in places]).reshape(-1, 3, 3)
@@ -299,7 +322,7 @@ def _on_robot(model: CameraModel, reference: Trajectory, t: Array, poses: Array,
     if reference.covariances is None:
         return cameras, np.repeat(usual[None], len(t), axis=0)
     nearest = np.clip(np.searchsorted(reference.t, t), 0, len(reference.t) - 1)
-    # by (x, y, heading) in the world: the heading rotates about z, and moves the camera around the robot
+    # Jacobian of the camera pose by x, y and heading in the world frame: the heading turns the camera and moves it around the robot
     by_pose = np.zeros((len(t), 6, 3))
     by_pose[:, 2, 2] = by_pose[:, 3, 0] = by_pose[:, 4, 1] = 1.0
     arm = cameras.positions[:, :2] - poses[:, :2]

@@ -1,9 +1,9 @@
 """Operations on whole maps of points: merging the maps of two drives, and thinning of dense maps.
 
-Two points are one under three conditions. Their positions agree within their covariances. Each is the most similar candidate of
-the other. Their views differ no more than views of one point of the first map. Their errors may be correlated, such as those of
-one reference. They are therefore fused by covariance intersection with equal weights (Julier, Uhlmann, American Control
-Conference 1997), which is consistent for any correlation.
+Two points of different maps are considered the same point under three conditions. Their positions agree within their covariances.
+Each is the most similar candidate of the other. Their views differ no more than views of one point of the first map. The errors of
+both points may be correlated, for example if both maps were made with the same reference. Therefore they are fused by covariance
+intersection with equal weights (Julier, Uhlmann, American Control Conference 1997), which is consistent for any correlation.
 """
 
 from __future__ import annotations
@@ -20,16 +20,20 @@ from factors import positive
 from factors.se2 import Array, Integers
 
 GATE = 16.27  # 99.9 % of chi-square with three degrees of freedom
-FARTHEST = 0.5  # m between two estimates of one point
-PERCENTILE = 90.0  # percentile of the differences of views of one point, above which points are not one
-COMPARED = 2000  # points whose views are compared to learn that
-CELL = 0.5  # m: thinning keeps points in as many such cells as it can
-LEAST = 1e-6  # m: standard deviation of exact points when they are compared
+FARTHEST = 0.5  # m: largest distance of two estimates of the same point
+PERCENTILE = 90.0  # of the differences between views of one point: the limit for views of the same point in two maps
+COMPARED = 2000  # number of points from which this percentile is estimated
+CELL = 0.5  # m: size of the cells of space; thinning keeps points in as many cells as possible
+LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact points can be compared
 
 
 def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
-    """The points of both maps, those of one place and look as one, and the number of these. Points of ``first`` keep their names,
-    others that have no view keep theirs, which must be new. InputError for features of different kinds."""
+    """Merge two maps. Returns the merged map, and the number of points that both maps have in common.
+
+    A common point has its name of the map ``first``. The other points of ``second`` get new names, except points without a view.
+    Raises InputError if the maps have features of different kinds, or if a point without a view of ``second`` has a name of
+    ``first``.
+    """
     kinds = {points.feature for points in (first, second) if points.feature}
     if len(kinds) > 1:
         raise InputError(f"the maps have points of the features {' and '.join(sorted(kinds))}, expected one kind")
@@ -53,7 +57,10 @@ def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
 
 
 def thinned(points: PointMap, most: int) -> PointMap:
-    """At most ``most`` of the points that have views, the best determined ones in as many places as possible, and all others."""
+    """Select points of a map: at most ``most`` of the points with views, and all points without views.
+
+    In each cell of space the points with the smallest covariances are kept, and as many cells as possible keep points.
+    """
     viewed = np.unique(points.owners)
     if len(viewed) <= most:
         return points
@@ -70,10 +77,15 @@ def thinned(points: PointMap, most: int) -> PointMap:
 
 
 def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers) -> PointMap:
-    """The points of ``first`` and the ``added`` of ``second``, whose views have new ``owners`` (P,) by point."""
+    """Join the points of ``first`` and the points of ``second`` with the indices ``added``. All views of ``second`` are joined.
+
+    ``owners`` (P,): for each point of ``second``, the index of the point in the result that gets its views.
+    """
     named = {second.names[i] for i in np.setdiff1d(added, second.owners).tolist()}
     if double := sorted(named & set(first.names)):
-        raise InputError(f"the point {double[0]} is in both maps without a view, expected different names")
+        raise InputError(
+            f"the point {double[0]} is in both maps but has no view by which to compare it: rename it in one of the maps"
+        )
     taken, number, names = {*first.names, *named}, 0, list(first.names)
     for i in added.tolist():
         name = second.names[i]
@@ -95,14 +107,15 @@ def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers
 
 
 def _common(first: PointMap, second: PointMap) -> Array | None:
-    """The common errors of the views of both maps; zero for a map that was made with a reference."""
+    """Return the covariances of the errors that all points of a view have in common, for the views of both maps, or None if neither
+    map has them. They are zero for a map that was made with a reference."""
     if first.common is None and second.common is None:
         return None
     return np.concatenate([np.zeros((len(p.owners), 3, 3)) if p.common is None else p.common for p in (first, second)])
 
 
 def _same(first: PointMap, second: PointMap) -> Integers:
-    """Pairs (M, 2) of points of both maps that are one."""
+    """Return pairs (M, 2) of indices of points in the maps ``first`` and ``second`` that are the same point."""
     none = np.empty((0, 2), dtype=np.int64)
     if not (len(first.owners) and len(second.owners)):
         return none
@@ -131,13 +144,14 @@ def _same(first: PointMap, second: PointMap) -> Integers:
 
 
 def _views(points: PointMap) -> list[Integers]:
-    """The views of each point."""
+    """Return for each point the indices of its views."""
     order = np.argsort(points.owners, kind="stable")
     return np.split(order, np.cumsum(np.bincount(points.owners, minlength=len(points)))[:-1])
 
 
 def _limit(points: PointMap, views: list[Integers]) -> float:
-    """A percentile, over points, of the distance between the most similar two views of one point; 0 without such points."""
+    """Return a limit for the difference between views of the same point: the percentile :data:`PERCENTILE`, over points, of the
+    distance between the two most similar views of a point. Returns 0 if no point has two views."""
     least = []
     for mine in [mine for mine in views if len(mine) > 1][:COMPARED]:
         apart = distance_matrix(points.descriptors[mine], points.descriptors[mine])

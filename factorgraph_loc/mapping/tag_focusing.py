@@ -1,10 +1,11 @@
-"""Positions of tags to centimetres, from the phases of reads along known poses.
+"""Positions of tags with centimetre accuracy, from the phases of reads at known robot poses.
 
-The phase of the path is subtracted from the phases of one tag, antenna and channel within a window (:mod:`factors.rfid.signals`).
-The results agree only at the tag's position, as in a synthetic aperture (holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011).
-Unknown phase offsets and frequency hopping cancel within a window. Therefore only the relative poses of one window must be exact
-to a fraction of the wavelength. The prior is the position from reads and misses. The likelihood has side lobes: it is evaluated on
-a lattice first, then refined by Fisher scoring.
+Phases of one tag, antenna and channel within a short time window are compared with the phases predicted for a tag position
+(:mod:`factors.rfid.signals`). The differences are equal only at the true position of the tag, as in a synthetic aperture
+(holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011). Unknown phase offsets and frequency hopping cancel within a window. Therefore
+only the relative poses within a window must be accurate to a fraction of the wavelength. The prior is the position estimated from
+reads and misses. The likelihood has side lobes. Therefore it is evaluated on a lattice first, and the best position is refined by
+Fisher scoring.
 """
 
 from __future__ import annotations
@@ -25,24 +26,25 @@ from factors.rfid.detection import TagArray
 from factors.rfid.signals import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
 
-# Exponent of the likelihood. That of the rig, for localization, is smaller, as it also allows for errors of the surveyed tags.
+# Exponent of the likelihood. The rig's exponent, which is used for localization, is smaller because of errors of surveyed tags.
 TEMPERING = 0.5
-STEP = 0.02  # m, of the lattice: a quarter of the period of twice the phase
-REACH, FARTHEST = 3.0, 1.0  # standard deviations of the prior, and m, that are searched
-SELECTIONS = 3  # the reads used depend on the position that they improve
-ITERATIONS, CONVERGED = 20, 1e-4  # m
+STEP = 0.02  # m: spacing of the lattice, a quarter of the period of the likelihood
+REACH, FARTHEST = 3.0, 1.0  # half the size of the lattice: standard deviations of the prior, and upper bound in m
+SELECTIONS = 3  # iterations: the selection of the used reads depends on the position that they improve
+ITERATIONS, CONVERGED = 20, 1e-4  # of Fisher scoring; the step is in m
 FEWEST = 20  # reads
-INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and at most between keyframes
+INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and largest time between keyframes
 
 
 def focused(
     log: Log, observations: TagObservations, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
 ) -> dict[int, LearntPoint]:
-    """The ``learnt`` positions by tag, improved by the phases of the reads along the log's reference, or along the estimated
-    ``keyframes``, which are interpolated.
+    """Improve positions of tags by the phases of their reads. Returns the new positions by index of the tag.
 
-    Positions of tags with unknown height, or with too few reads with a phase, do not change; none does if the rig has no
-    ``[rfid.phase]``.
+    ``learnt``: the positions from reads and misses, by index of the tag. ``keyframes``: the estimated robot poses, which are
+    interpolated. If None, the poses of the log's reference are used.
+    A position does not change if the height of the tag is unknown or too few reads have a phase. No position changes if the rig has
+    no section ``[rfid.phase]``.
     """
     rfid = log.rig.of(RfidSettings)
     if rfid.phase is None:
@@ -65,7 +67,8 @@ def focused(
 
 
 def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntPoint) -> LearntPoint:
-    """The position of the only tag of ``reads``, which are relative to the world's origin."""
+    """Improve the position ``prior`` of one tag at ``height`` [m]. ``reads``: the reads of this tag, with antenna poses in the
+    world frame."""
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     position = prior
     for _ in range(SELECTIONS):
@@ -82,7 +85,7 @@ def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntP
 
 
 def _lattice(covariance: Array) -> Array:
-    """Displacements (G, 2) within ``REACH`` standard deviations of zero."""
+    """Return a lattice of displacements (G, 2) [m] within ``REACH`` standard deviations of zero. The first is zero itself."""
     extent = np.minimum(REACH * np.sqrt(np.diag(covariance)), FARTHEST)
     axes = [np.arange(-e, e + STEP, STEP) for e in extent]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -91,7 +94,11 @@ def _lattice(covariance: Array) -> Array:
 
 
 def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, offs: Array) -> Array:
-    """The best displacement of ``offs`` (G, 2) from ``start``. Displacing the tag is displacing all poses the other way."""
+    """Return the displacement of ``offs`` (G, 2) with the largest posterior density.
+
+    ``start`` (2,): the current position relative to the prior. ``information`` (2, 2): the inverse covariance of the prior. The
+    likelihood of a displaced tag is computed by displacing all poses by the opposite vector.
+    """
     poses = np.column_stack((-offs, np.zeros(len(offs))))
     moved = offs + start
     cost = 0.5 * np.einsum("gi,ij,gj->g", moved, information, moved) - likelihood.log_likelihood(poses, reads)
@@ -101,7 +108,8 @@ def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, informat
 def _refined(
     likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, off: Array
 ) -> tuple[Array, Array]:
-    """The displacement (2,) at the nearest optimum, and the information (2, 2) there."""
+    """Maximise the posterior density by Fisher scoring, starting at the displacement ``off`` (2,). Returns the optimal displacement
+    (2,) and the information (2, 2) there. ``start``, ``information``: see :func:`_best`."""
 
     def at(off: Array) -> tuple[float, Array, Array]:
         score, moved = likelihood.score(np.array((*-off, 0.0)), reads), off + start

@@ -1,6 +1,7 @@
-"""Maps of RFID tags from a log, along its reference or from odometry and reads alone, and comparison with a given map.
+"""Maps of RFID tags from a log, and their comparison with a given map.
 
-The map is written in the frame of the survey of the log's rig (``[survey]``), so that it fits that rig.
+The robot poses are those of the log's reference, or they are estimated together with the tags from odometry and reads. The map is
+written in the frame of the survey of the log's rig (``[survey]``), so that it can be used with this rig.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,16 +27,18 @@ from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array
 
-MAX_GAP = 0.5  # s between poses of the reference, beyond which it is not interpolated
+MAX_GAP = 0.5  # s: the reference is not interpolated between poses that are farther apart
 
 Poses = Literal["reference", "odometry"]
 
 
 @dataclass(frozen=True)
 class MadeTags:
-    """A map of tags: ``world`` as written to a file; ``made``: the same as landmarks in the world frame, with verdicts on the
-    given map; ``poses`` (N, 3): the trajectory in that frame; ``open``: by EPC, why a tag was not located; ``modes``: candidate
-    positions of ambiguous tags in that frame.
+    """A new map of tags, and its comparison with the given map.
+
+    ``world``: the map as written to a file, in the frame of the survey. ``made``: the same tags as landmarks in the world frame,
+    and the verdicts on the given tags. ``poses`` (N, 3): the trajectory in the world frame. ``open``: for each tag that was not
+    located, by EPC, the reason. ``modes``: candidate positions of ambiguous tags in the world frame, by EPC.
     """
 
     world: World
@@ -62,12 +65,14 @@ def map_tags(
 ) -> MadeTags:
     """Make a map of the tags that a log read.
 
-    ``poses``: those of the reference, or estimated together with the tags, starting from ``prior``, which defines the frame.
-    Without a prior the first pose is the origin, and the facings of the log's map are not used. ``extend``: the tags of the
-    log's map do not change, and are used to estimate the poses; otherwise they are only compared. ``height`` [m]: of tags
-    that the map lacks, by default the mean height of the antennas.
+    ``poses``: "reference" uses the poses of the log's reference, "odometry" estimates poses and tags together.
+    ``prior``: the start pose, which defines the frame of estimated poses. If it is None, the first pose is the origin, and the
+    facings of the log's map are not used. ``extend``: True keeps the tags of the log's map and uses them to estimate the poses.
+    False estimates all tags, and compares them with the log's map. ``height`` [m]: of tags that the map lacks; None uses the mean
+    height of the antennas. ``progress``: is called with the fraction done.
 
-    Raises InputError if the log lacks what is needed, RunFailedError if no tag could be located.
+    Raises InputError if the log has no reads, no antennas in its rig or no suitable reference. Raises RunFailedError if no tag
+    could be located.
     """
     observations = tag_observations(log, height)
     given = np.isfinite(observations.positions[:, 0])
@@ -79,7 +84,7 @@ def map_tags(
         if prior is None:
             if extend:
                 raise InputError(
-                    f"{log.name}: prior is None, expected a start, as extend is true without reference poses"
+                    f"{log.name}: prior is None, expected a start pose: extend with estimated poses needs a start in the map"
                 )
             prior = PosePrior(log.span()[0], np.zeros(3), EXACT_SIGMA**2 * np.eye(3))
             observations = replace(observations, facing=np.full(len(given), np.nan))
@@ -112,15 +117,21 @@ def map_tags(
 def _along_reference(
     log: Log, observations: TagObservations
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
-    """Learnt tags by index; facings (T,); the search result of each tag; and the poses (K, 3) of the antenna observations."""
+    """Locate the tags along the log's reference.
+
+    Returns the located tags by index, the facings (T,) [rad], the search result of each of T tags, and the robot poses (K, 3) of
+    the antenna observations.
+    """
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference, expected a reference or poses from odometry")
+        raise InputError(f"{log.name}: has no reference: map its tags with poses from odometry instead")
     if not log.reference.has_heading:
-        raise InputError(f"{log.name}: its reference has no headings, expected poses from odometry")
+        raise InputError(f"{log.name}: its reference has no headings: map its tags with poses from odometry instead")
     at = log.reference.at(observations.t, max_gap=MAX_GAP)
     which = np.asarray(np.isfinite(at).all(axis=1))
     if not which.any():
-        raise InputError(f"{log.name}: no tag was read where the reference has poses, expected poses from odometry")
+        raise InputError(
+            f"{log.name}: its reference has no pose at the time of any read: map its tags with poses from odometry instead"
+        )
     posteriors = search(
         observations.model, observations.along(at[which], which), observations.heights, observations.facing
     )
@@ -138,13 +149,13 @@ def _along_reference(
 
 
 def _why(posterior: TagPosterior, reads: int) -> Notice:
-    """The reason why a tag is not in the map: it is ``unread``, or read by ``chance``, or its position ``ambiguous`` or
-    ``uncertain``."""
+    """Return the reason why a tag is not in the map. The kinds of reasons are "unread", "chance" (false reads), "ambiguous" and
+    "uncertain". ``reads``: the number of reads of the tag."""
     if not reads:
         return notice("unread", "never read")
     count = f"read {reads} times" if reads > 1 else "read once"
     if not posterior.is_explained:
-        return notice("chance", "{reads}: no position explains that significantly better than chance", count)
+        return notice("chance", "{reads}: no position explains the reads significantly better than chance", count)
     if posterior.is_ambiguous:
         places = [f"({m.position[0]:.2f}, {m.position[1]:.2f}) m with {m.weight:.0%}" for m in posterior.modes[:3]]
         return notice("ambiguous", "{reads}: ambiguous, {places}", count, " or ".join(places))
@@ -152,7 +163,7 @@ def _why(posterior: TagPosterior, reads: int) -> Notice:
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
-    """A given tag in the world frame."""
+    """Convert a given tag to a landmark in the world frame. ``position`` (2,): its position in the world frame."""
     tag = log.world.tags[name]
     x, y = position.tolist()
     if tag.covariance is None:
@@ -173,7 +184,11 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 def _world(
     log: Log, observations: TagObservations, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
 ) -> World:
-    """The map for its file: learnt tags in the frame of the rig's survey, given tags unchanged."""
+    """Return the map as written to a file: learnt tags in the frame of the rig's survey, and given tags unchanged.
+
+    ``made``: the map in the world frame. ``facing``: the facings [rad] of learnt tags in the world frame, by EPC.
+    ``in_given_frame``: True if the new map has the frame of the log's map, so that other parts of the log's map remain valid.
+    """
     survey: SurveySettings = log.rig.of(SurveySettings)
     transform = survey.transform()
     tags: dict[str, Tag] = {}

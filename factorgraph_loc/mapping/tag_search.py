@@ -1,10 +1,11 @@
-"""Search for the position of a tag, given known robot poses: all modes of the likelihood, not only the best one.
+"""Search for the positions of tags, given known robot poses. All modes of the likelihood are found, not only the best one.
 
-The likelihood of all antenna observations is evaluated on a lattice, and its best positions are refined by Fisher scoring.
-After a straight pass a tag on the left of the robot may be as likely as one on the right. Then there are two modes, with weights
-from Laplace's method under a uniform prior.
+The likelihood of all antenna observations is evaluated on a lattice, and its best positions are refined by Fisher scoring. After a
+straight drive, a tag on the left of the robot may be as likely as a tag on the right. Then there are two modes. Their weights are
+computed by Laplace's method under a uniform prior.
 
-An unknown facing that matters to the model is tried in :data:`DIRECTIONS`, then between the best of them.
+If the detection model depends on the facing of a tag and the facing is unknown, :data:`DIRECTIONS` facings are tried on the
+lattice, and then intermediate facings near the best ones.
 """
 
 from __future__ import annotations
@@ -21,31 +22,34 @@ from factors.rfid.detection import RfidLikelihood, TagArray, TagReadCounts
 from factors.rfid.model import RfidModel, probability
 from factors.se2 import Array, Integers, wrap, wrap_scalar
 
-CELL = 0.4  # m, of the lattice
+CELL = 0.4  # m: spacing of the lattice
 LEVEL = 0.2  # m: tags of about the same height share a lattice
-DIRECTIONS = 8
-CANDIDATES = 6  # per tag, that are refined
-CUT = 40.0  # nats above the minimum on the lattice, beyond which a position is not refined
-APART = 0.9  # m or (for facings) rad, between candidates
-SAME = 0.05  # m between optima that are considered equal
-MERGED = 0.5  # m, or
-OVERLAP = 9.0  # squared Mahalanobis distance, between modes that are counted as one
-COARSE, FINE = (0.2, 0.15), (0.05, 0.03)  # m and rad within which counts are merged, on the lattice and after
-GAIN = 8.0  # of the log-likelihood; false reads can reach less at the best of a few thousand positions
-SURE = 0.95  # weight above which a mode is unique
-LARGEST_SIGMA = 1.0  # m
-LEAST = 0.05  # probability of a read that defines the reach of an antenna
+DIRECTIONS = 8  # facings that are tried on the lattice
+CANDIDATES = 6  # positions per tag that are refined
+CUT = 40.0  # a position is refined if its negative log-likelihood exceeds the minimum on the lattice by at most this value
+APART = 0.9  # least distance between candidates: m for positions, rad for facings
+SAME = 0.05  # m, rad: optima with smaller differences are equal
+# modes are merged if their distance [m] or their squared Mahalanobis distance is smaller
+MERGED, OVERLAP = 0.5, 9.0
+# m, rad: observations from poses within these differences are added up, on the lattice and in the refinement
+COARSE, FINE = (0.2, 0.15), (0.05, 0.03)
+# least gain of log-likelihood of a located tag; by false reads the best of some thousand positions gains less
+GAIN = 8.0
+SURE = 0.95  # a mode with a larger weight is the only one
+LARGEST_SIGMA = 1.0  # m: largest standard deviation of a located tag
+LEAST = 0.05  # an antenna is in reach of a tag if it reads the tag with at least this probability
 ITERATIONS = 30
 CONVERGED = 1e-3  # m
 LARGEST_STEP = 0.5  # m
-CURVATURE_STEP = 0.02  # m, of the numerical curvature
-CHUNK = 256  # candidates per refinement, to bound the memory
-PER_EVALUATION = 2000  # observations per evaluation of the lattice, to bound the memory
+CURVATURE_STEP = 0.02  # m: step of the numerical derivatives
+CHUNK = 256  # candidates that are refined at once, to limit the memory
+PER_EVALUATION = 2000  # observations that are evaluated on the lattice at once, to limit the memory
 
 
 @dataclass(frozen=True, eq=False)
 class TagCandidates:
-    """C candidate positions (C, 2) of the tags ``tag`` (C,), with facings (C,)."""
+    """C candidates for the positions of tags. ``tag`` (C,): index of the tag. ``places`` (C, 2) [m]: its position. ``facing`` (C,)
+    [rad]: its facing, NaN if it does not matter."""
 
     tag: Integers
     places: Array
@@ -57,7 +61,10 @@ class TagCandidates:
 
 @dataclass(frozen=True)
 class TagMode:
-    """A mode of a tag's position: ``position`` (2,) [m], ``covariance`` (2, 2), ``facing`` [rad] or NaN, and its weight."""
+    """A mode of the posterior density of a tag's position.
+
+    ``weight``: the probability of this mode. ``position`` (2,) [m] and ``covariance`` (2, 2). ``facing`` [rad]: NaN if unknown.
+    """
 
     weight: float
     position: Array
@@ -72,8 +79,10 @@ class TagMode:
 
 @dataclass(frozen=True)
 class TagPosterior:
-    """Search result of one tag: ``modes``, by descending weight (sum 1); ``reads``: rounds that read it; ``gain``: tempered
-    log-likelihood at the best position, relative to a tag out of reach.
+    """The result of the search for one tag.
+
+    ``modes``: by descending weight; the weights sum to 1. ``reads``: the number of inventory rounds that read the tag. ``gain``:
+    the tempered log-likelihood at the best position, minus that of a tag out of reach of all antennas.
     """
 
     modes: tuple[TagMode, ...]
@@ -82,24 +91,25 @@ class TagPosterior:
 
     @property
     def is_explained(self) -> bool:
-        """Whether a position explains the reads significantly better than chance."""
+        """True if the best position explains the reads significantly better than false reads do."""
         return bool(self.modes) and self.gain > GAIN
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether another position is about as likely as the best."""
+        """True if the weight of the best mode is too small to exclude the other modes."""
         return bool(self.modes) and self.modes[0].weight < SURE
 
     @property
     def is_located(self) -> bool:
-        """Whether there is a single mode with a small enough uncertainty."""
+        """True if the reads are explained by a single mode with a small enough standard deviation."""
         return self.is_explained and not self.is_ambiguous and self.modes[0].sigma < LARGEST_SIGMA
 
 
 def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
-    """Search for T tags with ``heights`` (T,) and ``facing`` (T,), NaN where unknown.
+    """Search for the positions of T tags. Returns a result per tag.
 
-    ``counts``: of reads from known poses, relative to the world's origin.
+    ``counts``: the reads of these tags; its ``offsets`` are the robot poses in the world frame. ``heights`` (T,) [m]. ``facing``
+    (T,) [rad]: NaN where unknown.
     """
     counts = merged(counts, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
@@ -127,7 +137,7 @@ def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Arra
 
 
 def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
-    """Read counts with those of one antenna added up while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
+    """Add up consecutive read counts of an antenna while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
     group = np.empty(len(counts.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
@@ -151,7 +161,7 @@ def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCount
 def _lattice_search(
     model: RfidModel, counts: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> TagCandidates:
-    """The best candidates of each tag that is ``read`` (T,), on a lattice of all places within reach of an antenna."""
+    """Return the best candidates on a lattice of all places in reach of an antenna. ``read`` (T,): mask of the tags to search."""
     cells = _cells(counts.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])
@@ -173,7 +183,7 @@ def _lattice_search(
 
 
 def _cells(places: Array, distance: float) -> Array:
-    """The lattice points (G, 2) within ``distance`` of any place."""
+    """Return the lattice points (G, 2) within ``distance`` [m] of any of the robot positions ``places`` (K, 2)."""
     low, high = places.min(axis=0) - distance, places.max(axis=0) + distance
     axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, high, strict=True)]
     x, y = np.meshgrid(*axes, indexing="ij")
@@ -188,7 +198,10 @@ def _cells(places: Array, distance: float) -> Array:
 def _nll(
     model: RfidModel, counts: TagReadCounts, tags: NDArray[np.int64], cells: Array, height: float, direction: float
 ) -> Array:
-    """Tempered negative log-likelihood (G, S) of S ``tags`` at all cells."""
+    """Return the tempered negative log-likelihood (G, S) of S ``tags`` at the lattice points ``cells`` (G, 2).
+
+    ``height`` [m], ``direction`` [rad]: height and facing of the tags.
+    """
     points = np.column_stack((cells, np.full(len(cells), height)))
     likelihood = RfidLikelihood(model, TagArray(points, np.full(len(cells), direction)))
     out = np.zeros((len(cells), len(tags)))
@@ -206,7 +219,10 @@ def _nll(
 
 
 def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, float, float]]:
-    """The best candidates (x, y, facing), separated from each other."""
+    """Return at most :data:`CANDIDATES` best candidates (x, y, facing) of one tag, at least :data:`APART` from each other.
+
+    ``table``: for each facing the negative log-likelihood (G,) at the lattice points ``cells`` (G, 2), and the facing.
+    """
     nll = np.stack([column for column, _ in table])
     directions = np.array([direction for _, direction in table])
     out: list[tuple[float, float, float]] = []
@@ -223,7 +239,11 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
 
 
 def _modes(optima: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMode, ...]:
-    """Optima of one tag, best first, as modes; neighbouring ones, which differ in facing, are merged."""
+    """Convert the local optima of one tag to modes. Equal optima are dropped, and overlapping ones, such as those that differ in
+    facing only, are merged.
+
+    ``optima``: C optima, best first. ``nll`` (C,): their negative log-likelihoods. ``covariances`` (C, 2, 2).
+    """
     kept: list[int] = []
     for i in range(len(nll)):
         apart = np.hypot(*(optima.places[kept] - optima.places[i]).T)
@@ -262,12 +282,13 @@ def _modes(optima: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMo
 
 
 def of_tags(counts: TagReadCounts, tags: Integers) -> TagReadCounts:
-    """The read counts of some ``tags`` (C,)."""
+    """Return the read counts of the tags with the indices ``tags`` (C,)."""
     return TagReadCounts(counts.offsets, counts.antennas, counts.rounds, np.ascontiguousarray(counts.hits[:, tags]))
 
 
 def reach(model: RfidModel) -> float:
-    """The distance [m] from the robot within which its antennas read."""
+    """Return the largest distance [m] from the robot at which an antenna reads a tag with at least the probability
+    :data:`LEAST`."""
     out = 0.0
     bearings = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     for antenna in model.antennas:
@@ -284,7 +305,10 @@ def reach(model: RfidModel) -> float:
 def refine(
     model: RfidModel, counts: TagReadCounts, heights: Array, candidates: TagCandidates
 ) -> tuple[TagCandidates, Array, Array]:
-    """TagCandidates at the nearest local optimum, with negative log-likelihood (C,) and covariance (C, 2, 2)."""
+    """Move C candidates to the nearest local optimum of the likelihood.
+
+    Returns the moved candidates, their negative log-likelihoods (C,) and covariances (C, 2, 2).
+    """
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
     covariances = np.empty((len(nll), 2, 2))
     prior = np.eye(2) / reach(model) ** 2
@@ -300,9 +324,11 @@ def refine(
 def _refined(
     model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array, places: Array
 ) -> tuple[Array, Array, Array]:
-    """Positions (C, 2) at the optimum, negative log-likelihood (C,) and information (C, 2, 2) of C tags, a column of hits each.
+    """Move C candidates to the nearest local optimum. Column c of ``counts.hits`` has the reads of candidate c.
 
-    The information is the observed curvature if it is positive definite, else the Fisher information.
+    ``heights``, ``facing`` (C,), ``places`` (C, 2): of the candidates. Returns positions (C, 2), negative log-likelihoods (C,) and
+    information matrices (C, 2, 2). The information is the observed curvature if it is positive definite, otherwise the Fisher
+    information.
     """
 
     def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:

@@ -1,9 +1,9 @@
 """Joint estimation of tag positions and robot trajectory from odometry and reads.
 
-The trajectory grows in stretches, to bound the drift of the odometry. After each stretch all poses so far are optimised with the
-mapped tags (:class:`factors.rfid.factor.RfidTagFactor`). Then the remaining tags are searched
-(:mod:`factorgraph_loc.mapping.tag_search`); those with a single position that explains their reads are added to the map. At the
-end all tags are searched again along the whole trajectory, and the problem is solved again if one has moved.
+The trajectory is built in sections, to limit the drift of the odometry. After each section, all poses and mapped tags are optimised
+(:class:`factors.rfid.factor.RfidTagFactor`). Then the other tags are searched (:mod:`factorgraph_loc.mapping.tag_search`). A tag is
+added to the map if a single position explains its reads. At the end all tags are searched again along the whole trajectory. If the
+position of a tag has changed significantly, the problem is solved again.
 """
 
 from collections.abc import Callable
@@ -37,11 +37,12 @@ from factors.rfid.model import RfidModel
 from factors.se2 import Array
 
 INTERVAL = 1.0  # s between keyframes
-STRETCH = 15  # keyframes per stretch
-WINDOW = 90  # latest keyframes along which new tags are searched
-MARGIN = 1.0  # m beyond the reach: farther away, missed reads of a tag are ignored
-ITERATIONS, FINAL_ITERATIONS = 4, 40
-ROUNDS = 3  # of searching all tags again at the end
+SECTION = 15  # keyframes per section of the trajectory
+WINDOW = 90  # number of last keyframes along which new tags are searched
+# m: missed reads of a tag are ignored if its distance exceeds the reach of the antennas plus this margin
+MARGIN = 1.0
+ITERATIONS, FINAL_ITERATIONS = 4, 40  # of the optimization after each section, and at the end
+ROUNDS = 3  # largest number of times that all tags are searched again at the end
 MOVED_GATE = 13.8  # 99.9 % of chi-square with two degrees of freedom
 
 Factors = list[tuple[Factor, tuple[int, ...]]]
@@ -51,9 +52,11 @@ Factors = list[tuple[Factor, tuple[int, ...]]]
 class TagObservations:
     """K antenna observations of T tags, ordered by time. An observation is what one antenna read in some inventory rounds.
 
-    ``names``: T EPCs; ``t`` (K,) [s]; ``antennas`` (K,): indices in the ``model``; ``rounds`` (K,); ``hits`` (K, T).
-    ``heights`` (T,) [m], assumed if not ``has_height`` (T,); ``facing`` (T,) [rad] in the world, NaN where unknown; ``positions``
-    (T, 2): from the log's map, NaN where it has none.
+    ``names``: the EPCs of the T tags. ``t`` (K,) [s]: times. ``antennas`` (K,): indices of the antennas in ``model``.
+    ``rounds`` (K,): the number of inventory rounds. ``hits`` (K, T): the number of these rounds that read each tag.
+    ``heights`` (T,) [m]: the heights of the tags. ``has_height`` (T,): False where the height is only assumed.
+    ``facing`` (T,) [rad]: the facings in the world frame, NaN where unknown. ``positions`` (T, 2) [m]: from the log's map, NaN
+    where the map lacks the tag.
     """
 
     model: RfidModel
@@ -68,24 +71,27 @@ class TagObservations:
     has_height: NDArray[np.bool_]
 
     def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
-        """Read counts of the observations ``which``, from robot ``poses`` (K', 3) in the world, relative to the world's origin."""
+        """Return the read counts of some observations. ``which``: mask (K,) of K' observations, or a slice. ``poses`` (K', 3): the
+        robot poses at their times, in the world frame."""
         return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 
 def tag_observations(log: Log, height: float | None = None) -> TagObservations:
-    """All antenna observations of the tags that a log read or that its map contains.
+    """Return the antenna observations of all tags that a log read or that its map contains.
 
-    Heights and facings come from the map. For other tags the height is ``height`` [m], by default the mean height of the
-    antennas, and the facing is unknown.
+    Heights and facings are those of the log's map. Tags that are not in the map have an unknown facing and the height ``height``
+    [m]. If ``height`` is None, they have the mean height of the antennas.
 
-    Raises InputError if the log has no reads, or none by an antenna of its rig.
+    Raises InputError if the log has no reads, or no reads by an antenna of its rig.
     """
     scans = whole_scans(log)
     read_tags = {epc for scan in scans for epc in scan.tags}
     if not read_tags:
-        raise InputError(f"{log.name}: has no reads of tags (rfid), so that there is nothing to map")
+        raise InputError(f"{log.name}: has no reads of tags (rfid), so there is nothing to map")
     if log.rig.find(RfidSettings) is None:
-        raise InputError(f"{log.name}: its rig has no [rfid], expected antennas and what they read")
+        raise InputError(
+            f"{log.name}: its rig has no section [rfid]: add it with the antennas and their detection model"
+        )
     antennas = {name: i for i, name in enumerate(log.rig.of(RfidSettings).all_antennas())}
     model = log.rig.of(RfidSettings).model()
     given = tag_map(log.world, log.rig.of(SurveySettings))
@@ -94,7 +100,9 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
     rows = [row for m in scans for row in _rows(m, antennas, index)]
     if not rows:
         known = listed(antennas)
-        raise InputError(f"{log.name}: no antenna that read is in its rig, expected some of {known}")
+        raise InputError(
+            f"{log.name}: its rig has none of the antennas that read tags, expected antennas among {known}"
+        )
     rows.sort(key=lambda row: row[0])
     t, antenna, rounds, hits = zip(*rows, strict=True)
     unmapped = len(names) - len(given.names)
@@ -118,7 +126,10 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
 def _rows(
     m: RfidScan, antennas: dict[str, int], index: dict[str, int]
 ) -> list[tuple[float, int, int, NDArray[np.int64]]]:
-    """Antenna observations of a scan: time, antenna, rounds, and hits (T,)."""
+    """Return the antenna observations of a scan: time, index of the antenna, number of rounds, and hits (T,).
+
+    ``antennas``, ``index``: the indices of antennas and of T tags by name.
+    """
     places = [antennas.get(name, -1) for name in m.antennas]
     out = {a: (m.t, a, places.count(a), np.zeros(len(index), dtype=np.int64)) for a in sorted(set(places) - {-1})}
     # a tag counts once per round, even if it answers several times
@@ -130,9 +141,10 @@ def _rows(
 
 @dataclass(frozen=True)
 class TagSlam:
-    """``t`` (M,) and ``poses`` (M, 3) of the keyframes; ``tags``: the located ones by index; ``facing`` (T,).
+    """The estimated trajectory and map of tags.
 
-    ``posteriors``: results of the last search for each of T tags.
+    ``t`` (M,) [s], ``poses`` (M, 3): times and poses of the keyframes. ``tags``: the estimated positions of located tags, by index.
+    ``facing`` (T,) [rad]: the facings of all T tags, NaN where unknown. ``posteriors``: the results of the last search, per tag.
     """
 
     t: Array
@@ -149,10 +161,14 @@ def tag_slam(
     known: NDArray[np.bool_],
     progress: Callable[[float], None],
 ) -> TagSlam:
-    """Map the tags that are not ``known`` (T,); known ones stay at ``observations.positions``. The frame is that of the prior."""
+    """Estimate the positions of tags and the trajectory of the robot together.
+
+    ``prior``: the start pose, in the frame of the result. ``known`` (T,): mask of the tags whose positions are fixed at
+    ``observations.positions``. ``progress``: is called with the fraction done.
+    """
     problem = _Problem(log, observations, prior, known)
     count = len(problem.t)
-    for end in (*range(STRETCH, count, STRETCH), count):
+    for end in (*range(SECTION, count, SECTION), count):
         problem.extend(end)
         problem.solve(ITERATIONS)
         problem.add_located(problem.search(~problem.mapped, max(0, end - WINDOW)))
@@ -166,10 +182,10 @@ def tag_slam(
 
 
 class _Problem:
-    """The optimisation problem as built so far."""
+    """The least-squares problem of keyframes and mapped tags, with their current estimates. Both are added step by step."""
 
     def __init__(self, log: Log, observations: TagObservations, prior: PosePrior, known: NDArray[np.bool_]) -> None:
-        self._looks, self._prior, self._known = observations, prior, known
+        self._observations, self._prior, self._known = observations, prior, known
         self._constants = log.rig.estimated("odometry")
         self._places = np.array(self._constants.indices, dtype=np.int64)
         wheels = moving(log.streams)
@@ -192,28 +208,34 @@ class _Problem:
         self._count = 1
 
     def extend(self, count: int) -> None:
-        """Add poses up to keyframe ``count`` by odometry."""
+        """Add keyframes until there are ``count``, with poses predicted by odometry."""
         for i in range(self._count, count):
             step = self._recalibrated(self._steps[i - 1])
             self._values[pose_key(i)] = se2.compose(self._values[pose_key(i - 1)], step)
         self._count = max(self._count, count)
 
     def search(self, wanted: NDArray[np.bool_], first: int) -> list[TagPosterior]:
-        """Search the ``wanted`` (T,) tags in observations from keyframe ``first`` on; the result of the others is empty."""
+        """Search for tags along the current poses. Returns a result for each of T tags, which is empty for tags not searched.
+
+        ``wanted`` (T,): mask of the tags to search. ``first``: the first keyframe whose observations are used.
+        """
         which = self._used & (self._keyframe >= first) & (self._keyframe < self._count)
         poses = se2.compose(self._poses()[self._keyframe[which]], self._offsets[which])
-        along = self._looks.along(poses, which)
+        along = self._observations.along(poses, which)
         tags = np.flatnonzero(wanted)
         out = [TagPosterior((), 0, 0.0) for _ in wanted]
         if len(tags) and len(poses):
             mine = of_tags(along, tags)
-            posteriors = search(self._looks.model, mine, self._looks.heights[tags], self._looks.facing[tags])
+            posteriors = search(
+                self._observations.model, mine, self._observations.heights[tags], self._observations.facing[tags]
+            )
             for tag, posterior in zip(tags.tolist(), posteriors, strict=True):
                 out[tag] = posterior
         return out
 
     def add_located(self, posteriors: list[TagPosterior]) -> bool:
-        """Add located tags, and move mapped ones that were located significantly elsewhere; whether anything changed."""
+        """Add located tags to the map, and move mapped tags whose new position differs significantly. Returns True if any
+        changed."""
         changed = False
         for tag, posterior in enumerate(posteriors):
             if self._known[tag] or not posterior.is_located:
@@ -225,7 +247,7 @@ class _Problem:
                     continue
             self._values[key] = mode.position
             self.mapped[tag], changed = True, True
-            if np.isnan(self._looks.facing[tag]):
+            if np.isnan(self._observations.facing[tag]):
                 self._facing[tag] = mode.facing
         return changed
 
@@ -266,7 +288,7 @@ class _Problem:
         return Problem(factors + self._tag_factors())
 
     def _tag_factors(self) -> Factors:
-        observations, out = self._looks, list[tuple[Factor, tuple[int, ...]]]()
+        observations, out = self._observations, list[tuple[Factor, tuple[int, ...]]]()
         points = np.column_stack((np.nan_to_num(observations.positions), observations.heights))
         everything = RfidLikelihood(observations.model, TagArray(points, self._facing))
         fixed = np.flatnonzero(self._known)
@@ -290,9 +312,9 @@ class _Problem:
 
 
 def _keyframes(begin: float, end: float, stamps: Array) -> Array:
-    """Times [s] at intervals of ``INTERVAL`` from ``begin`` to ``end``, without those inside of long gaps between ``stamps``.
+    """Return the times [s] of keyframes at intervals of ``INTERVAL`` from ``begin`` to ``end``.
 
-    The time of the first stamp after a gap is preceded by one of these.
+    Times inside of long gaps between ``stamps`` [s] are left out, except the last time before the end of a gap.
     """
     measured = np.unique(np.concatenate(((begin, end), stamps[(stamps > begin) & (stamps < end)])))
     gaps = np.flatnonzero(np.diff(measured) > TICK_GAP)

@@ -1,7 +1,7 @@
-"""Tracks of features in images of cameras with known poses, and the points triangulated from them.
+"""Tracks of features in images with known camera poses, and triangulation of their points.
 
-Matches are searched near epipolar lines only (Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9), which
-separates features that look alike and yields more matches.
+Matches are searched near epipolar lines only (Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9). This separates
+similar features, so that more matches pass the ratio test.
 """
 
 from __future__ import annotations
@@ -20,20 +20,12 @@ from factors.camera import triangulation_kernels as kernels
 from factors.camera.model import CameraModel, linearize_in_space, undistorted
 from factors.se2 import Array, Integers
 
-NEAREST, FARTHEST = 0.1, 100.0  # m, allowed depths in every camera that sees a point
-PARALLAX = 0.02  # rad, the least angle between two rays to a point that determines its depth
-ANY_SPREAD = 1e3  # relative standard deviation of a point that is never exceeded in practice
-RANKS = (
-    0,
-    1,
-    2,
-    4,
-    7,
-    12,
-    20,
-    33,
-)  # ranks of the overlapping frames, nearest first, that a frame is matched with
-APART, ASKEW = 1.0, 0.8  # m and rad: cameras farther apart are assumed not to overlap
+NEAREST, FARTHEST = 0.1, 100.0  # m: allowed depths of a point in the cameras that observe it
+PARALLAX = 0.02  # rad: least angle between two rays to a point
+ANY_SPREAD = 1e3  # largest relative standard deviation of a triangulated point: so large that none is rejected
+# a frame is matched with the overlapping frames of these ranks, nearest first
+RANKS = (0, 1, 2, 4, 7, 12, 20, 33)
+APART, ASKEW = 1.0, 0.8  # m, rad: the images of cameras that differ more are assumed not to overlap
 RATIO = 0.85
 
 
@@ -53,8 +45,10 @@ class Cameras:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """N observations of T points: the point ``track`` (N,) in 0 .. T - 1 is feature ``feature`` (N,) of frame ``frame`` (N,),
-    at ``pixels`` (N, 2).
+    """N observations of T points.
+
+    ``track`` (N,): the index of the point, from 0 to T - 1. ``frame`` (N,): the index of the image. ``feature`` (N,): the index
+    of the feature in this image. ``pixels`` (N, 2): the observed pixel.
     """
 
     track: Integers
@@ -71,11 +65,12 @@ class Tracks:
         return int(self.track.max(initial=-1)) + 1
 
     def lengths(self) -> Integers:
-        """The number of observations of each point (T,)."""
+        """Return the number of observations of each point (T,)."""
         return np.bincount(self.track, minlength=self.count)
 
     def kept(self, observations: Truths) -> tuple[Tracks, Integers]:
-        """The tracks with the selected ``observations`` (N,), renumbered, and the old indices (T',) of the remaining points."""
+        """Select observations by a mask (N,). Returns the tracks with renumbered points, and the old index of each of their T'
+        points (T',)."""
         old, track = np.unique(self.track[observations], return_inverse=True)
         left = (self.frame[observations], self.feature[observations], self.pixels[observations])
         return Tracks(track.astype(np.int64), *left), old
@@ -83,8 +78,11 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class Triangulated:
-    """``positions`` (T, 3) [m] with ``covariances`` (T, 3, 3), given the cameras; ``errors`` (N, 2) [px] of the observations,
-    predicted minus measured, and their ``depths`` (N,) [m]; ``parallax`` (T,) [rad]: the largest angle between two rays.
+    """T triangulated points with N observations.
+
+    ``positions`` (T, 3) [m], ``covariances`` (T, 3, 3): of the points, for exact camera poses. ``errors`` (N, 2) [px]: the
+    residuals, predicted minus measured. ``depths`` (N,) [m]: the depth of the point in the camera of each observation.
+    ``parallax`` (T,) [rad]: the largest angle between two rays to a point.
     """
 
     positions: Array
@@ -94,9 +92,8 @@ class Triangulated:
     parallax: Array
 
     def good(self, tracks: Tracks, model: CameraModel, parallax: float = PARALLAX) -> Truths:
-        """Which points (T,) have two or more observations, lie in front of all their cameras, and have enough parallax
-        and small errors.
-        """
+        """Return a mask (T,) of the points with two or more observations, an allowed depth in all their cameras, at least
+        ``parallax`` [rad], and small residuals."""
         invalid = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))
@@ -106,10 +103,11 @@ class Triangulated:
 
 
 def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
-    """Errors of N observations (N, 2) [px], predicted minus measured, their Jacobians, and the depths (N,) [m].
+    """Compute the residuals of N observations, with derivatives.
 
-    The Jacobians are with respect to the camera (N, 2, 6), as in :func:`factors.camera.model.linearize_in_space`, and to the
-    point (N, 2, 3).
+    ``points`` (T, 3): positions in the world frame. Returns the residuals (N, 2) [px], predicted minus measured; their Jacobians
+    with respect to the camera pose (N, 2, 6), as in :func:`factors.camera.model.linearize_in_space`, and to the point (N, 2, 3);
+    the depths (N,) [m].
     """
     rotations = cameras.rotations[tracks.frame]
     local = np.einsum("nj,njk->nk", points[tracks.track] - cameras.positions[tracks.frame], rotations)
@@ -118,8 +116,10 @@ def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Track
 
 
 def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangulated:
-    """Triangulate the points of ``tracks``, with exact camera poses (:mod:`factors.camera.triangulation_kernels`). A point that is
-    not determined is at the origin, with no parallax."""
+    """Triangulate the points of ``tracks`` for exact camera poses (:mod:`factors.camera.triangulation_kernels`).
+
+    The parallax of a point is set to 0 if its rays do not determine it.
+    """
     points, covariances = np.zeros((tracks.count, 3)), np.zeros((tracks.count, 3, 3))
     rays, determined = reprojection.rays(model, tracks.pixels), np.zeros(tracks.count, dtype=bool)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
@@ -137,7 +137,7 @@ def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangu
 
 
 def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
-    """The largest angle (T,) [rad] between two of the rays to each of ``points`` (T, 3)."""
+    """Return for each of ``points`` (T, 3) the largest angle (T,) [rad] between the rays of two of its observations."""
     rays = points[tracks.track] - cameras.positions[tracks.frame]
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
     order = np.argsort(tracks.track, kind="stable")
@@ -147,8 +147,10 @@ def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
 
 
 def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
-    """Indices of keyframes: the first, and each at ``distance`` [m] or ``angle`` [rad] from all chosen before, so that
-    revisiting a place adds none.
+    """Select keyframes. Returns their indices.
+
+    The first camera is a keyframe, and each later one that differs from all earlier keyframes by ``distance`` [m] or ``angle``
+    [rad]. A second drive through the same place therefore adds no keyframes.
     """
     chosen: list[int] = []
     for i in range(len(cameras)):
@@ -159,7 +161,8 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
 
 
 def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of frames that overlap: for each frame the nearest ones, and some farther ones."""
+    """Return pairs (i, j), i < j, of images that probably overlap: for each image the nearest ones, and some that are farther
+    away."""
     pairs = set()
     for i in range(len(cameras)):
         distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
@@ -175,9 +178,10 @@ def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
 def near_epipolar_lines(
     model: CameraModel, cameras: Cameras, i: int, j: int, first: Array, second: Array, gate: float
 ) -> Truths:
-    """Whether pairs (N, M) of pixels ``first`` (N, 2) of frame i and ``second`` (M, 2) of frame j may show one point.
+    """Return a mask (N, M) of the pairs of pixels in images i and j that may show the same point.
 
-    Each must be at most ``gate`` pixels from the epipolar line of the other.
+    ``first`` (N, 2), ``second`` (M, 2) [px]: pixels in image i and in image j. Each pixel of a pair must be at most ``gate`` [px]
+    from the epipolar line of the other pixel.
     """
     rotation = cameras.rotations[j].T @ cameras.rotations[i]
     shift = cameras.rotations[j].T @ (cameras.positions[i] - cameras.positions[j])
@@ -185,9 +189,8 @@ def near_epipolar_lines(
     essential = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ rotation
     a, b = (np.column_stack((undistorted(model, pixels), np.ones(len(pixels)))) for pixels in (first, second))
     lines_j, lines_i = (lines.astype(np.float32) for lines in (a @ essential.T, b @ essential))
-    off = np.abs(
-        lines_j @ b.T.astype(np.float32)
-    )  # single precision is accurate to 0.001 px and takes half of the time
+    # single precision is accurate to 0.001 px and takes half of the time
+    off = np.abs(lines_j @ b.T.astype(np.float32))
     limit = np.float32(gate / np.sqrt(model.fx * model.fy))
     return np.asarray(
         (off <= limit * np.hypot(lines_j[:, 0], lines_j[:, 1])[:, None]) & (off <= limit * np.hypot(*lines_i[:, :2].T))
@@ -197,8 +200,10 @@ def near_epipolar_lines(
 def matched_pairs(
     model: CameraModel, cameras: Cameras, frames: Sequence[CameraFrame], pairs: Sequence[tuple[int, int]], gate: float
 ) -> list[tuple[int, int, Integers, Array]]:
-    """For each of ``pairs`` (i, j): indices (K, 2) of matching features, and their distances (K,) relative to the typical
-    distance of that pair. ``gate`` [px]: see :func:`near_epipolar_lines`.
+    """Match the features of each of the ``pairs`` (i, j) of images. Pairs without a match are left out.
+
+    ``gate`` [px]: see :func:`near_epipolar_lines`. Returns i, j, the indices (K, 2) of matching features, and the distances (K,) of
+    their descriptors, divided by the median distance of the pair of images.
     """
     out = []
     for i, j in pairs:
@@ -213,7 +218,10 @@ def matched_pairs(
 
 
 def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Integers, Array]]) -> Tracks:
-    """Tracks chained from matches, best first; a match that would join two features of one frame is rejected."""
+    """Chain matches into tracks, the best matches first. A match that would join two features of one image is left out.
+
+    ``matches``: the result of :func:`matched_pairs`.
+    """
     starts = np.cumsum([0, *(len(frame.pixels) for frame in frames)])
     frame_of = np.repeat(np.arange(len(frames)), np.diff(starts))
     first = np.concatenate([starts[i] + indices[:, 0] for i, _, indices, _ in matches] or [np.empty(0, dtype=np.int64)])
@@ -222,7 +230,7 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
     )
     order = np.argsort(np.concatenate([d for *_, d in matches] or [np.empty(0)]), kind="stable")
     root = list(range(int(starts[-1])))
-    members: dict[int, dict[int, int]] = {}  # features by frame, for each root
+    members: dict[int, dict[int, int]] = {}  # for each root of a track, its features by frame
 
     def find(k: int) -> int:
         while root[k] != k:
@@ -253,6 +261,6 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
 
 
 def angles_between(first: Array, second: Array) -> Array:
-    """Angles (F,) [rad] between rotations ``first`` (F, 3, 3) and ``second`` (F, 3, 3), or one (3, 3)."""
+    """Return the angles (F,) [rad] between the rotations ``first`` and ``second``, each (F, 3, 3) or a single one (3, 3)."""
     trace = np.einsum("nij,nij->n", *np.broadcast_arrays(first, second))
     return np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))

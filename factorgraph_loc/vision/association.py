@@ -1,9 +1,9 @@
 """Matching of an image's features to the points of a map, with or without a predicted camera pose.
 
-With a prediction, a point is searched at its predicted pixel, if it was once observed from a similar viewpoint; this excludes
-occluded points. The most similar feature in its gate is accepted if it passes the ratio test. All matches must agree on one pose
-(:mod:`~factorgraph_loc.vision.consensus`). Ratio test: Lowe, IJCV 60, 2004, section 7.1, but only among different points, as
-views of one point are similar.
+With a prediction, a point is searched at its predicted pixel. Points that were never observed from a similar viewpoint are left
+out, because they may be occluded. The most similar feature in the gate of a point is accepted if it passes the ratio test (Lowe,
+IJCV 60, 2004, section 7.1). The ratio test compares different points only, because all views of one point are similar. All matches
+must agree on one pose (:mod:`~factorgraph_loc.vision.consensus`).
 
 Without a prediction, the image is compared with a whole small map, or with the most similar keyframes of a large one
 (:mod:`~factorgraph_loc.vision.relocalization`).
@@ -21,36 +21,40 @@ from factorgraph_loc.vision.consensus import CameraPose, agreeing
 from factorgraph_loc.vision.frame import CameraFrame
 from factorgraph_loc.vision.keypoints import Descriptors, Float, Integers
 from factorgraph_loc.vision.matching import distance_matrix
-from factorgraph_loc.vision.relocalization import KeyframeLooks, as_numbers, located
+from factorgraph_loc.vision.relocalization import KeyframeIndex, as_numbers, located
 from factors import chi_squared
 from factors.camera import model as reprojection
 from factors.camera.model import CameraModel
 from factors.compiled import compiled
 from factors.se2 import Array
 
-RATIO, GLOBAL_RATIO = 0.85, 0.8
-NEAREST, FARTHEST = 0.2, 50.0  # m, of points that are searched
-LARGEST_ANGLE, LARGEST_RATIO = math.radians(50.0), 2.0  # bounds between views: angle, ratio of distances
+RATIO, GLOBAL_RATIO = 0.85, 0.8  # ratio tests with and without a prediction
+NEAREST, FARTHEST = 0.2, 50.0  # m: depths of points that are searched
+# a viewpoint is similar to another if angle and ratio of distances to the point are smaller
+LARGEST_ANGLE, LARGEST_RATIO = math.radians(50.0), 2.0
 GATE = float(chi_squared.quantile(0.99, 2))
 CELL = 20.0  # px, cells for sorting features
-# px, radius: added for errors of the prediction, and the largest gate
+# px, radii of gates: added to each gate because the prediction is not exact; upper bound
 SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
-MARGIN = 20.0  # px around the image: predicted points there are searched
+MARGIN = 20.0  # px: points that are predicted this far outside the image are still searched
 SAME_PIXEL = 4.0  # px: closer points and features may be the same
 SAME_POINT = 0.15  # m: closer points may be the same
-CHANCE = 0.02  # fraction of pairs of different map points that are more similar than a match may be
+CHANCE = 0.02  # descriptors of a match must be more similar than this fraction of pairs of different map points
 MANY = 5000  # views of a map: with more, only the most similar keyframes are compared with an image
-# matches, and fraction of the visible points: fewer may be consistent with the prediction by chance. In an office unknown to the
-# map up to 2 % of the features are
+# least number of matches, and least fraction of the visible points that must match. In an office that the map does not contain,
+# up to 2 % of the features match by chance
 FEWEST, LEAST_SHARE = 3, 0.05
-SAMPLED = 300  # views, to estimate that similarity
-FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # matches that must agree in relocalization, and their fraction
+SAMPLED = 300  # number of views from which the similarity of different points is estimated
+FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # relocalization: least number and least fraction of inliers among the matches
 
 
 @dataclass(frozen=True)
 class Associations:
-    """Matched ``points`` of the map (M,) and features of an image (M,); ``expected``: number of points searched; ``rejected``:
-    number of similar features that were outliers."""
+    """M matches between points of a map and features of an image.
+
+    ``points`` (M,): indices of the map's points. ``features`` (M,): indices of the image's features. ``expected``: the number of
+    points that should be visible. ``rejected``: the number of matches that were rejected as outliers.
+    """
 
     points: Integers
     features: Integers
@@ -65,7 +69,7 @@ NONE = Associations(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
 
 
 class Associator:
-    """Matches features to a map; see the module."""
+    """Matches the features of images to the points of a map. ``feature``: the kind of the map's features."""
 
     def __init__(self, points: PointMap, model: CameraModel) -> None:
         self.feature = points.feature
@@ -79,7 +83,7 @@ class Associator:
         self._seen_from = np.ascontiguousarray(points.seen_from[order], dtype=float)
         self._descriptors: Descriptors = points.descriptors[order]
         self._numbers = _numbers(self._descriptors)
-        self._places: KeyframeLooks | None = None
+        self._keyframes: KeyframeIndex | None = None
         self._largest_cost = self._cost_limit()
         corners = np.array(((-0.5, -0.5), (model.width, -0.5), (-0.5, model.height), (model.width, model.height)))
         # wide enough for an uncertain focal length
@@ -88,9 +92,11 @@ class Associator:
     def guided(
         self, frame: CameraFrame, camera: CameraPose, model: CameraModel | None = None, focal: float = 0.0
     ) -> Associations:
-        """Match with a predicted pose of the ``camera``.
+        """Match an image to the map with a predicted pose of the camera.
 
-        ``model``: the current estimate of the camera, ``focal``: standard deviation of the logarithm of its focal length."""
+        ``model``: the current estimate of the camera's calibration, if it differs from the rig's. ``focal``: the standard deviation
+        of the logarithm of the focal length.
+        """
         model = self._model if model is None else model
         position, rotation = camera.position, camera.rotation
         if len(frame.pixels) == 0 or frame.feature != self.feature:
@@ -128,8 +134,10 @@ class Associator:
         return Associations(ahead[rows[right]], matched_features[right], expected, int(np.count_nonzero(~right)))
 
     def _similar_views(self, points: Integers, place: Array) -> tuple[Integers, Integers]:
-        """The views of ``points`` (C,), ascending, from viewpoints similar to ``place`` (3,); and the start of each point's views
-        in these (C+1,)."""
+        """Select the views of ``points`` (C,) whose viewpoints are similar to the camera position ``place`` (3,).
+
+        Returns the indices of these views, sorted by point, and the start of each point's views in this array (C+1,).
+        """
         is_wanted = np.zeros(len(self._positions), dtype=bool)
         is_wanted[points] = True
         views = np.flatnonzero(is_wanted[self._owners])
@@ -144,7 +152,10 @@ class Associator:
         return views, np.append(np.searchsorted(self._owners[views], points), len(views))
 
     def relocalized(self, frame: CameraFrame) -> tuple[CameraPose, Associations] | None:
-        """Relocalize: the pose of the camera, and the matches; None if the map does not determine the pose."""
+        """Locate the camera of an image in the map without a prediction. Returns the camera pose and the matches.
+
+        Returns None if too few features match for a reliable pose.
+        """
         if len(frame.pixels) == 0 or frame.feature != self.feature or len(self._owners) == 0:
             return None
         points, features = self._alike(frame)
@@ -161,12 +172,15 @@ class Associator:
         return resection.camera, associations
 
     def _alike(self, frame: CameraFrame) -> tuple[Integers, Integers]:
-        """Points and features that are similar, and pass the ratio test against all other points."""
+        """Match features to points by their descriptors alone. Returns indices of points and of features.
+
+        A match passes the ratio test against all other points and is mutual: each is the most similar one of the other.
+        """
         owners, descriptors = self._owners, self._descriptors
         if len(owners) > MANY:
-            if self._places is None:
-                self._places = KeyframeLooks(self._descriptors, self._seen_from)
-            views = self._places.views(frame.descriptors)
+            if self._keyframes is None:
+                self._keyframes = KeyframeIndex(self._descriptors, self._seen_from)
+            views = self._keyframes.views(frame.descriptors)
             owners, descriptors = owners[views], descriptors[views]
         owners, first = np.unique(owners, return_index=True)
         distances = distance_matrix(frame.descriptors, descriptors)
@@ -182,7 +196,8 @@ class Associator:
         return np.asarray(distances(pairs, begins, views, self._numbers, _numbers(frame_descriptors)))
 
     def _cost_limit(self) -> float:
-        """Upper limit of the cost of a match: few pairs of views of different points are below it."""
+        """Return the largest distance of descriptors that a match may have. Only the fraction :data:`CHANCE` of pairs of different
+        points is more similar."""
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf
         rows = np.linspace(0, len(self._owners) - 1, min(SAMPLED, len(self._owners))).astype(np.int64)
@@ -199,7 +214,10 @@ def _numbers(descriptors: Descriptors) -> Float:
 
 
 def _gates(covariances: Array) -> tuple[Array, Array]:
-    """Gates of innovations with covariances (C, 2, 2) [px^2]: inverse matrices (C, 2, 2) and largest radii (C,)."""
+    """Return the elliptic gates of C predicted pixels with innovation ``covariances`` (C, 2, 2) [px^2].
+
+    Returns the matrices A (C, 2, 2) of the ellipses x'Ax = 1, and the largest radii (C,) [px].
+    """
     gates = GATE * covariances
     mean = 0.5 * (gates[:, 0, 0] + gates[:, 1, 1])
     half = np.hypot(0.5 * (gates[:, 0, 0] - gates[:, 1, 1]), gates[:, 0, 1])
@@ -211,10 +229,11 @@ def _gates(covariances: Array) -> tuple[Array, Array]:
 
 @compiled
 def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
-    """Pairs (N, 2) of a point and a feature inside the gate of the point's prediction.
+    """Return the pairs (N, 2) of a point and a feature, as indices, where the feature is inside the gate of the point.
 
-    ``predicted`` (C, 2); ``inverses`` (C, 2, 2): inverse gate matrices (1 on the border); ``reaches`` (C,): largest radii;
-    ``features`` (K, 2). ``cell``: size of the cells for sorting features.
+    ``predicted`` (C, 2) [px]: the predicted pixels of the points. ``inverses`` (C, 2, 2): the matrices A of the elliptic gates
+    x'Ax = 1. ``reaches`` (C,) [px]: the largest radii of the gates. ``features`` (K, 2) [px]: the pixels of the features.
+    ``cell`` [px]: the size of the grid cells by which the features are sorted for speed.
     """
     low_x, low_y = high_x, high_y = features[0, 0], features[0, 1]
     for i in range(1, len(features)):
@@ -261,9 +280,11 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
 @compiled(fastmath=True)
 def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any) -> Array:
-    """Squared distance (N,) of each pair's feature from the nearest view of its point; of bits it is the Hamming distance.
+    """Return for each pair of point and feature the squared distance (N,) between the feature's descriptor and the most similar
+    view of the point. For descriptors of bits this is the Hamming distance.
 
-    ``frame_descriptors`` (K, D): of the features; ``known`` (V, D): of the views.
+    ``pairs`` (N, 2): indices of point and feature. ``views[begins[i]:begins[i + 1]]``: indices of the views of point i.
+    ``known`` (V, D): the descriptors of the map's views. ``frame_descriptors`` (K, D): the descriptors of the features.
     """
     out = np.empty(len(pairs))
     size = known.shape[1]
@@ -283,8 +304,12 @@ def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, fr
 def clear_pairs(
     pairs: Integers, costs: Array, predicted: Array, features: Array, ratio: float, apart: float
 ) -> Integers:
-    """Indices of the mutually nearest pairs that pass the ratio test: a cost below ``ratio`` times that of the best other match
-    at least ``apart`` pixels away.
+    """Return the indices of the pairs that are mutually best and pass the ratio test.
+
+    ``pairs`` (N, 2): indices of point and feature. ``costs`` (N,): distances of their descriptors. ``predicted`` (C, 2),
+    ``features`` (K, 2) [px]: the pixels of points and features.
+    A pair passes the ratio test if its cost is below ``ratio`` times the costs of the other pairs with the same point or feature.
+    Other pairs less than ``apart`` [px] away are not compared, because they may show the same point.
     """
     every = np.arange(len(pairs))
     kept = np.ones(len(pairs), dtype=bool)

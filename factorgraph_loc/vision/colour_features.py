@@ -1,8 +1,8 @@
-"""The paper's colour features behind the common interface of features.
+"""Extractor of the colour features of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011).
 
-Images have the Gaussian colour model: intensity and two opponent colours as linear combinations of red, green and blue. It is the
-response, for RGB cameras, of a Gaussian receptive field to a spectrum and its first two derivatives (Geusebroek, van den Boomgaard,
-Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5).
+Images are converted to the Gaussian colour model: intensity and two opponent colours, each a linear combination of red, green and
+blue. For RGB cameras this approximates the response of a Gaussian receptive field to a spectrum and its first two derivatives
+(Geusebroek, van den Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5).
 """
 
 from dataclasses import dataclass
@@ -25,18 +25,18 @@ _FROM_BGR = GAUSSIAN_COLOUR[:, ::-1].astype(np.float32).copy()
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """A linear map that weights the 35 values of a colour feature, learnt from points seen in two images.
+    """A linear map from the 35 values of a colour feature to its descriptor, learnt from points observed in two images.
 
-    ``map`` (35, 35) multiplies the values minus their ``mean`` (35,). The results have unit covariance of the difference between
-    two views of a point: their Euclidean distance is the Mahalanobis distance of the values (within-class whitening, Fukunaga,
-    "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
+    ``map`` (35, 35) multiplies the values minus their ``mean`` (35,). After the map, the difference between two views of a point
+    has unit covariance. The Euclidean distance of two results is then the Mahalanobis distance of the values (within-class
+    whitening, Fukunaga, "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
     """
 
     mean: Float
     map: Float
 
     def __call__(self, values: Float) -> Float:
-        """Unit descriptors (N, 35) of ``values`` (N, 35)."""
+        """Return the descriptors (N, 35), of unit length, of features with ``values`` (N, 35)."""
         mapped = (values - self.mean) @ self.map
         length = np.linalg.norm(mapped, axis=1, keepdims=True)
         return np.asarray(mapped / np.maximum(length, np.finfo(np.float32).tiny), dtype=np.float32)
@@ -44,8 +44,8 @@ class Weights:
 
 @cache
 def shipped_weights() -> Weights:
-    """The weights included in the package, learnt by ``scripts/learn_feature_weights`` on the sequences bark and graf of
-    Mikolajczyk et al., IJCV 65, 2005."""
+    """Return the weights that are part of the package. ``scripts/learn_feature_weights`` learnt them from the image sequences bark
+    and graf of Mikolajczyk et al., IJCV 65, 2005."""
     with (
         resources.files("factorgraph_loc.vision").joinpath("weights.npz").open("rb") as file,
         np.load(file, allow_pickle=False) as stored,
@@ -54,12 +54,12 @@ def shipped_weights() -> Weights:
 
 
 class ColourExtractor:
-    """Extractor of colour features (:class:`~factorgraph_loc.vision.keypoints.Extractor`), at most ``count`` per image, with
-    ``float32`` unit descriptors (N, 35).
+    """Extractor of colour features (see :class:`~factorgraph_loc.vision.keypoints.Extractor`).
 
-    ``everywhere``: of all parts of an image alike, not the strongest. ``paper_literal``: the neighbours of the paper
-    (:func:`~factorgraph_loc.vision.descriptor.records`), for comparison. The memory of an image is reused for the next one of its
-    size, so an extractor must be used by one thread only.
+    The descriptors (N, 35) are ``float32`` and of unit length. ``count``: the largest number of features per image.
+    ``everywhere``: choose features in all parts of an image, not only the strongest. ``paper_literal``: use the neighbours of the
+    paper (:func:`~factorgraph_loc.vision.descriptor.records`), for comparison.
+    An extractor must be used by one thread only, because the memory for an image is reused for the next image of the same size.
     """
 
     def __init__(self, count: int, *, everywhere: bool = False, paper_literal: bool = False) -> None:
@@ -76,7 +76,8 @@ class ColourExtractor:
         return keypoints, shipped_weights()(descriptor.values(described))
 
     def record(self, image: object) -> tuple[Keypoints, NDArray[np.void]]:
-        """The points of ``image``, and their raw values :data:`~factorgraph_loc.vision.descriptor.RECORD` (N,)."""
+        """Return the N features of ``image``, and their values (N,) as records of
+        :data:`~factorgraph_loc.vision.descriptor.RECORD`, before weights are applied."""
         space, keypoints = self._detect(image)
         if space is None:
             return keypoints, np.empty(0, dtype=descriptor.RECORD)
@@ -99,7 +100,8 @@ class ColourExtractor:
 
 
 def colour_channels(image: Image) -> list[Float]:
-    """E, E_lambda, E_lambda_lambda, each (H, W), of a BGR image; a grey image (H, W) gives E only."""
+    """Return the channels E (intensity), E_lambda and E_lambda_lambda (opponent colours), each (H, W), of a BGR image. A grey image
+    (H, W) has the channel E only."""
     if image.ndim == 2:
         return [image.astype(np.float32)]
     channels = cv2.split(cv2.transform(image.astype(np.float32), _FROM_BGR))

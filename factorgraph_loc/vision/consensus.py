@@ -1,9 +1,10 @@
-"""Outlier rejection among the points seen in an image: they must agree on one camera pose near the predicted one.
+"""Outlier rejection among the points observed in an image: they must agree on one camera pose near the predicted one.
 
 All points are accepted if they are jointly compatible with the prediction (Neira, Tardos, IEEE Transactions on Robotics and
-Automation 17(6), 2001). Otherwise samples of three points correct the prediction by a Kalman update, and the correction with most
-inliers is used. (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010, use
-one point.) The prediction of a robot on a floor has a covariance of rank 5, and so has the correction.
+Automation 17(6), 2001). Otherwise random samples of three points correct the prediction by a Kalman update each. The correction
+with most inliers is used. (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5),
+2010, use samples of one point.) The predicted camera of a robot on a floor has a covariance of rank 5. The correction changes only
+these five directions.
 """
 
 from dataclasses import dataclass
@@ -22,12 +23,12 @@ from factors.se2 import Array
 
 Truths = NDArray[np.bool_]
 
-FEWEST = 4  # points that must agree: three always determine a pose
-SAMPLE = 3
-HYPOTHESES, ROUND = 96, 16  # maximum number, and number between checks for termination
-FAILURE = 1e-3  # probability that no outlier-free sample was drawn
-REACH = 10.0  # standard deviations of the prediction that bound a correction
-FARTHEST = 3.0  # bound of a single step, relative to REACH
+FEWEST = 4  # least number of points that must agree: three points agree with some pose even if they are outliers
+SAMPLE = 3  # points
+HYPOTHESES, ROUND = 96, 16  # largest number of samples, and number of samples between two checks for termination
+FAILURE = 1e-3  # largest probability that no sample without outliers was drawn
+REACH = 10.0  # for corrections by samples, the standard deviations of the prediction are multiplied by this factor
+FARTHEST = 3.0  # bound of a single step, in these enlarged standard deviations
 ROUNDING = 1e-12  # relative to the largest eigenvalue of a covariance: smaller ones count as zero
 RIDGE = 1e-9  # regularisation of the information, for points very close to the camera
 SAMPLE_GATE, GATE = 25.0, 13.8  # squared residuals of inliers of a sample, and of the final pose (99.9 %)
@@ -36,8 +37,8 @@ JOINT = 0.99  # probability of the joint compatibility test
 
 @dataclass(frozen=True)
 class CameraPose:
-    """``position`` (3,) and ``rotation`` (3, 3) of a camera in the world, and ``covariance`` (6, 6) of a perturbation in its own
-    frame, rotation first."""
+    """The pose of a camera. ``position`` (3,), ``rotation`` (3, 3): in the world frame. ``covariance`` (6, 6): of a perturbation in
+    the camera frame, rotation first."""
 
     position: Array
     rotation: Array
@@ -45,21 +46,24 @@ class CameraPose:
 
 
 def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> bool:
-    """Whether all ``points`` (K, 3), seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2], are jointly
-    compatible with the prediction."""
+    """True if K observed points together pass a chi-square test (joint compatibility) with the predicted ``camera``.
+
+    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): observations. ``covariances`` (K, 2, 2) [px^2]: their noise.
+    """
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, covariances))
     try:
         joint = _joint(reprojection.lens_of(model), camera.position, camera.rotation, camera.covariance, *arrays)
-    except np.linalg.LinAlgError:  # an extreme covariance: each point is tested separately
+    except np.linalg.LinAlgError:  # an extreme covariance: the caller then tests each point separately
         return False
     return bool(joint < chi_squared.quantile(JOINT, 2 * len(points)))
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
-    """The inliers among ``points`` (K, 3) with a pose near the predicted ``camera``.
+    """Return a mask (K,) of the observed points that agree on one pose near the predicted ``camera``.
 
-    They were seen at ``pixels`` (K, 2) with noise covariances ``covariances`` (K, 2, 2) [px^2]. All are inliers if
-    :func:`are_compatible`, none with fewer than :data:`FEWEST`.
+    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): observations. ``covariances`` (K, 2, 2) [px^2]: their noise.
+    All points are inliers if they are jointly compatible with the prediction (:func:`are_compatible`). Otherwise at least
+    :data:`FEWEST` points must agree, or none is an inlier.
     """
     count = len(points)
     if are_compatible(model, camera, points, pixels, covariances):
@@ -83,7 +87,11 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
 def _best_of_samples(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, whiteners: Array, root: Array
 ) -> tuple[Array, Array, Array]:
-    """The pose (1, 3), (1, 3, 3) with most inliers among corrections by random samples, and the squared residuals (K,) there."""
+    """Correct the predicted pose by random samples of points, and return the correction with most inliers: position (1, 3),
+    rotation (1, 3, 3), and the squared whitened residuals (K,) of all points at this pose.
+
+    ``whiteners`` (K, 2, 2): whiten the pixel errors. ``root`` (6, 6): a square root of the covariance of the allowed corrections.
+    """
     rng, count = np.random.default_rng(0), len(points)
     best: tuple[float, Array, Array, Array] | None = None
     tried = 0
@@ -100,7 +108,7 @@ def _best_of_samples(
             normal[:, range(6), range(6)] = 1.0 + (1.0 + RIDGE) * normal[:, range(6), range(6)]
             gradient = np.einsum("hij,hi->hj", flat, residual) + total
             step = -np.linalg.solve(normal, gradient[..., None])[..., 0]
-            # three outliers may give any correction
+            # if a sample has outliers, its correction may be arbitrarily large
             step *= np.minimum(1.0, FARTHEST / np.linalg.norm(step, axis=1))[:, None]
             total = total + step
             position, rotation = _moved(position, rotation, step @ root.T)
@@ -121,8 +129,8 @@ def _best_of_samples(
 def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, covariances: Array
 ) -> float:
-    """Normalised squared innovation of points (K, 3) seen at pixels (K, 2) with noise (K, 2, 2), by a camera with perturbation
-    covariance (6, 6)."""
+    """Return the normalised squared innovation of K ``points`` (K, 3), observed at ``pixels`` (K, 2) with noise ``covariances``
+    (K, 2, 2), for a camera whose perturbation has the ``covariance`` (6, 6)."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
     for i in range(len(points)):
@@ -148,14 +156,14 @@ def _joint(
 
 
 def _root(camera: CameraPose) -> Array:
-    """A square root (6, 6) of the covariance, which may be singular."""
+    """Return a matrix R (6, 6) with RR' equal to the covariance of the camera pose, which may be singular."""
     values, vectors = np.linalg.eigh(camera.covariance)
     # rounding errors must not change the directions of a sample
     return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 
 def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
-    """H camera poses after perturbations (H, 6)."""
+    """Perturb H camera poses by ``step`` (H, 6), rotation first. Returns positions (H, 3) and rotations (H, 3, 3)."""
     shifted = position + (rotation @ step[:, 3:, None])[..., 0]
     return shifted, rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:, :3]).as_matrix()
 
@@ -163,8 +171,11 @@ def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]
 def _whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """Whitened residuals (H, 2S), predicted minus measured, of H cameras with ``points`` (H, S, 3) each, and their Jacobians
-    (H, 2S, 6) by the perturbation of the camera."""
+    """Return the whitened residuals (H, 2S), predicted minus measured, of H cameras with S points each, and their Jacobians
+    (H, 2S, 6) by the perturbation of the camera.
+
+    ``points`` (H, S, 3), ``pixels`` (H, S, 2), ``whiteners`` (H, S, 2, 2): the points of each camera.
+    """
     count = len(position)
     local = (points - position[:, None]) @ rotation
     # a point in the camera frame is like a world point seen by a camera at the origin
@@ -177,7 +188,7 @@ def _whitened(
 def _squared(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> Array:
-    """Squared whitened residuals (H, K) of all points for H cameras."""
+    """Return the squared whitened residuals (H, K) of K points for each of H cameras."""
     local = (points - position[:, None]) @ rotation
     predicted = reprojection.project(model, local.reshape(-1, 3)).reshape(*local.shape[:2], 2)
     error = np.einsum("kij,hkj->hki", whiteners, predicted - pixels)

@@ -1,9 +1,9 @@
-"""Descriptors of the colour features: the paper's 2 space, 21 scale, 5 orientation and 9 texture values.
+"""Values that describe a colour feature: 2 of space, 21 of scale, 5 of orientation and 9 of texture.
 
-They are computed on a lattice of 24 x 24 samples of E in a point's own frame and in units of its scale, as one product with a
-matrix of filters. The paper's neighbours are a cross of four places around the point, whose size depends on the scale. Algorithm
-1 and figure 2 of Raoui, Bouyakhf, Devy, ICINCO 2011; normalised Laplacian of Gaussian: Lindeberg, IJCV 30, 1998; Gabor wavelets:
-Daugman, J. Opt. Soc. Am. A 2(7), 1985."""
+They are those of Algorithm 1 and figure 2 of Raoui, Bouyakhf, Devy, ICINCO 2011 ("the paper"). The intensity E is sampled on a
+lattice of 24 x 24 places around a point, oriented by the direction of the point and in units of its scale. The values are the
+product of the samples and a matrix of filters. In place of the paper's neighbours, four places in a cross around the point are
+used. Normalised Laplacian of Gaussian: Lindeberg, IJCV 30, 1998. Gabor wavelets: Daugman, J. Opt. Soc. Am. A 2(7), 1985."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from factorgraph_loc.vision.keypoints import Float, Integers, Keypoints
 from factorgraph_loc.vision.scale_space import ScaleSpace
 from factors.se2 import Array
 
-# the first place is the point, the others form a cross; responses and texture are in grey levels
+# the first of five places is the point, the other four are the cross around it; responses and texture are in grey levels
 RECORD = np.dtype(
     [
         ("position", np.float32, 2),  # x, y [px]
@@ -27,10 +27,10 @@ RECORD = np.dtype(
         ("texture", np.float32, (3, 3)),  # magnitude of the Gabor wavelet of each wavelength and direction
     ]
 )
-VALUES = 35  # of the distance: all but the position
-OWN_SCALE = 20  # index of the point's own scale, which has no weight as a zoom changes it
+VALUES = 35  # number of values that are compared: all but the position
+OWN_SCALE = 20  # index of the point's own scale, which gets no weight, because it changes with the camera's distance
 
-# in units of a point's scale; the patch truncates the coarsest filters
+# parameters of the filters, in units of a point's scale. The lattice is too small for the coarsest filters and truncates them
 SIDE = 24
 LOG_SCALES = (1.6, 2.4, 3.6, 5.4)
 LOG_ARMS = (2.0, 4.0, 6.0, 8.0)
@@ -43,9 +43,11 @@ _FLAT = 1e-6  # grey levels: norm of a patch's responses below which they are se
 
 
 def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = False) -> NDArray[np.void]:
-    """The values of :data:`RECORD` (N,) of points with directions in the image of ``space``.
+    """Compute the values of N ``keypoints`` of an image, as records (N,) of the type :data:`RECORD`.
 
-    ``paper_literal``: use the four nearest other points as neighbours, which seldom are the same in another image."""
+    ``space``: the scale space of the image. ``keypoints`` must have directions. ``paper_literal``: as in the paper, use the four
+    nearest other keypoints as neighbours. In another image the neighbours often are others, which makes the values less repeatable.
+    """
     sigmas = keypoints.sizes / 2.0
     answers = space.patches(keypoints.points, sigmas, keypoints.angles, LATTICE) @ FILTERS
     result = np.empty(len(keypoints), dtype=RECORD)
@@ -65,10 +67,10 @@ def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = Fa
 
 
 def values(record: NDArray[np.void]) -> Float:
-    """The 35 values (N, 35) of records (N,), each block dimensionless.
+    """Convert records (N,) to the 35 dimensionless values (N, 35) that are compared.
 
-    Responses and textures are divided by their norm, for invariance to contrast. Scale is in octaves. Orientations are given by
-    their sine, which is continuous where an angle wraps.
+    Responses and textures are divided by their norm, for invariance to contrast. Scale is in octaves. Orientations are replaced by
+    their sine, which is continuous where an angle wraps around.
     """
     responses = record["scale_responses"].reshape(-1, 20)
     texture = record["texture"].reshape(-1, 9)
@@ -78,7 +80,8 @@ def values(record: NDArray[np.void]) -> Float:
 
 
 def _nearest(points: Array) -> Integers:
-    """The four nearest others (N, 4) of each of ``points`` (N, 2), nearest first; the point itself if there are too few."""
+    """Return the indices (N, 4) of the four nearest other points of each of ``points`` (N, 2), nearest first. If there are too few
+    points, the index of the point itself is used."""
     indices = cKDTree(points).query(points, k=np.arange(2, 6))[1] if len(points) else np.empty((0, 4), dtype=np.int64)
     return np.where(indices < len(points), indices, np.arange(len(points))[:, None]).astype(np.int64)
 
@@ -88,13 +91,14 @@ def _unit(block: Float) -> Float:
 
 
 def cross(arm: float) -> Array:
-    """The point and its four neighbours (5, 2), on the diagonals of its frame."""
+    """Return five places (5, 2) in the frame of a point: its origin, and one place on each diagonal at the distance ``arm``."""
     angles = np.pi / 4.0 + np.pi / 2.0 * np.arange(4.0)
     return np.vstack([np.zeros(2), arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)])
 
 
 def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
-    """The blur (M,) that takes a point's plane to ``scale``, around ``centre`` (2,); offsets from there (M, 2); its variance."""
+    """Return the weights (M,) of a Gaussian at the M places of the lattice, their offsets (M, 2) from ``centre`` (2,), and the
+    variance of the Gaussian. Its blur is added to that of the samples, 1, so that the result has the blur ``scale``."""
     variance = scale**2 - 1.0
     away = LATTICE - centre
     return np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2.0 * np.pi * variance), away, variance
@@ -103,7 +107,7 @@ def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
 def _laplacian(scale: float, centre: Array) -> Array:
     window, away, variance = _gaussian(scale, centre)
     response = scale**2 * ((away**2).sum(axis=1) / variance - 2.0) / variance * window
-    # truncated on a lattice the sum is not zero: subtract it, or brightness would count
+    # the sum of the truncated filter is not zero: subtract it, because the response must not depend on brightness
     return np.asarray(response - window * (response.sum() / window.sum()))
 
 
@@ -114,7 +118,7 @@ def _gradient(scale: float, centre: Array) -> list[Array]:
 
 
 def _gabor(wavelength: float, angle: float) -> list[Array]:
-    """Real and imaginary part of a wavelet, the real one without its mean."""
+    """Return the weights of a Gabor wavelet at the places of the lattice: real part, without its mean, and imaginary part."""
     x, y = LATTICE.T
     window = np.exp(-0.5 * (x**2 + y**2) / (ENVELOPE * wavelength) ** 2)
     window /= window.sum()

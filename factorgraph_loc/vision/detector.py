@@ -1,11 +1,11 @@
-"""Detector of colour features: corners of colour at their characteristic scales, with a direction.
+"""Detector of colour features: corners in colour images, with a scale and a direction.
 
-Colour Harris: the second moment matrix of Harris and Stephens ("A combined corner and edge detector", 1988) summed over the
-channels of the Gaussian colour model. It has a derivative and an integration scale (Mikolajczyk, Schmid, "Scale & affine
-invariant interest point detectors", IJCV 60, 2004, eq. 1). The scale of a corner maximises the normalised Laplacian of Gaussian
-(ibid., section 2.1). Direction: the peak of a histogram of gradients (Lowe, "Distinctive image features", IJCV 60, 2004, section
-5). Weaker corners near a stronger one of their scale are suppressed (Brown, Szeliski, Winder, "Multi-image matching using
-multi-scale oriented patches", CVPR 2005, section 2.1)."""
+Strength: the Harris measure of the second moment matrix (Harris, Stephens, "A combined corner and edge detector", 1988), summed
+over the channels of the Gaussian colour model. The matrix has a derivative scale and an integration scale (Mikolajczyk, Schmid,
+"Scale & affine invariant interest point detectors", IJCV 60, 2004, eq. 1). The scale of a corner maximises the normalised
+Laplacian of Gaussian (ibid., section 2.1). The direction is the peak of a histogram of gradients (Lowe, "Distinctive image
+features", IJCV 60, 2004, section 5). Corners near a stronger corner of about the same scale are suppressed (Brown, Szeliski,
+Winder, "Multi-image matching using multi-scale oriented patches", CVPR 2005, section 2.1)."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from factorgraph_loc.vision.kernels import (
     Int32,
     corner_strength,
-    lonely,
+    locally_strongest,
     orientation_histograms,
     refined_peaks,
     structure_tensor,
@@ -22,19 +22,19 @@ from factorgraph_loc.vision.keypoints import PARTS, Float, Keypoints, spread_out
 from factorgraph_loc.vision.scale_space import SCALES, SIGMAS, STEP, Octave, ScaleSpace, blur, more_blur
 from factors.se2 import Array
 
-INTEGRATION = 0.8  # integration over characteristic scale; derivatives are taken one scale below
+INTEGRATION = 0.8  # ratio of integration scale and characteristic scale; the derivative scale is the next finer scale
 WEAKEST = 1.0  # squared grey levels: weaker corners are camera noise
-# The response for ranking is a product of powers. A strong Laplacian gives a well-defined scale, and coarse corners remain
-# visible when the camera moves away.
+# Exponents of the response, which ranks corners. A corner with a strong Laplacian has a well-defined scale. A corner with a large
+# scale remains visible when the camera moves away.
 BY_STRENGTH, BY_LAPLACIAN, BY_SCALE = 0.7, 0.6, 0.3
-BORDER = 4  # pixels of an octave near the image border without corners
-CLEARANCE = 1.2  # in units of a point's scale: within it, weaker points are suppressed
+BORDER = 4  # pixels of an octave: no corners are detected this near to the image border
+CLEARANCE = 1.2  # in units of a point's scale: the point is suppressed if a stronger one is nearer
 
 _NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
 
 ORIENTATION_SIDE = 13
 ORIENTATION_SPACING = 0.85  # in units of a point's scale
-ORIENTATION_WINDOW = 2.25  # standard deviation of the weight, in the same
+ORIENTATION_WINDOW = 2.25  # standard deviation of the Gaussian weight, in units of a point's scale
 ORIENTATION_BINS = 36
 
 _arm = ORIENTATION_SPACING * (np.arange(ORIENTATION_SIDE) - ORIENTATION_SIDE // 2)
@@ -44,16 +44,16 @@ _WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTAT
 
 
 def detect(space: ScaleSpace, colours: list[Float], count: int, *, everywhere: bool = False) -> Keypoints:
-    """At most ``count`` points of the image in ``space``, by descending strength.
+    """Detect at most ``count`` points in an image. Returns them by descending response.
 
-    They are the strongest ones or, with ``everywhere``, those of all parts of the image. ``colours``: channels (H, W) in addition
-    to E.
+    ``space``: the scale space of the intensity E. ``colours``: the other channels (H, W) of the image. ``everywhere``: choose
+    points in all parts of the image, not only the strongest.
     """
     corners = np.vstack(_corners(space, colours))
     corners = corners[np.argsort(-corners[:, 3], kind="stable")]
     places, scales = corners[:, :2].astype(np.float32), corners[:, 2].astype(np.float32)
-    alone = lonely(places, scales, CLEARANCE, STEP, len(corners) if everywhere else count)
-    best, crowded = np.flatnonzero(alone), np.flatnonzero(~alone)
+    is_best = locally_strongest(places, scales, CLEARANCE, STEP, len(corners) if everywhere else count)
+    best, crowded = np.flatnonzero(is_best), np.flatnonzero(~is_best)
     if everywhere:
         best = best[spread_out(corners[best, :2], count, cells=PARTS)]
     corners = corners[np.sort(np.concatenate((best, crowded[: count - len(best)])))]
@@ -63,7 +63,10 @@ def detect(space: ScaleSpace, colours: list[Float], count: int, *, everywhere: b
 
 
 def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
-    """The dominant direction (N,) [rad], in (-pi, pi], of E around ``points`` (N, 2) at scales ``sigmas`` (N,), both in px."""
+    """Return the dominant gradient direction (N,) [rad], in (-pi, pi], of the intensity around points.
+
+    ``points`` (N, 2) [px]. ``sigmas`` (N,) [px]: the scales of the points.
+    """
     patches = space.patches(points, sigmas, np.zeros(len(points)), _OFFSETS)
     histograms = np.zeros((len(points), ORIENTATION_BINS), dtype=np.float32)
     orientation_histograms(patches, ORIENTATION_SIDE, _WEIGHTS, histograms)
@@ -81,7 +84,8 @@ def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
 
 
 def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
-    """Corners (N, 4) of each characteristic scale: x and y [px], scale [px], response."""
+    """Detect the corners of each characteristic scale. Returns an array (N, 4) for each scale: x and y [px], scale [px],
+    response."""
     by_scale = []
     for o, octave in enumerate(space.octaves):
         if o > 0:
@@ -98,7 +102,8 @@ def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
 
 
 def fill_strength(octave: Octave, i: int) -> None:
-    """Compute the Harris measure at scale ``i`` of an octave whose colours are at scale ``i - 1``."""
+    """Write the Harris measure at scale number ``i`` of an octave to ``octave.strength``. ``octave.colours`` must have the blur of
+    scale ``i - 1``."""
     structure_tensor(octave.planes[i - 1], octave.colours, octave.products)
     for product in octave.products:
         blur(product, product, INTEGRATION * SIGMAS[i])

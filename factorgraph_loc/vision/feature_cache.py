@@ -1,6 +1,6 @@
-"""Features of an image as bytes, and their disk cache in the user's cache folder.
+"""Disk cache of the features of images, and the conversion of features to bytes.
 
-A cache that is missing, full or damaged only causes features to be computed again.
+The cache is in the user's cache folder. If it is missing, full or damaged, features are computed again.
 """
 
 import os
@@ -20,21 +20,21 @@ from factorgraph_loc.files.models import replacing
 from factorgraph_loc.vision.keypoints import Descriptors, Keypoints
 from factors.se2 import Array
 
-# points, columns of descriptors, whether these are bytes, whether they are stored as bytes
+# number of points, columns of the descriptors, whether descriptors have the type uint8, whether they are stored as uint8
 _FEATURES = struct.Struct("<IIBB")
 
 
 @dataclass(frozen=True, eq=False)
 class ImageFeatures:
-    """``pixels`` (K, 2) [px], ``descriptors`` (K, D)."""
+    """The K features of an image: ``pixels`` (K, 2) [px] and ``descriptors`` (K, D)."""
 
     pixels: Array
     descriptors: Descriptors
 
 
 def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
-    """Encode features as bytes: pixel coordinates as float32, which is exact to 0.001 px or better below 16384 px; descriptors
-    without loss."""
+    """Encode features as bytes. Pixel coordinates are rounded to float32: the error is at most 0.001 px below 16384 px.
+    Descriptors are stored without loss."""
     points = keypoints.points.astype("<f4")
     binary = descriptors.dtype == np.uint8
     narrow = descriptors.astype(np.uint8)
@@ -44,7 +44,7 @@ def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
 
 
 def decode(content: bytes) -> ImageFeatures:
-    """Decode the result of :func:`encode`; ValueError for other bytes."""
+    """Decode the features that :func:`encode` encoded. Raises ValueError if ``content`` is something else."""
     if len(content) < _FEATURES.size:
         raise ValueError("these bytes are no features")
     count, columns, binary, fits = _FEATURES.unpack_from(content)
@@ -56,29 +56,30 @@ def decode(content: bytes) -> ImageFeatures:
     return ImageFeatures(pixels, stored.astype(np.uint8 if binary else np.float32))
 
 
-VARIABLE = "FGLOC_CACHE"  # environment variable: a folder other than the user's
-LIMIT = 4 * 10**9  # bytes
+VARIABLE = "FGLOC_CACHE"  # environment variable that names the folder of the cache
+LIMIT = 4 * 10**9  # bytes: largest size of the cache
 _HEAD = struct.Struct("<4sII")  # mark, CRC-32 and length of the content
 _MARK = b"FGLC"
 
 
 def cache_folder() -> Path:
-    """The folder that ``FGLOC_CACHE`` names, else the user's cache folder of the system."""
+    """Return the folder that the environment variable ``FGLOC_CACHE`` names. If it is not set, return the user's cache folder."""
     folder_name = os.environ.get(VARIABLE)
     return Path(folder_name) if folder_name else platformdirs.user_cache_path("factorgraph-loc", appauthor=False)
 
 
 class FeatureCache:
-    """Contents by key, one file each, below ``folder``; :meth:`trim` limits their size to :data:`LIMIT`.
+    """Stores the encoded features of each image in a file below ``folder``, by a key. Call :meth:`trim` to limit the total size.
 
-    ``fault``: why nothing can be written, if so."""
+    ``fault``: an error message if the folder cannot be written, otherwise empty.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder / "features"
         self.fault = ""
 
     def read(self, key: str) -> bytes | None:
-        """The content of a key, marked as used now; None if it is missing or damaged."""
+        """Return the content of a key, or None if it is missing or damaged. The time of the last use is set to now."""
         path = self._path(key)
         try:
             stored = read_bytes(path, DATA)
@@ -94,7 +95,7 @@ class FeatureCache:
         return content
 
     def write(self, key: str, content: bytes) -> None:
-        """Store ``content`` atomically; nothing happens if that is impossible."""
+        """Store ``content`` under a key, atomically. If it cannot be written, ``fault`` is set and no error is raised."""
         if self.fault:
             return
         path = self._path(key)
@@ -106,8 +107,8 @@ class FeatureCache:
             self.fault = f"{self._folder}: cannot be written: {error.strerror}"
 
     def trim(self) -> None:
-        """Remove the least recently used contents until the rest is within the limit."""
-        files = []  # except those being written
+        """Delete the least recently used contents until the size of the cache is at most :data:`LIMIT`."""
+        files = []  # without temporary files, which are still being written
         for path in self._folder.glob("*/[!.]*"):
             try:
                 status = path.stat()

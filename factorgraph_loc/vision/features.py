@@ -1,4 +1,4 @@
-"""Features by name: the paper's colour features, and OpenCV's SIFT and ORB, behind one interface."""
+"""Extractors of point features by name: the paper's colour features, and OpenCV's SIFT and ORB."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,12 +15,16 @@ from factorgraph_loc.vision.keypoints import PARTS, Descriptors, Extractor, Inte
 
 __all__ = ["EXTRACTORS", "Descriptors", "Extractor", "Integers", "Keypoints", "OpenCvExtractor", "extractor"]
 
-MORE = 10  # times as many features are found where those are chosen that are everywhere
+MORE = 10  # if features of all parts of an image are wanted, this factor more are detected, and then selected
 SIFT_CONTRAST = 0.01  # OpenCV's default of 0.04 finds too few points in indoor images
 
 
 class OpenCvExtractor:
-    """An OpenCV feature behind :class:`Extractor`."""
+    """An :class:`Extractor` that uses a feature of OpenCV.
+
+    ``create``: the function of OpenCV that creates the feature. ``count``: the largest number of features per image.
+    ``everywhere``: choose features in all parts of an image, not only the strongest.
+    """
 
     def __init__(self, create: Callable[..., cv2.Feature2D], count: int, *, everywhere: bool = False) -> None:
         self._feature = create(nfeatures=count * MORE if everywhere else count)
@@ -44,7 +48,8 @@ class OpenCvExtractor:
         return keypoints[order], np.asarray(descriptors)[order]
 
     def _chosen(self, keypoints: Keypoints) -> Integers:
-        """Indices of the points, by descending response: OpenCV keeps more than asked for at equal responses."""
+        """Return the indices of the selected keypoints, by descending response. OpenCV returns more than ``nfeatures`` if responses
+        are equal."""
         order = np.argsort(-keypoints.responses, kind="stable").astype(np.int64)
         if self._everywhere:
             return order[spread_out(keypoints.points[order], self._count, cells=PARTS)]
@@ -59,8 +64,11 @@ EXTRACTORS: dict[str, Callable[..., Extractor]] = {
 
 
 def extractor(name: str, count: int = 1000, *, everywhere: bool = False) -> Extractor:
-    """The extractor ``name`` of :data:`EXTRACTORS`, with at most ``count`` features per image: the strongest, or of all its parts
-    ``everywhere``. Raises InputError for an unknown name."""
+    """Create an extractor of features. ``name``: a key of :data:`EXTRACTORS`.
+
+    ``count``: the largest number of features per image. ``everywhere``: choose features in all parts of an image, not only the
+    strongest. Raises InputError for an unknown name or a ``count`` below 1.
+    """
     if name not in EXTRACTORS:
         raise InputError(f"feature {quoted(name)} is not known{nearest(name, sorted(EXTRACTORS))}")
     if count < 1:

@@ -1,10 +1,11 @@
-"""Fiducial markers in images, detected by OpenCV (Garrido-Jurado et al., "Automatic generation and detection of highly reliable
-fiducial markers under occlusion", Pattern Recognition 2014; for AprilTags their dictionaries, Olson, ICRA 2011).
+"""Detection of fiducial markers in images, with corners of subpixel accuracy.
 
-Each corner of a marker is a named point at the intersection of lines fitted to the edges. Refinement at the corner itself
-(OpenCV's ``cornerSubPix``) is biased: blur moves a corner into the square, so that the marker appears smaller and farther away.
-Blur across an edge is symmetric, so that the edge position follows from the mean grey level. (Tabatabai, Mitchell, "Edge location
-to subpixel values in digital imagery", PAMI 1984, use moments.)
+OpenCV detects the markers (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under
+occlusion", Pattern Recognition 2014). For AprilTags it uses their dictionaries (Olson, ICRA 2011). A corner is then refined as the
+intersection of lines fitted to the edges of the marker. Refinement at the corner itself (OpenCV's ``cornerSubPix``) is biased: blur
+moves a corner into the square, so that the marker appears smaller and farther away. Blur across an edge is symmetric, so that the
+mean grey level determines the position of the edge. (Tabatabai, Mitchell, "Edge location to subpixel values in digital imagery",
+PAMI 1984, use moments.)
 """
 
 from collections import Counter
@@ -16,25 +17,28 @@ from factorgraph_loc.maps.markers import MarkerFamily
 from factorgraph_loc.vision.images import Image
 from factors.se2 import Array
 
-REACH = 3.0  # px on both sides of an edge
+REACH = 3.0  # px: an edge is searched within this distance of its previous position
 MIN_REACH = 1.5  # px: a shorter range does not cover a blurred edge
 STEP = 0.25  # px between samples across an edge
-INSIDE = (0.12, 0.88)  # used part of an edge, without its ends
-FARTHEST = 3.0  # px that a corner may move per pass
-PASSES = 3  # each uses the lines of the previous one
-MIN_CONTRAST = 20.0  # grey levels
+INSIDE = (0.12, 0.88)  # fractions of an edge's length between which it is sampled: not near the corners
+FARTHEST = 3.0  # px: largest shift of a corner per iteration
+PASSES = 3  # iterations; each starts at the corners of the previous one
+MIN_CONTRAST = 20.0  # grey levels across an edge; an edge with less contrast is not used
 
 
 def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
-    """The refined corners (4, 2) [px] of a marker with ``bits`` along a side, including its black border; unchanged where edges
-    are blurred, covered or short."""
+    """Return the refined corners (4, 2) [px] of a marker. A corner is unchanged if its edges are blurred, covered or short.
+
+    ``corners`` (4, 2) [px]: the detected corners. ``bits``: the number of cells along a side, including the black border.
+    """
     for _ in range(PASSES):
-        corners = _met(grey, corners, bits)
+        corners = _intersections(grey, corners, bits)
     return corners
 
 
-def _met(grey: Image, corners: Array, bits: int) -> Array:
-    """Intersections of the lines fitted near the sides of the square ``corners``."""
+def _intersections(grey: Image, corners: Array, bits: int) -> Array:
+    """Fit a line to the edge near each side of the square ``corners`` (4, 2), and return the intersections of neighbouring
+    lines."""
     middle = corners.mean(axis=0)
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     reach = min(REACH, 0.8 * float(sides.min()) / bits)  # not across the black border
@@ -57,7 +61,11 @@ def _met(grey: Image, corners: Array, bits: int) -> Array:
 
 
 def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) -> tuple[Array, float] | None:
-    """The line n.p = c along an edge, with normal n (2,) and c [px]; None if the edge is not visible."""
+    """Fit a line to an edge of a marker between ``start`` and ``end``. Returns None if the edge is not visible.
+
+    ``middle`` (2,): the centre of the marker. ``reach`` [px]: the largest distance of samples from the line between ``start`` and
+    ``end``. The result is the normal n (2,) and the offset c [px] of the line n.p = c.
+    """
     along = end - start
     length = float(np.linalg.norm(along))
     normal = np.array((-along[1], along[0])) / length
@@ -80,7 +88,7 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
     weights[[0, -1]] = STEP / 2.0
     shift = across[0] + share @ weights
     points = places[use] + shift[:, None] * normal
-    for _ in range(2):  # the second time without outliers, such as a shadow or an occlusion
+    for _ in range(2):  # the second fit leaves out outliers, such as those of a shadow or an occlusion
         centre = points.mean(axis=0)
         direction = np.linalg.svd(points - centre, full_matrices=False)[2][0]
         fitted = np.array((-direction[1], direction[0]))
@@ -93,8 +101,11 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
 
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
-    """The numbers of the markers in an image, and their corners (4, 2) [px]: upper left, upper right, lower right, lower left of
-    the printed marker. A number that occurs twice is omitted."""
+    """Detect the markers in an image. Returns the number of each marker and its corners (4, 2) [px].
+
+    The order of the corners is upper left, upper right, lower right, lower left of the printed marker. A number that occurs twice
+    in the image is omitted, because it is not known which of both is meant.
+    """
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     detector = _detector(family)
     corners, numbers, _ = detector.detectMarkers(grey)

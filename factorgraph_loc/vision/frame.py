@@ -1,4 +1,4 @@
-"""The features of one image."""
+"""A camera measurement: the features of one image."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -11,10 +11,11 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class CameraFrame:
-    """The features of one image, empty if it could not be read.
+    """The K features of one image. The arrays are empty if the image could not be read.
 
-    ``pixels`` (K, 2) [px], x right, y down, (0, 0) at the centre of the upper left pixel; ``descriptors`` (K, D) of the kind
-    ``feature``. ``tracks`` (K,): numbers of the tracks that features belong to.
+    ``t`` [s]: the time of the image. ``feature``: the kind of features, such as "sift".
+    ``pixels`` (K, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``descriptors`` (K, D).
+    ``tracks`` (K,): the number of each feature's track. Features of different images with the same number show the same point.
     """
 
     sensor: ClassVar[str] = "camera"
@@ -30,10 +31,10 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """The features; empty arrays without features."""
+        """This object. Measurements of named points have None here instead."""
         return self
 
     @property
     def count(self) -> int:
-        """Number of features."""
+        """The number of features."""
         return len(self.pixels)

@@ -1,4 +1,4 @@
-"""Input images of :mod:`factorgraph_loc.vision`: checked once, then ``uint8``, grey or BGR as in OpenCV."""
+"""Reading and checking of images. A checked image has the type ``uint8`` and is grey or BGR, as in OpenCV."""
 
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,11 @@ MIN_SIDE = 16  # px: smaller images have no features
 
 
 def as_image(array: object, source: object = "image") -> Image:
-    """Convert ``array`` (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA to ``uint8``, (H, W) or (H, W, 3), C-contiguous.
+    """Convert an image to a C-contiguous array of ``uint8``, (H, W) if it is grey or (H, W, 3) BGR.
 
-    ``uint16`` spans 0 to 65535 and floating point 0 to 1: both are scaled to 0 to 255. Alpha is dropped. An
-    empty array, another shape or type, and values that are not finite or out of range raise InputError, which names ``source``.
+    ``array``: (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA. Alpha is dropped. ``uint16`` values from 0 to 65535 and
+    floating-point values from 0 to 1 are scaled to 0 to 255. ``source``: the origin of the image, for error messages.
+    Raises InputError for an empty array, another shape or type, and values that are not finite or out of range.
     """
     if not isinstance(array, np.ndarray):
         raise InputError(f"{source}: is {type(array).__name__}, expected an array of pixels")
@@ -48,19 +49,26 @@ def as_image(array: object, source: object = "image") -> Image:
 
 
 def is_blank(image: Image) -> bool:
-    """Whether an image cannot have features: a side is below :data:`MIN_SIDE`, or all its pixels are equal."""
-    # row by row, as the first one usually decides
+    """True if an image cannot have features, because a side is below :data:`MIN_SIDE` or all its pixels are equal."""
+    # compare row by row: in most images the first row has different pixels, and no other row needs to be compared
     return min(image.shape[:2]) < MIN_SIDE or all(bool((row == image[0, 0]).all()) for row in image)
 
 
 def read_image(path: Path) -> Image:
-    """Read an image, (H, W) or (H, W, 3) BGR. Raises InputError if it is missing, cannot be decoded or has too many pixels."""
+    """Read an image file. Returns an array of ``uint8``, (H, W) or (H, W, 3) BGR.
+
+    Raises InputError if the file is missing, cannot be decoded or has too many pixels.
+    """
     return as_image(decoded(read_bytes(path, IMAGE), path, cv2.IMREAD_UNCHANGED), path)
 
 
 def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
-    """Decode an image file with OpenCV's ``flags``. Raises InputError if that fails, or for more than
-    :data:`~factorgraph_loc.files.bounded.PIXELS` pixels, before memory is allocated. OpenCV itself would allow 2^30."""
+    """Decode the bytes of an image file with OpenCV. ``flags``: those of ``cv2.imdecode``. ``source``: the origin of the bytes, for
+    error messages.
+
+    Raises InputError if the bytes are no image, or if it has more than :data:`~factorgraph_loc.files.bounded.PIXELS` pixels. This
+    is checked before memory is allocated. OpenCV itself would allow 2^30 pixels.
+    """
     image_size(content, source)
     with foreign(source, NO_IMAGE), quiet():
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)

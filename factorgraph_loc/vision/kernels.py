@@ -1,6 +1,7 @@
-"""Compiled loops of the colour features, which avoid numpy's temporary images.
+"""Compiled loops of the colour features. Unlike numpy expressions they need no temporary images.
 
-Everything is ``float32``, to halve memory traffic. Threads run the loops in parallel, as these do not use Python objects.
+Images are ``float32``, to halve memory traffic. Several threads can run the loops in parallel, because the loops do not use Python
+objects.
 """
 
 import math
@@ -18,16 +19,16 @@ Truths = NDArray[np.bool_]
 
 HALF = np.float32(0.5)
 TINY = np.float32(1e-6)  # keeps a quotient finite where an image is flat
-MAX_SHIFT = 0.7  # px: larger shifts from the largest pixel do not fit the paraboloid model
+MAX_SHIFT = 0.7  # px: bound of the distance between a refined peak and its largest pixel
 FAST = {"contract", "reassoc"}
 
 
 @compiled(nogil=True, fastmath=FAST)
 def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
-    """Sum over the channels of the products of first derivatives: ``intensity`` (H, W) and ``colours`` (C, H, W) to ``products``
-    (3, H, W): xx, xy, yy.
+    """Compute the products of first derivatives of an image, summed over its channels.
 
-    Derivatives are central differences, halved in the first and last row, 0 in the first and last column.
+    ``intensity`` (H, W), ``colours`` (C, H, W): the channels. ``products`` (3, H, W): receives the sums of dx dx, dx dy and dy dy.
+    Derivatives are central differences. They are halved in the first and last row, and 0 in the first and last column.
     """
     height, width = intensity.shape
     xx, xy, yy = products[0], products[1], products[2]
@@ -50,9 +51,10 @@ def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
 
 @compiled(nogil=True, fastmath=FAST)
 def corner_strength(products: Float, scale: np.float32, strength: Float) -> None:
-    """Half the harmonic mean of the eigenvalues of the second moment matrix, times ``scale``: determinant over trace.
+    """Compute the strength of corners: determinant over trace of the second moment matrix, times ``scale``. Without ``scale``
+    this is half the harmonic mean of the eigenvalues.
 
-    ``products`` (3, H, W): its elements xx, xy, yy; written to ``strength`` (H, W).
+    ``products`` (3, H, W): the elements xx, xy, yy of the matrix at each pixel. ``strength`` (H, W): receives the result.
     """
     xx, xy, yy = products[0], products[1], products[2]
     height, width = strength.shape
@@ -64,7 +66,7 @@ def corner_strength(products: Float, scale: np.float32, strength: Float) -> None
 
 @compiled(nogil=True)
 def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
-    """The largest absolute Laplacian, times ``weight``, at a pixel and its eight neighbours."""
+    """Return the largest absolute Laplacian of ``plane`` at the pixel (x, y) and its eight neighbours, times ``weight``."""
     largest = 0.0
     for v in range(y - 1, y + 2):
         for u in range(x - 1, x + 2):
@@ -77,12 +79,14 @@ def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
 def refined_peaks(
     strength: Float, threshold: float, planes: Float, variances: Array, pixels: Int32, peaks: Array
 ) -> int:
-    """Select and refine the ``pixels`` (N, 2) at local maxima of ``strength`` (H, W) that are also maxima over scale.
+    """Select the local maxima of the corner strength that are also maxima over scale, and refine them. Returns their number.
 
-    A pixel is selected under two conditions. Its strength is above ``threshold``. At the pixel or a neighbour, the middle one of
-    ``planes`` (3, H, W), with ``variances`` (3,), has the largest normalised Laplacian. Written to ``peaks`` (N, 5): x and y, from
-    a paraboloid through the 3x3 strengths; scale offset from the middle plane, from a parabola; strength; absolute Laplacian.
-    Returns their number.
+    ``strength`` (H, W): the corner strength. ``pixels`` (N, 2): x and y of its local maxima. ``planes`` (3, H, W): the intensity at
+    three consecutive scales with ``variances`` (3,) [px^2].
+    A pixel is selected if its strength is above ``threshold`` and if the normalised Laplacian near it is largest in the middle
+    plane.
+    ``peaks`` (N, 5): receives a row for each selected pixel. Its values are x and y, refined by a paraboloid through 3x3 strengths;
+    the scale, refined by a parabola, in steps from the middle plane; the strength; the absolute Laplacian.
     """
     count = 0
     for n in range(len(pixels)):
@@ -116,10 +120,12 @@ def refined_peaks(
 
 
 @compiled(nogil=True)
-def lonely(points: Float, scales: Float, reach: float, alike: float, most: int) -> Truths:
-    """Which of the points (N, 2), sorted by descending strength, have no stronger one nearby: the first ones, at ``most`` so many.
+def locally_strongest(points: Float, scales: Float, reach: float, alike: float, most: int) -> Truths:
+    """Return a mask (N,) of the points that have no stronger point nearby. At most the first ``most`` such points are True.
 
-    Nearby: within ``reach`` times their own of the ``scales`` (N,), with a scale ratio of at most ``alike``."""
+    ``points`` (N, 2) [px]: sorted by descending strength. ``scales`` (N,) [px]: their scales. A stronger point is nearby if its
+    distance is less than ``reach`` times the point's scale and the ratio of both scales is at most ``alike``.
+    """
     alone, count = np.zeros(len(points), np.bool_), 0
     for n in range(len(points)):
         if count == most:
@@ -139,11 +145,13 @@ def lonely(points: Float, scales: Float, reach: float, alike: float, most: int) 
 
 @compiled(nogil=True, fastmath=FAST)
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
-    """Bilinear samples of patches around points, each in its own frame and plane.
+    """Sample rotated and scaled patches around N points by bilinear interpolation. Each point has its own plane of a pyramid.
 
-    ``planes`` (T,): all planes concatenated, row by row; ``starts`` (N,), ``shapes`` (N, 2): first element, height and width of
-    each point's plane. ``frames`` (N, 4): x and y of a point in its plane [px], and the vector (a, b) [px] of its frame's x axis.
-    ``offsets`` (M, 2): sampled places in the frame. Beyond the border the nearest pixel counts. Written to ``patches`` (N, M)."""
+    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's plane.
+    ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4): x and y of the point in its plane [px], and the vector
+    (a, b) [px] of the x axis of its frame. ``offsets`` (M, 2): the sampled places in the frame. ``patches`` (N, M): receives the
+    samples. Outside the plane the nearest pixel is used.
+    """
     for n in range(len(frames)):
         start, height, width = starts[n], shapes[n, 0], shapes[n, 1]
         px, py, a, b = frames[n, 0], frames[n, 1], frames[n, 2], frames[n, 3]
@@ -162,8 +170,12 @@ def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, o
 
 @compiled(nogil=True)
 def orientation_histograms(patches: Float, side: int, weights: Float, histograms: Float) -> None:
-    """Histograms of gradient directions in patches (N, side * side), weighted by gradient magnitude and ``weights`` (side - 2,
-    side - 2), linearly distributed over two bins. Added to ``histograms`` (N, bins), bin 0 at direction 0."""
+    """Compute histograms of the gradient directions in patches.
+
+    ``patches`` (N, side * side): the samples of each patch, row by row. ``weights`` (side - 2, side - 2): weights of the
+    gradients, in addition to their magnitude. ``histograms`` (N, bins): the result is added here. Bin 0 is centred at direction
+    0. Each gradient is distributed over the two nearest bins.
+    """
     bins = histograms.shape[1]
     per_radian = np.float32(bins / (2.0 * math.pi))
     for n in range(len(patches)):

@@ -22,10 +22,12 @@ Descriptors = NDArray[Any]
 class Keypoints:
     """N points of an image, as arrays.
 
-    ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``sizes`` (N,) [px]: for SIFT and the
-    colour features twice the standard deviation of the Gaussian scale of a point, for ORB its patch. It is proportional to the
-    size of the described region. ``angles`` (N,) [rad]: direction ``atan2(dy, dx)`` with y down, NaN if a point has none.
-    ``responses`` (N,): strength, comparable within one image and one extractor."""
+    ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel.
+    ``sizes`` (N,) [px]: proportional to the size of the described region. For SIFT and the colour features this is twice the
+    standard deviation of the point's Gaussian scale, for ORB the side of its patch.
+    ``angles`` (N,) [rad]: the direction ``atan2(dy, dx)`` with y down, NaN if a point has none.
+    ``responses`` (N,): the strength, comparable within one image and one extractor.
+    """
 
     points: Array
     sizes: Array
@@ -44,7 +46,7 @@ class Keypoints:
 
     @classmethod
     def from_cv2(cls, keypoints: Sequence[cv2.KeyPoint]) -> Keypoints:
-        """Convert OpenCV's keypoints, with degrees to radians; its angle of -1 means none."""
+        """Convert keypoints of OpenCV. Its angle of -1 degrees means that a keypoint has no direction."""
         if not keypoints:
             return cls.empty()
         rows = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], dtype=float)
@@ -59,25 +61,30 @@ class Keypoints:
 
 
 class Extractor(Protocol):
-    """Detector and descriptor of one kind of feature.
+    """The interface of feature extractors: detector and descriptor of one kind of feature.
 
-    Images are checked by :func:`~factorgraph_loc.vision.images.as_image`, which raises InputError; an image that is blank or
-    below 16 px has no features. Returns at most ``count`` points, the strongest first."""
+    Images are checked by :func:`~factorgraph_loc.vision.images.as_image`, which raises InputError. An image that is blank or has a
+    side below 16 px has no features. At most ``count`` points are returned, the strongest first. ``count`` is an argument of the
+    extractor's constructor.
+    """
 
     def detect(self, image: object) -> Keypoints:
-        """The points of ``image``."""
+        """Return the features of ``image``."""
 
     def detectAndCompute(self, image: object) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
-        """The points of ``image``, and their descriptors: bits, (N, bytes) ``uint8``, or numbers, (N, D) ``float32``."""
+        """Return the N features of ``image`` and their descriptors. These are bits, (N, bytes) ``uint8``, or numbers, (N, D)
+        ``float32``."""
 
 
-PARTS = 12  # of an image that has features everywhere: with more the weakest would be among them
+PARTS = 12  # grid cells for features in all parts of an image: with more cells, very weak features would be chosen
 
 
 def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None, cells: int | None = None) -> Integers:
-    """Ascending indices of at most ``count`` of ``pixels`` (K, 2), chosen in turn from about ``cells`` cells of a grid.
+    """Select at most ``count`` pixels that are spread over the image. Returns their indices in ascending order.
 
-    ``cells``: by default ``count``. ``priority`` (K,): highest first in each cell, by default the first pixels.
+    ``pixels`` (K, 2). One pixel after the other is taken from each cell of a grid in turn. ``cells``: the approximate number of
+    cells, ``count`` if None. ``priority`` (K,): in each cell the pixels with the highest priority are taken first. If it is None,
+    the first pixels are taken first.
     """
     if len(pixels) <= count:
         return np.arange(len(pixels))

@@ -1,9 +1,10 @@
-"""Matching of descriptors: nearest neighbours that pass the ratio test.
+"""Matching of descriptors: mutual nearest neighbours that pass the ratio test.
 
-Ratio test and mutual check: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section 7.1.
-Descriptors of type ``uint8`` are bits and have Hamming distances, others Euclidean ones.
+Ratio test: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section 7.1. Descriptors of type
+``uint8`` are bits and are compared by their Hamming distance. Other descriptors are compared by their Euclidean distance.
 
-Descriptors are rounded to single precision. A neighbour must therefore be nearer than the second by more than :data:`ROUNDING`.
+Descriptors are rounded to single precision. Two distances are equal if they differ by less than :data:`ROUNDING`, and a nearest
+neighbour with the same distance as the second nearest is no match.
 """
 
 import math
@@ -17,7 +18,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.vision.keypoints import Descriptors, Integers
 from factors.se2 import Array
 
-RATIO = 0.8
+RATIO = 0.8  # largest ratio of the distances of the nearest and the second nearest descriptor
 GATE = 0.99  # probability that the true point lies in its gate
 ROUNDING = 1e-5  # relative difference of distances below which they are equal
 
@@ -26,7 +27,11 @@ Truths = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """``indices`` (M, 2): of the descriptor in the first and in the second image, ascending in the first; ``distances`` (M,)."""
+    """M matches between the descriptors of two images.
+
+    ``indices`` (M, 2): indices of the descriptors in the first and in the second image, ascending in the first. ``distances`` (M,):
+    distances of the descriptors.
+    """
 
     indices: Integers
     distances: Array
@@ -42,11 +47,12 @@ def match(
     ratio: float = RATIO,
     allowed: Truths | None = None,
 ) -> Matches:
-    """For each of ``first`` (N, D) the nearest of ``second`` (M, D), if it passes the ratio test. Ties are no matches.
+    """Match the descriptors ``first`` (N, D) with the descriptors ``second`` (M, D).
 
-    The distance must be below ``ratio`` times that to the second nearest, if there is one, and both must be nearest to each other.
-    ``allowed`` (N, M): restricts the pairs. Raises InputError for incompatible or non-finite descriptors, and for a ratio that is
-    not positive.
+    Two descriptors match if each is the nearest neighbour of the other. In addition their distance must be below ``ratio`` times
+    the distance to the second nearest one in ``second``, if there is one. Ties are no matches.
+    ``allowed`` (N, M): mask of the pairs that may match; None allows all. Raises InputError for incompatible or non-finite
+    descriptors, and for a ratio that is not positive.
     """
     if not ratio > 0.0:
         raise InputError(f"matching: ratio is {ratio}, expected more than 0")
@@ -66,11 +72,12 @@ def match(
 
 
 def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
-    """Whether ``points`` (M, 2) lie in the ellipses (N, M), of the probability :data:`GATE`, of predictions: the pairs that
-    :func:`match` may allow.
+    """Return a mask (N, M) of the pairs of prediction and pixel where the pixel is in the gate of the prediction. It can be
+    passed to :func:`match` as ``allowed``.
 
-    ``predicted`` (N, 2) [px]; ``covariances`` (N, 2, 2) [px^2]: of prediction and measurement together. NaN predictions have empty
-    gates. Raises InputError if a covariance is not positive definite.
+    ``predicted`` (N, 2) [px]: predicted pixels. ``covariances`` (N, 2, 2) [px^2]: of prediction and measurement together.
+    ``points`` (M, 2) [px]: measured pixels. A gate is the ellipse that contains the pixel with the probability :data:`GATE`. The
+    gate of a prediction that is NaN is empty. Raises InputError if a covariance is not positive definite.
     """
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     determinant = a * c - b * b
@@ -84,8 +91,8 @@ def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
 
 
 def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
-    """The nearest column (N,) in each of N rows of ``distances`` (N, M), M > 0; the distances of the nearest (N,), and of the
-    second nearest (N,), infinite without one."""
+    """Return for each row of ``distances`` (N, M), M > 0, the index of the smallest distance (N,), the smallest distance (N,),
+    and the second smallest distance (N,). The latter is infinite if M is 1."""
     rows = np.arange(len(distances))
     index = distances.argmin(axis=1)
     best = distances[rows, index]
@@ -96,22 +103,29 @@ def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
 
 
 def _is_clear(best: Array, second: Array) -> Truths:
-    """Whether the nearest is nearer than the second nearest by more than rounding."""
+    """Return a mask of the neighbours whose distance ``best`` is smaller than ``second`` by more than rounding errors."""
     return np.asarray(second > (1.0 + ROUNDING) * best)
 
 
 def distance_matrix(first: Descriptors, second: Descriptors) -> Array:
-    """Distances (N, M), Hamming or Euclidean, between ``first`` (N, D) and ``second`` (M, D). Raises InputError for incompatible or
-    non-finite descriptors."""
+    """Return the distances (N, M) between the descriptors ``first`` (N, D) and ``second`` (M, D).
+
+    These are Hamming distances of bits if the descriptors have the type ``uint8``, otherwise Euclidean distances. Raises InputError
+    for incompatible or non-finite descriptors.
+    """
     for which, descriptors in (("first", first), ("second", second)):
         if descriptors.ndim != 2:
             raise InputError(f"matching: {which} descriptors have shape {descriptors.shape}, expected (N, D)")
         if not np.isfinite(descriptors).all():
             raise InputError(f"matching: {which} descriptors have values that are not finite numbers")
     if first.shape[1] != second.shape[1]:
-        raise InputError(f"matching: descriptors have {first.shape[1]} and {second.shape[1]} columns, expected as many")
+        raise InputError(
+            f"matching: descriptors have {first.shape[1]} and {second.shape[1]} columns, expected equal numbers"
+        )
     if (first.dtype == np.uint8) != (second.dtype == np.uint8):
-        raise InputError(f"matching: descriptors are {first.dtype} and {second.dtype}, expected both or none as uint8")
+        raise InputError(
+            f"matching: descriptors are {first.dtype} and {second.dtype}, expected uint8 for both or for none"
+        )
     if first.dtype != np.uint8:
         return np.asarray(cdist(first, second))
     left, right = (np.unpackbits(part, axis=1).astype(np.float32) for part in (first, second))

@@ -1,8 +1,8 @@
-"""Camera pose from matched map points without a prediction.
+"""Camera pose from matched map points, without a prediction.
 
-Each sample of three points gives up to four poses; the pose with most inliers is kept and refined with all inliers. (Universal
-RANSAC: Raguram, Chum, Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as in OpenCV.) For a robot on the floor only three values are
-refined, and a camera that would float or tilt is rejected.
+Each random sample of three points yields up to four poses. The pose with most inliers is refined with all its inliers (Universal
+RANSAC: Raguram, Chum, Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as in OpenCV). For a robot on the floor only x, y and heading are
+refined. A camera pose is rejected if the robot would be tilted or not on the floor.
 
 In a large map an image is compared only with the few most similar keyframes. A keyframe is described by the differences between its
 descriptors and the words of a small vocabulary (VLAD: Jegou, Douze, Schmid, Perez, CVPR 2010). Each word is normalised separately
@@ -29,21 +29,21 @@ from factors.camera.model import CameraModel
 from factors.robust import huber_weight
 from factors.se2 import Array
 
-REACH = 3.0  # standard deviations of a pixel for inliers
+REACH = 3.0  # a pixel is an inlier of a sample within so many standard deviations
 CONFIDENCE, MOST_SAMPLES = 0.9999, 5000
-REFINEMENTS = 10
-CONVERGED = 1e-6  # m, rad
-# m, rad: height and tilt tolerated for a robot on the floor: errors of a pose in space, and of the camera's mounting
+REFINEMENTS = 10  # largest number of iterations
+CONVERGED = 1e-6  # m, rad: step below which the refinement ends
+# m, rad: the estimated pose of a robot on the floor may have this height and tilt, by its errors and those of the mounting
 LARGEST_HEIGHT, LARGEST_TILT = 0.3, 0.15
-LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which a pose is not determined
-WORDS = 64  # of the vocabulary
-SAMPLE, ROUNDS = 4000, 6  # descriptors that it is learnt from, and rounds of Lloyd's algorithm
-NEAREST = 20  # keyframes that an image is compared with
+LARGEST_SIGMA = 0.5  # m, rad: a pose with larger standard deviations is not accepted
+WORDS = 64  # words of the vocabulary
+SAMPLE, ROUNDS = 4000, 6  # descriptors from which the vocabulary is learnt, and iterations of Lloyd's algorithm
+NEAREST = 20  # number of keyframes that an image is compared with
 
 
 @dataclass(frozen=True)
 class Resection:
-    """A camera pose and its inliers (K,)."""
+    """A camera pose computed from K points. ``inliers`` (K,): mask of the points that agree with the pose."""
 
     camera: CameraPose
     inliers: Truths
@@ -51,7 +51,10 @@ class Resection:
 
 @dataclass(frozen=True)
 class FoundOnFloor:
-    """A robot's ``pose`` (3,) with body-frame ``covariance`` (3, 3), and its inliers (K,)."""
+    """The pose of a robot on the floor, computed from K points.
+
+    ``pose`` (3,): x, y and heading. ``covariance`` (3, 3): in the robot's frame. ``inliers`` (K,): mask of the points that agree.
+    """
 
     pose: Array
     covariance: Array
@@ -59,9 +62,10 @@ class FoundOnFloor:
 
 
 def located(model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None) -> Resection | None:
-    """The pose with most inliers among ``points`` (K, 3), seen at ``pixels`` (K, 2); None if there is none.
+    """Compute the camera pose from K points with outliers. Returns None if the points do not determine it.
 
-    ``covariances`` (K, 3, 3) [m^2]: covariances of the points.
+    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): their observed pixels. ``covariances`` (K, 3, 3) [m^2]: of
+    the positions, None if these are exact.
     """
     if len(points) < FEWEST:
         return None
@@ -87,7 +91,11 @@ def located(model: CameraModel, points: Array, pixels: Array, covariances: Array
 def on_floor(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
-    """The pose of a robot on the floor whose camera was found at ``camera``; None if it floats, tilts or is not determined."""
+    """Compute the planar pose of a robot on the floor, starting at the pose ``camera`` of its camera.
+
+    ``points`` (K, 3), ``pixels`` (K, 2), ``covariances`` (K, 3, 3): see :func:`located`. Returns None if the robot with this camera
+    pose is tilted or not on the floor, or if the points do not determine the planar pose.
+    """
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
     if abs(position[2]) > LARGEST_HEIGHT or tilt > LARGEST_TILT:
@@ -124,7 +132,7 @@ def _refined(
         whitener = positive.whitener(noise)
         residual = np.einsum("kij,kj->ki", whitener, residual)
         squared = np.sum(residual**2, axis=1)
-        # distant outliers would still have an effect under the loss
+        # outliers far away get no weight: under the Huber loss alone they would still have an effect
         weight = np.where(squared < (2.0 * GATE if i < 3 else GATE), huber_weight(squared, model.robust), 0.0)
         by_camera = whitener @ by_camera
         information = np.einsum("k,kri,krj->ij", weight, by_camera, by_camera)
@@ -145,7 +153,10 @@ def _refined(
 def found_on_floor(
     model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
-    """The pose of a robot on the floor from K points with outliers; ``inliers`` refers to all of them."""
+    """Compute the planar pose of a robot on the floor from K points with outliers, without a prediction.
+
+    Arguments: see :func:`located`. Returns None if the points do not determine a pose on the floor.
+    """
     resection = located(model, points, pixels, covariances)
     if resection is None:
         return None
@@ -160,8 +171,12 @@ def found_on_floor(
     return replace(planar, inliers=inliers)
 
 
-class KeyframeLooks:
-    """Keyframes that saw ``descriptors`` (M, D) from the positions ``seen_from`` (M, 3), one for each position."""
+class KeyframeIndex:
+    """An index of the keyframes of a map, to find those that are most similar to an image.
+
+    ``descriptors`` (M, D): the descriptors of the map's M views. ``seen_from`` (M, 3): the camera position of each view. All views
+    with the same camera position form a keyframe.
+    """
 
     def __init__(self, descriptors: Descriptors, seen_from: Array) -> None:
         _, self._of = np.unique(seen_from, axis=0, return_inverse=True)
@@ -169,22 +184,24 @@ class KeyframeLooks:
         values = as_numbers(descriptors)
         sample = values[np.linspace(0, len(values) - 1, min(SAMPLE, len(values))).astype(np.int64)]
         begin = sample[np.linspace(0, len(sample) - 1, min(WORDS, len(sample))).astype(np.int64)]
-        with warnings.catch_warnings(action="ignore"):  # of words that nothing is nearest to, which stay where they are
+        with warnings.catch_warnings(action="ignore"):  # about words without a nearest descriptor, which stay unchanged
             self._words, _ = kmeans2(sample, begin, ROUNDS, minit="matrix")
-        self._looks = self._described(values, self._of)
+        self._descriptions = self._described(values, self._of)
 
     def __len__(self) -> int:
-        return len(self._looks)
+        return len(self._descriptions)
 
     def views(self, descriptors: Descriptors) -> Integers:
-        """The rows of the map's descriptors that the keyframes see that are most like an image with ``descriptors`` (N, D)."""
+        """Return the indices of the views of the :data:`NEAREST` keyframes that are most similar to an image with ``descriptors``
+        (N, D)."""
         (description,) = self._described(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)
-        alike[np.argsort(-(self._looks @ description), kind="stable")[:NEAREST]] = True
+        alike[np.argsort(-(self._descriptions @ description), kind="stable")[:NEAREST]] = True
         return np.flatnonzero(alike[self._of])
 
     def _described(self, values: Array, of: Integers) -> Array:
-        """The descriptions (K, WORDS * D) of K images, from the values (M, D) in image ``of`` (M,)."""
+        """Return the descriptions (K, WORDS * D) of K images. ``values`` (M, D): the descriptors of all images. ``of`` (M,): the
+        image of each descriptor."""
         (nearest, _), count = vq(values, self._words), len(self._words)
         descriptions = np.zeros((int(of.max()) + 1, count, values.shape[1]))
         np.add.at(descriptions, (of, nearest), values - self._words[nearest])
@@ -194,7 +211,7 @@ class KeyframeLooks:
 
 
 def as_numbers(descriptors: Descriptors) -> Array:
-    """Descriptors as real numbers, with a number for each bit of binary ones."""
+    """Convert descriptors to floating-point numbers. Each bit of a binary descriptor becomes a number."""
     if descriptors.dtype == np.uint8:
         descriptors = np.unpackbits(descriptors, axis=1)
     return np.asarray(descriptors, dtype=float)

@@ -1,7 +1,7 @@
-"""Gaussian scale space: a pyramid whose octaves hold four characteristic scales and their neighbours.
+"""Gaussian scale space: a pyramid of octaves. An octave contains an image at six scales, of which four are characteristic scales.
 
-One :class:`ScaleSpace` serves all images of a size, to reuse its memory. Derivatives are multiplied by powers of the scale:
-Lindeberg, "Feature detection with automatic scale selection", IJCV 30, 1998."""
+The size of a feature is one of the characteristic scales. A :class:`ScaleSpace` can be used for all images of one size, to reuse
+its memory. Scale-normalised derivatives: Lindeberg, "Feature detection with automatic scale selection", IJCV 30, 1998."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ from factorgraph_loc.vision.keypoints import Float, Integers
 from factors.se2 import Array
 
 SCALES = 4  # characteristic scales of an octave
-STEP = 2.0 ** (1.0 / SCALES)
+STEP = 2.0 ** (1.0 / SCALES)  # ratio of two consecutive scales
 FINEST = 1.3  # px: standard deviation of the first characteristic scale
 
-# of each octave, in its own pixels: the four scales, one below and one above
+# standard deviations of an octave's scales, in pixels of the octave: the characteristic scales, one below and one above
 SIGMAS: Array = FINEST * STEP ** np.arange(-1.0, SCALES + 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Octave:
-    """Memory for one octave: ``planes`` (6, H, W), E at each of :data:`SIGMAS`; ``colours`` (C, H, W), the other channels at one
-    scale; ``products`` (3, H, W) and ``strength``, ``largest`` (H, W): work arrays of the detector. ``step`` [px]: size of a
-    pixel of the octave in pixels of the image."""
+    """The arrays of one octave.
+
+    ``planes`` (6, H, W): the intensity E at each scale of :data:`SIGMAS`. ``colours`` (C, H, W): the other channels at one scale.
+    ``products`` (3, H, W), ``strength`` (H, W), ``largest`` (H, W): work arrays of the detector.
+    ``step`` [px]: the size of a pixel of the octave, in pixels of the image.
+    """
 
     planes: Float
     colours: Float
@@ -44,8 +47,10 @@ class Octave:
 
 
 class ScaleSpace:
-    """Octaves for images of ``shape`` (H, W) with ``colours`` channels besides E, each half as large as the previous, down to 16
-    px."""
+    """The scale space of an image. Each octave has half the size of the previous one, down to a side of 16 px.
+
+    ``shape``: height and width of the images. ``colours``: the number of channels in addition to the intensity E.
+    """
 
     def __init__(self, shape: tuple[int, ...], colours: int) -> None:
         self.shape, self.colours = shape, colours
@@ -65,7 +70,7 @@ class ScaleSpace:
         self._steps: Array = np.array([2.0**o for o, _ in levels])
 
     def fill(self, intensity: Float) -> None:
-        """Compute the planes of all octaves from E (H, W)."""
+        """Compute the planes of all octaves from the intensity E, ``intensity`` (H, W)."""
         blur(intensity, self.octaves[0].planes[0], SIGMAS[0])
         for o, octave in enumerate(self.octaves):
             if o > 0:
@@ -74,15 +79,16 @@ class ScaleSpace:
                 blur(octave.planes[i - 1], octave.planes[i], more_blur(SIGMAS[i - 1], SIGMAS[i]))
 
     def levels(self, sigmas: Array) -> Integers:
-        """The index over all octaves of the characteristic scale nearest to each of ``sigmas`` (N,) [px]."""
+        """Return for each scale of ``sigmas`` (N,) [px] the index (N,) of the nearest characteristic scale, counted over all
+        octaves."""
         nearest = np.rint(SCALES * np.log2(sigmas / FINEST))
         return np.asarray(np.clip(nearest, 0, len(self._steps) - 1), dtype=np.int64)
 
     def patches(self, points: Array, sigmas: Array, angles: Array, offsets: Float) -> Float:
-        """Samples (N, M) of E around ``points`` (N, 2) [px] at scales ``sigmas`` (N,) [px].
+        """Sample the intensity E around N points. Returns the samples (N, M).
 
-        ``offsets`` (M, 2): in units of the scale, along axes rotated by ``angles`` (N,) [rad]. Beyond the border the nearest pixel
-        counts.
+        ``points`` (N, 2) [px]. ``sigmas`` (N,) [px]: the scales of the points. ``offsets`` (M, 2): the sampled places around each
+        point, in units of its scale and along axes rotated by ``angles`` (N,) [rad]. Outside the image the nearest pixel is used.
         """
         levels = self.levels(sigmas)
         steps = self._steps[levels]
@@ -94,11 +100,12 @@ class ScaleSpace:
 
 
 def blur(source: Float, target: Float, sigma: float) -> None:
-    """Gaussian blur of ``source`` (H, W) to ``target``, which may be the same, with mirrored borders; ``sigma`` [px]."""
+    """Blur ``source`` (H, W) by a Gaussian with standard deviation ``sigma`` [px] and mirrored borders. The result is written to
+    ``target``, which may be ``source``."""
     side = 2 * int(np.ceil(3.0 * sigma)) + 1
     cv2.GaussianBlur(source, (side, side), sigma, dst=target, borderType=cv2.BORDER_REFLECT_101)
 
 
 def more_blur(have: float, want: float) -> float:
-    """Standard deviation of the blur that takes an image of blur ``have`` to ``want``."""
+    """Return the standard deviation of the blur that an image with blur ``have`` needs to have the blur ``want``."""
     return float(np.sqrt(want**2 - have**2))

@@ -1,8 +1,9 @@
 """Feature tracks over consecutive images.
 
 Matches between two images are mutual nearest neighbours that pass the ratio test and have a bounded displacement. They must fit
-one essential matrix, estimated by USAC (Raguram et al., PAMI 35, 2013) as in OpenCV with a fixed seed. A fundamental matrix would
-often fit a moving object too. Features without a match are also compared with the last image but one.
+one essential matrix, estimated by USAC (Raguram et al., PAMI 35, 2013) as in OpenCV with a fixed seed. A fundamental matrix is not
+used, because it often fits a moving object too. Features without a match in the last image are also compared with the image before
+it.
 """
 
 import math
@@ -16,15 +17,16 @@ from factorgraph_loc.vision.matching import Truths, match
 from factors.camera.model import CameraModel, undistorted
 from factors.se2 import Array
 
-RADIUS = 0.25  # of the longer side of an image: largest displacement of a feature
-EPIPOLAR = 1.5  # px from the epipolar line
-CONFIDENCE, DRAWS = 0.99, 300  # samples of five pairs
-FEWEST = 16  # pairs needed for a meaningful consensus
-OTHER_BODY = 0.5  # share of the other pairs that agree, if they are of another body and not wrong
+RADIUS = 0.25  # largest displacement of a feature, as a fraction of the longer side of the image
+EPIPOLAR = 1.5  # px: largest distance of an inlier from its epipolar line
+CONFIDENCE, DRAWS = 0.99, 300  # of USAC: confidence, and largest number of samples of five pairs
+FEWEST = 16  # with fewer pairs, no outliers are rejected
+OTHER_BODY = 0.5  # if more of the rejected pairs fit a second essential matrix, they show another moving body
 
 
 class _TrackedImage(NamedTuple):
-    """Directions (K, 2), descriptors (K, D) and track numbers (K,) of the features of one image."""
+    """The K features of one image. ``directions`` (K, 2): x and y at depth 1. ``descriptors`` (K, D). ``numbers`` (K,): their track
+    numbers."""
 
     directions: Array
     descriptors: Descriptors
@@ -32,18 +34,21 @@ class _TrackedImage(NamedTuple):
 
 
 class FeatureTracker:
-    """Numbers the tracks of features, image by image in order of time, keeping the last two images. Not thread-safe."""
+    """Assigns track numbers to the features of consecutive images. Features with the same number show the same point.
+
+    The images must be passed in order of time. The last two images are stored. Not thread-safe.
+    """
 
     def __init__(self, camera: CameraModel) -> None:
         self._camera = camera
         self._last: _TrackedImage | None = None
-        self._before: _TrackedImage | None = None  # the last but one, with the features that the last one did not match
-        self._count = 0  # of tracks
+        self._before: _TrackedImage | None = None  # the image before the last, without the features matched since
+        self._count = 0  # number of tracks
 
     def follow(self, pixels: Array, descriptors: Descriptors) -> Integers:
-        """Track numbers (K,) of the features of the next image, with ``pixels`` (K, 2) and ``descriptors`` (K, D).
+        """Return the track numbers (K,) of the features of the next image, with ``pixels`` (K, 2) and ``descriptors`` (K, D).
 
-        A number occurs at most once per image; a feature seen only once has a number of its own.
+        A number occurs at most once per image. A feature without a match gets a new number.
         """
         numbers = np.full(len(pixels), -1, dtype=np.int64)
         image = _TrackedImage(undistorted(self._camera, pixels), descriptors, numbers)
@@ -59,7 +64,8 @@ class FeatureTracker:
         return numbers
 
     def _continued(self, earlier: _TrackedImage, image: _TrackedImage) -> _TrackedImage:
-        """Continue tracks of an earlier image in the features without a number; the rest of the earlier image is returned."""
+        """Match the features of ``image`` that have no number yet with an earlier image, and write their track numbers. Returns the
+        features of the earlier image that were not matched."""
         rows = np.flatnonzero(image.numbers < 0)
         current = image.directions[rows], image.descriptors[rows]
         matched = pairs(earlier[:2], current, self._camera)
@@ -69,7 +75,10 @@ class FeatureTracker:
 
 
 def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel) -> Integers:
-    """Pairs (M, 2) of features of two images, each given as directions (K, 2), i.e. (x, y) at depth 1, and descriptors (K, D)."""
+    """Match the features of two images. Returns pairs (M, 2) of indices.
+
+    ``first``, ``second``: the features of an image as directions (K, 2), that is x and y at depth 1, and descriptors (K, D).
+    """
     if len(first[0]) == 0 or len(second[0]) == 0:
         return np.empty((0, 2), dtype=np.int64)
     focal = math.sqrt(camera.fx * camera.fy)
@@ -83,14 +92,17 @@ def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], c
     right = _of_one_geometry(a, b, focal)
     rejected = np.flatnonzero(~right)
     if len(rejected) >= FEWEST:
-        too = _of_one_geometry(a[rejected], b[rejected], focal)
-        if np.count_nonzero(too) > OTHER_BODY * len(rejected):
-            right[rejected] = too
+        fits = _of_one_geometry(a[rejected], b[rejected], focal)
+        if np.count_nonzero(fits) > OTHER_BODY * len(rejected):
+            right[rejected] = fits
     return matched[right]
 
 
 def _of_one_geometry(first: Float, second: Float, focal: float) -> Truths:
-    """The inliers of M pairs of pixels (M, 2), relative to the principal point, of one epipolar geometry."""
+    """Return a mask (M,) of the pairs of pixels that fit one essential matrix. All are True if none can be estimated.
+
+    ``first``, ``second`` (M, 2) [px]: relative to the principal point. ``focal`` [px]: the focal length.
+    """
     matrix = np.diag((focal, focal, 1.0))
     try:
         _, inliers = cv2.findEssentialMat(first, second, matrix, cv2.USAC_FAST, CONFIDENCE, EPIPOLAR, DRAWS)

@@ -13,7 +13,7 @@ from factorgraph_loc.vision.descriptor import LOG_SCALES, OWN_SCALE, RECORD, VAL
 from factorgraph_loc.vision.detector import CLEARANCE, orientations
 from factorgraph_loc.vision.features import extractor
 from factorgraph_loc.vision.images import as_image
-from factorgraph_loc.vision.kernels import lonely, refined_peaks
+from factorgraph_loc.vision.kernels import locally_strongest, refined_peaks
 from factorgraph_loc.vision.keypoints import Keypoints
 from factorgraph_loc.vision.scale_space import FINEST, SCALES, SIGMAS, STEP, ScaleSpace
 
@@ -300,4 +300,4 @@ def test_lonely_points_are_those_of_the_definition(seed: int, total: int, count:
         alike = np.abs(np.log2(scales[:n] / scales[n])) <= 0.5
         if not np.any(alike & (distance < reach * scales[n])):
             free.append(n)
-    assert np.flatnonzero(lonely(points, scales, reach, 2.0**0.5, count)).tolist() == free[:count]
+    assert np.flatnonzero(locally_strongest(points, scales, reach, 2.0**0.5, count)).tolist() == free[:count]

@@ -8,7 +8,7 @@ from refusal import refusal
 
 from factorgraph_loc.evaluation.features.sequences import inside, jacobians, project, read_homography, view
 from factorgraph_loc.vision.keypoints import spread_out
-from factorgraph_loc.vision.relocalization import NEAREST, KeyframeLooks
+from factorgraph_loc.vision.relocalization import NEAREST, KeyframeIndex
 
 SHAPE = (480, 640)
 TILTED = np.array(((0.9, -0.2, 40.0), (0.15, 1.1, -12.0), (2e-4, -1e-4, 1.0)))
@@ -92,7 +92,7 @@ def drive(rng, binary):
 def test_the_keyframe_that_saw_the_same_is_among_the_most_alike(binary):
     rng = np.random.default_rng(0)
     descriptors, seen_from, by_keyframe = drive(rng, binary)
-    places = KeyframeLooks(descriptors, seen_from)
+    places = KeyframeIndex(descriptors, seen_from)
     assert len(places) == KEYFRAMES
     for k in range(5, KEYFRAMES, 20):
         image = by_keyframe[k][: EACH // 2].copy()
@@ -107,7 +107,7 @@ def test_the_keyframe_that_saw_the_same_is_among_the_most_alike(binary):
 def test_a_map_with_few_keyframes_is_taken_as_a_whole():
     descriptors, seen_from, _ = drive(np.random.default_rng(0), binary=False)
     few = seen_from[:, 0] < NEAREST
-    places = KeyframeLooks(descriptors[few], seen_from[few])
+    places = KeyframeIndex(descriptors[few], seen_from[few])
     np.testing.assert_array_equal(places.views(descriptors[:10]), np.arange(np.count_nonzero(few)))
 
 

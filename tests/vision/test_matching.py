@@ -112,7 +112,7 @@ def test_bad_input_is_an_error() -> None:
     floats, bits = np.ones((2, 35), dtype=np.float32), np.ones((2, 32), dtype=np.uint8)
     with pytest.raises(InputError, match="descriptors have 35 and 128 columns"):
         match(floats, np.ones((2, 128), dtype=np.float32))
-    with pytest.raises(InputError, match="descriptors are float32 and uint8, expected both or none as uint8"):
+    with pytest.raises(InputError, match="descriptors are float32 and uint8, expected uint8 for both or for none"):
         match(floats[:, :32], bits)
     with pytest.raises(InputError, match=r"first descriptors have shape \(35,\), expected \(N, D\)"):
         match(floats[0], floats)
