@@ -1,10 +1,12 @@
-"""ActiveMCL, the paper's Algorithm 2, with one set of particles.
+"""The particle filter of a robot that chooses its paths: ActiveMCL, Algorithm 2 of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011).
 
-As printed, each action has particles of its own, weighted by a scan that was not made, and the index m is both the map and the
-particle. Here one step is: propose paths; predict the reads along each, drawn from the antenna model, and the remaining entropy;
-choose; move; and update the particles once, by the actual reads. The first three are in
-:mod:`~factorgraph_loc.planning.policies`, the loop in :mod:`~factorgraph_loc.planning.closed_loop`. The particles are those of the
-search (:mod:`~factorgraph_loc.fusion.search`) over free space.
+One step of the algorithm is this. Propose paths. Predict reads along each path, drawn from the antenna model, and the remaining
+entropy. Choose a path and drive it. Update the particles once, by the actual reads. Proposals, predictions and choice are in
+:mod:`~factorgraph_loc.planning.policies`, and the loop is in :mod:`~factorgraph_loc.planning.closed_loop`. The particles are those
+of the search for an unknown pose (:mod:`~factorgraph_loc.fusion.search`) over free space.
+
+The algorithm as printed in the paper is different. Each action has particles of its own, weighted by a scan that was not made. The
+index m denotes both the map and the particle.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 
 
 @dataclass(frozen=True)
-class LengthsSeen:
-    """Free ``lengths`` (D,) [m] read by a proximity sensor, as an observation of a search."""
+class ProximityReading:
+    """A reading of a proximity sensor, by which the particles of a search can be weighed. ``lengths`` (D,) [m]: the measured free
+    lengths."""
 
     sensor: ProximitySensor
     lengths: Array
@@ -48,7 +51,8 @@ class LengthsSeen:
 
 
 class ActiveMcl:
-    """The search over free ``space`` as an estimator; see the module. ``particles``: their least number."""
+    """The estimator ActiveMCL: particles in the free ``space`` of a building, for an unknown start. ``particles``: their least
+    number."""
 
     deterministic = False
     supports_unknown_start = True
@@ -63,10 +67,10 @@ class ActiveMcl:
         self._records: list[PoseEstimate] = []
 
     def initialize(self, prior: PosePrior) -> None:
-        raise NotImplementedError("an active robot has an unknown start")
+        raise NotImplementedError("ActiveMCL always starts at an unknown pose")
 
     def process(self, measurement: Measurement) -> None:
-        """Take one measurement, in the order of time."""
+        """Process one measurement. Measurements must come in the order of time."""
         if measurement.is_motion:
             self._motion.add(measurement)
             return
@@ -78,12 +82,13 @@ class ActiveMcl:
             self._search.look(measurement, self._motion.state(measurement.t))
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
-        """Weigh the particles by free lengths (D,) [m] read by a proximity sensor; no effect before the first scan."""
-        self._search.queue(LengthsSeen(sensor, lengths), self._motion.state(self._t))
+        """Weigh the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. There is no effect before the
+        first scan."""
+        self._search.queue(ProximityReading(sensor, lengths), self._motion.state(self._t))
         self._search.advance(self._t)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The heaviest mode; ``localized`` if nearly all particles are of it."""
+        """Return the mode with the largest weight. The status is ``localized`` if its weight is above :data:`ONE_PLACE`."""
         at = self._t if t is None else max(t, self._t)
         modes = self._search.modes(at) if self._search.newest is not None else []
         if not modes:
@@ -92,7 +97,8 @@ class ActiveMcl:
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:
-        """The modes, and the particles: those of one mode only where nearly all are of it."""
+        """Return the modes and the particles. If the weight of one mode is above :data:`ONE_PLACE`, only its particles are
+        returned."""
         at = self._t if t is None else max(t, self._t)
         particles = self._search.particles(at) if self._search.newest is not None else None
         if particles is None:
@@ -104,11 +110,11 @@ class ActiveMcl:
         return Belief(modes, poses, weights)
 
     def learnt(self) -> Learnt:
-        """Nothing."""
+        """Return an empty result, because this estimator learns neither constants nor landmarks."""
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """The causal estimates at the ticks."""
+        """Return the causal estimates at the ticks."""
         poses = np.array([r.pose for r in self._records]).reshape(-1, 3)
         covariances = np.array([r.covariance for r in self._records]).reshape(-1, 3, 3)
         return Trajectory(np.array([r.t for r in self._records]), poses, covariances)

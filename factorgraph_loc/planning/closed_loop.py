@@ -1,4 +1,4 @@
-"""Closed loop of a simulated robot that chooses its paths until it is localized."""
+"""Simulation of a robot that starts at an unknown pose and chooses its paths until it is localized (closed loop)."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.model.world import World
 from factorgraph_loc.planning.active_mcl import ActiveMcl
 from factorgraph_loc.planning.information import Sensors
-from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths, waypoints
+from factorgraph_loc.planning.paths import Path, full_turn, primitives, waypoint_paths, waypoints
 from factorgraph_loc.planning.policies import Choice, Policy, Situation, usable
 from factorgraph_loc.planning.policies import policy as named_policy
 from factorgraph_loc.planning.robot import SimulatedRobot
@@ -37,25 +37,28 @@ from factorgraph_loc.text import quoted
 from factors import se2
 from factors.se2 import Array
 
-NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes closer to each other are one place
-SHOWN = 300  # particles of a belief that are stored
-SPREAD = 2000  # samples of a belief without particles
-WRONG = 3.0  # times the limits: larger errors are false claims
-MODES, LIKELY = 3, 0.05  # maximum number and least weight of modes as starting points of plans to distant places
-TAGS, PLACES, SPREAD_OVER = 8, 6, 40  # nearest tags, nearest of the places spread over free space, and number of those
-LOOK = 0.5  # m between proximity readings
-PAUSE = 1.0  # s that a robot waits if it has no path
-SLACK = 0.2  # m that particles may be nearer to walls than the robot: the size of a cell
+NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes with smaller differences are merged
+SHOWN = 300  # number of particles of a belief that are stored in the result
+SAMPLES = 2000  # number of particles that are drawn from a belief without particles
+WRONG = 3.0  # an estimator that claims to be localized is wrong if an error exceeds its limit by this factor
+MODES, LIKELY = 3, 0.05  # largest number and least weight of the modes from which paths to distant places are planned
+WAYPOINTS = 40  # number of places that are spread over free space
+TAGS, PLACES = 8, 6  # numbers of nearest tags and of nearest waypoints to which paths are planned
+READING_DISTANCE = 0.5  # m driven between two readings of the proximity sensor
+PAUSE = 1.0  # s that the robot waits if no path is free
+SLACK = 0.2  # m: particles may be nearer to walls than the robot by this distance, which is the size of a cell
 
 
 @dataclass(frozen=True)
 class PlanningStep:
-    """One choice of a path.
+    """One choice of a path by a policy.
 
-    At ``t`` [s] after ``metres`` [m], with true pose ``truth`` (3,), estimated ``pose`` (3,) and ``covariance`` (3, 3), both NaN
-    before the first observation. ``particles`` (K, 3): an equally weighted sample of the belief. ``candidates``: paths (S, 3)
-    from the true pose, in the world frame; ``values`` (C,): the policy's scores, higher is better, empty if it does not compare.
-    ``chosen``: the chosen path, None if there was none. ``planning_ms``: computing time.
+    ``t`` [s], ``metres`` [m]: time and driven distance. ``truth`` (3,): the true pose.
+    ``pose`` (3,), ``covariance`` (3, 3): the estimate, NaN before the first observation.
+    ``particles`` (K, 3): an equally weighted sample of the belief.
+    ``candidates``: the C proposed paths as poses (S, 3) in the world frame, starting at the true pose.
+    ``values`` (C,): the policy's scores of the candidates, higher is better; empty if the policy does not compare them.
+    ``chosen``: the poses of the chosen path, None if no path was free. ``planning_ms`` [ms]: the computing time.
     """
 
     t: float
@@ -72,11 +75,13 @@ class PlanningStep:
 
 @dataclass(frozen=True)
 class ActiveRun:
-    """A run of one policy with one estimator in one world.
+    """The result of a run of one policy with one estimator in one world.
 
-    ``localized``: the robot was localized correctly, after ``metres`` [m] and ``seconds`` [s], with ``error_position`` [m] and
-    ``error_heading`` [rad]; otherwise these are the values at the end. ``claimed_wrong``: at some time the estimator claimed to
-    be localized with an error above three times the limits. ``truth``: the true trajectory. ``steps``: the choices.
+    ``localized``: True if the robot was localized correctly; the run then ends.
+    ``metres`` [m], ``seconds`` [s]: distance and time at the end of the run.
+    ``error_position`` [m], ``error_heading`` [rad]: the errors of the estimate at the end.
+    ``claimed_wrong``: True if at some time the estimator claimed to be localized with an error above three times a limit.
+    ``truth``: the true trajectory. ``steps``: the choices of paths.
     """
 
     seed: int
@@ -95,17 +100,18 @@ class ActiveRun:
 
     @property
     def planning_ms(self) -> Array:
-        """Computing times (N,) [ms] of the choices."""
+        """The computing times (N,) [ms] of the N choices."""
         return np.array([step.planning_ms for step in self.steps])
 
 
 def run_active(
     simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings | None = None
 ) -> ActiveRun:
-    """Drive from an unknown start until the robot is localized or gives up.
+    """Simulate a robot that drives from an unknown start until it is localized or gives up.
 
-    Runs with the same seed share world, start, and noise sequences, for all policies and estimators. Raises InputError for a
-    wrong policy, estimator or start, and for a sensor faster than the robot's control; RunFailedError if the estimator fails.
+    ``policy``, ``estimator``: their names. Runs with the same ``seed`` have the same world, start and noise sequences, for all
+    policies and estimators. Raises InputError for a wrong policy, estimator or start, and for a sensor with a higher rate than the
+    robot's control. Raises RunFailedError if the estimator fails.
     """
     loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()
@@ -129,7 +135,7 @@ def run_active(
 
 
 class _ClosedLoop:
-    """One run: propose, predict, choose, move, and update by the actual reads."""
+    """The state of one run, and its loop: propose paths, choose one, drive it, and update the estimate by the measurements."""
 
     def __init__(
         self, simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings
@@ -137,7 +143,7 @@ class _ClosedLoop:
         for name, rate in _rates(simulation):
             if rate > RATE:
                 raise InputError(
-                    f"{simulation.name}: {name} is {rate:g}, expected at most {RATE:g}, the rate of the robot's control"
+                    f"{simulation.name}: {name} is {rate:g} Hz, expected at most {RATE:g} Hz, the rate of the robot's control"
                 )
         self._policy: Policy = named_policy(policy)
 
@@ -156,18 +162,18 @@ class _ClosedLoop:
         self.steps: list[PlanningStep] = []
         self.claimed_wrong = False
         self._settings = settings
-        self._paths, self._turn = primitives(settings.policy.horizon), look_around()
-        self._looked_at = -math.inf  # metres driven at the last proximity update of the particles
+        self._paths, self._turn = primitives(settings.policy.horizon), full_turn()
+        self._proximity_at = -math.inf  # metres driven at the last proximity update of the particles
         self._turned_at = -math.inf  # metres driven when the robot last turned around
         self._sensors = Sensors.of(
             world, simulation.rig, simulation, settings.speed, settings.turn_rate, only=robot.sensors
         )
-        # positions of the robot next to each tag
+        # targets of paths: the free cell nearest to each tag, and places spread over free space
         nearest_cells = cKDTree(space.centres).query(self._sensors.goals)[1]
-        self._targets = ((space.centres[np.unique(nearest_cells)], TAGS), (waypoints(space, SPREAD_OVER), PLACES))
+        self._targets = ((space.centres[np.unique(nearest_cells)], TAGS), (waypoints(space, WAYPOINTS), PLACES))
 
     def run(self) -> bool:
-        """Run to the end; whether the robot was localized."""
+        """Run to the end. Returns True if the robot was localized correctly."""
         robot, settings = self.robot, self._settings
         done = self._take(robot.begin())
         while not done and robot.metres < settings.max_metres - 1e-3 and robot.t < settings.max_seconds:
@@ -182,17 +188,18 @@ class _ClosedLoop:
         return done
 
     def errors(self) -> tuple[float, float]:
-        """Errors of the estimate in position [m] and heading [rad], NaN without an estimate."""
+        """Return the errors of the estimate in position [m] and heading [rad]. They are NaN if there is no estimate."""
         error = self._estimate().pose - self.robot.pose
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
     def _take(self, reports: Iterator[Measurement]) -> bool:
-        """Process the reports; whether the robot is localized correctly after one of them."""
+        """Process measurements of the robot. Stops and returns True as soon as the robot is localized correctly, otherwise returns
+        False at their end."""
         for report in reports:
             self._feed(report)
-            if isinstance(self._estimator, ActiveMcl) and self.robot.metres >= self._looked_at + LOOK:
-                self._looked_at = self.robot.metres
-                # filters move at scans and ticks only
+            if isinstance(self._estimator, ActiveMcl) and self.robot.metres >= self._proximity_at + READING_DISTANCE:
+                self._proximity_at = self.robot.metres
+                # a tick predicts the particles to the current pose: odometry alone does not move them
                 self._feed(Tick(self.robot.t))
                 with self._guard.computing("the walls", self.robot.t):
                     self._estimator.see(self.robot.proximity, self.robot.read_proximity())
@@ -255,7 +262,8 @@ class _ClosedLoop:
         return choice
 
     def _far(self, modes: Sequence[Mode]) -> list[Path]:
-        """The shortest paths to places from each likely mode: what distinguishes the modes may be far away."""
+        """Return the shortest paths from each mode to tags and to places in free space. Objects that distinguish the modes may be
+        far away."""
         out: list[Path] = []
         policy = self._settings.policy
         for mode in modes:
@@ -270,7 +278,7 @@ class _ClosedLoop:
 
 
 def _rates(simulation: SimulationSettings) -> Iterator[tuple[str, float]]:
-    """Rates [Hz] of the robot's sensors, with the names of their settings."""
+    """Yield the rate [Hz] of each of the robot's sensors, with the name of its setting."""
     yield "rounds_per_second", simulation.rounds_per_second
     for sensor in sensors().values():
         for section in sensor.simulation if sensor.on_robot else ():
@@ -283,13 +291,13 @@ def _estimator(name: str, setup: model_setup.Setup, settings: ActiveSettings) ->
         return ActiveMcl(setup, settings.particles, space)
     if name not in ACTIVE_ESTIMATORS:
         raise InputError(
-            f"no estimator of active runs is called {quoted(name)}{nearest(name, list(ACTIVE_ESTIMATORS))}"
+            f"estimator {quoted(name)} is not known for active runs{nearest(name, list(ACTIVE_ESTIMATORS))}"
         )
     return registry.create(name, setup, registry.settings_of(name, {}))
 
 
 def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings, rng: np.random.Generator) -> Array:
-    """The true start pose (3,)."""
+    """Return the true start pose (3,): that of the settings, or a random one in free space."""
     place = space.centres[rng.integers(len(space.centres))] + CELL * (rng.random(2) - 0.5)
     drawn = np.array((*place, rng.uniform(-math.pi, math.pi)))
     if settings.start is None:
@@ -299,14 +307,15 @@ def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings,
     gap = float(distance_to_walls(world, place)[0])
     if gap < settings.clearance or not plan.open(place)[0]:
         raise InputError(
-            f"{world.name}: start ({x:g}, {y:g}) is in a wall, in something solid, or {gap:.2f} m from one, "
-            f"expected a place between the walls, at least {settings.clearance:g} m from all"
+            f"{world.name}: start ({x:g}, {y:g}) is in a solid object, outside of the building, or {gap:.2f} m from a wall, "
+            f"expected a free place at least {settings.clearance:g} m from all walls"
         )
     return np.array(settings.start)
 
 
 def _places(belief: Belief) -> tuple[Mode, ...]:
-    """The significant modes of a belief, at most :data:`MODES`; neighbouring ones are merged into the heavier."""
+    """Return at most :data:`MODES` modes of a belief with a weight of at least :data:`LIKELY`. Neighbouring modes are merged: the
+    pose of the heaviest is used, and the weights are added."""
     places: list[Mode] = []
     for mode in belief.modes:
         if not np.all(np.isfinite(mode.pose)):
@@ -322,15 +331,16 @@ def _places(belief: Belief) -> tuple[Mode, ...]:
 
 
 def _sampled(belief: Belief, space: FreeSpace, rng: np.random.Generator) -> tuple[Array, Array]:
-    """A belief as particles (M, 3) with weights (M,): its own, or drawn from its modes, or from free space if it has none."""
+    """Return particles (M, 3) and weights (M,) of a belief. If it has none, they are drawn from its modes. If it has no modes
+    either, they are drawn from free space."""
     if belief.particles is not None and belief.weights is not None and len(belief.particles):
         return belief.particles, belief.weights
-    even = np.full(SPREAD, 1.0 / SPREAD)
+    even = np.full(SAMPLES, 1.0 / SAMPLES)
     modes = [m for m in belief.modes if np.all(np.isfinite(m.covariance))]
     if not modes:
-        rows = rng.integers(len(space.centres), size=SPREAD)
-        return np.column_stack((space.centres[rows], rng.uniform(-math.pi, math.pi, SPREAD))), even
+        rows = rng.integers(len(space.centres), size=SAMPLES)
+        return np.column_stack((space.centres[rows], rng.uniform(-math.pi, math.pi, SAMPLES))), even
     shares = np.array([m.weight for m in modes])
-    counts = rng.multinomial(SPREAD, shares / shares.sum())
+    counts = rng.multinomial(SAMPLES, shares / shares.sum())
     drawn = [rng.multivariate_normal(m.pose, m.covariance, n) for m, n in zip(modes, counts, strict=True)]
     return np.concatenate(drawn), even

@@ -1,16 +1,17 @@
-"""Expected information of a path: entropy of the belief, minus the mean entropy after the scans on the path.
+"""Expected information of a path: the entropy of the belief, minus the expected entropy after the measurements on the path.
 
-``h[p(x)] - E_z h[p(x | z, a)]``, to be maximised. Scans are drawn from the antenna model at particles of the belief, all
-particles are weighted by them, and the entropy is that of the weighted particles. All paths use the same particles and random
-numbers, so that the differences between paths have less variance than the gains (common random numbers: Glasserman, Yao,
-Management Science 38(6), 1992).
+The information ``h[p(x)] - E_z h[p(x | z, a)]`` is to be maximised. x is the pose, z are the measurements, and a is the path.
+Measurements are drawn from the sensor models at particles of the belief, and all particles are weighted by them. The entropy is
+that of the weighted particles. All paths use the same particles and random numbers. The differences between paths therefore have
+less variance than the information itself (common random numbers: Glasserman, Yao, Management Science 38(6), 1992).
 
-Entropies are differential, in nats: of a Gaussian with the particles' covariance for a unimodal belief, else of a histogram.
+Entropies are differential, in nats. For a belief with one mode, the entropy is that of a Gaussian with the particles' covariance.
+For a belief with several modes, it is that of a histogram.
 
-For a nearly known pose it is the Fisher information in closed form: a Gaussian belief is propagated along the path with the noise
-of the odometry; at each station the expected information of the sensors at the mean is added (van Trees, "Detection, Estimation,
-and Modulation Theory", part I, 1968, section 2.4: the Cramer-Rao bound). No measurement is drawn. It is valid while the sensor
-models are nearly linear over the belief.
+If the pose is nearly known, the information is computed in closed form (:func:`fisher_gain`), without drawing measurements. A
+Gaussian belief is propagated along the path with the noise of the odometry. At each pose of the path the expected Fisher
+information of the sensors is added (van Trees, "Detection, Estimation, and Modulation Theory", part I, 1968, section 2.4: the
+Cramer-Rao bound). This is valid while the sensor models are nearly linear over the belief.
 """
 
 from __future__ import annotations
@@ -39,14 +40,15 @@ from factors.odometry import model as odometry
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
-POSITION, POSE = 2, 3  # leading coordinates of a pose whose entropy counts: x and y, or all
+POSITION, POSE = 2, 3  # number of leading coordinates of a pose (x, y, heading) whose entropy is computed
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; an integer number of headings
-FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations below which nothing is gained
-LOOK = 1.5  # m between stations; a station represents the rounds on that distance, or in turns of the same duration
-LOOKS = 10  # maximum number of stations; on a longer path they are farther apart
-SAMPLES, SCANS = 256, 48  # particles that are weighted, and those that scans are drawn from
+FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: a standard deviation below these values is not counted as a gain
+# m between stations, where measurements are predicted. A station represents all measurements over this distance
+STATION_DISTANCE = 1.5
+MOST_STATIONS = 10  # largest number of stations; on a longer path they are farther apart
+SAMPLES, SCANS = 256, 48  # number of particles that are weighted, and number of drawn scans
 FEWEST = 10  # least number of particles
-SEVERAL = 0.5  # nats: largest difference of a unimodal belief's entropy from that of a Gaussian with its covariance
+SEVERAL = 0.5  # nats: a belief has several modes if the entropy of a Gaussian with its covariance is larger by this
 WIDEST_HEADING = 0.8  # rad: largest standard deviation of a Gaussian heading
 SPEED = 0.5  # m/s: converts noise of the odometry per second to noise per metre
 METRES_PER_RADIAN = 0.5  # of a robot that turns in place at 1 rad/s
@@ -54,8 +56,10 @@ METRES_PER_RADIAN = 0.5  # of a robot that turns in place at 1 rad/s
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """The sensors of a robot. ``odometry``: noise of the motion; ``forecasts``: of those that observe objects in the map;
-    ``metres_per_radian``: distance driven in the time of a turn by one radian.
+    """The sensor models of a robot, for the prediction of measurements along a path.
+
+    ``odometry``: the noise of the motion. ``forecasts``: a forecast for each sensor that observes objects in the map.
+    ``metres_per_radian``: the distance [m] that the robot drives in the time of a turn by one radian.
     """
 
     odometry: OdometryModel
@@ -64,7 +68,7 @@ class Sensors:
 
     @property
     def goals(self) -> Array:
-        """Places (K, 2) near which the sensors are most informative."""
+        """Positions (K, 2) [m] near which the sensors are most informative, such as those of tags."""
         return np.concatenate([np.empty((0, 2)), *(forecast.goals for forecast in self.forecasts)])
 
     @staticmethod
@@ -76,30 +80,33 @@ class Sensors:
         turn_rate: float,
         only: Collection[str],
     ) -> Sensors:
-        """The sensors of a rig with the names ``only`` that observe objects in the world, with the rates in a simulation's
-        ``settings``."""
+        """Return the sensor models of a rig. ``only``: the names of the sensors that are used. ``settings``: those of the
+        simulation, with the rates of sensors. ``speed`` [m/s], ``turn_rate`` [rad/s]: those of the robot."""
         made = [
             forecast(world, rig.alone(name), speed, settings)
             for name, forecast in functions("forecast", rig)
             if name in only
         ]
-        # those with goals first: the order affects the rounding of sums
+        # sensors with goals come first: the order affects the rounding of sums
         forecasts = sorted((f for f in made if f is not None), key=lambda f: not len(f.goals))
         return Sensors(odometry_model(rig, constants_as_noise=True), tuple(forecasts), speed / turn_rate)
 
 
 def gaussian_entropy(covariance: Array, dims: int = POSE) -> Array:
-    """Entropy (...) [nats] of Gaussians with ``covariance`` (..., 3, 3) of x, y, heading, in the first ``dims`` of these:
-    ``log(det(2 pi e C)) / 2`` (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1).
+    """Return the entropy (...) [nats] of Gaussians with ``covariance`` (..., 3, 3) of x, y and heading.
+
+    ``dims``: the number of leading coordinates that are considered. The entropy is ``log(det(2 pi e C)) / 2``, with the
+    covariance C of these coordinates (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1).
     """
     part = np.asarray(covariance)[..., :dims, :dims]
     return np.asarray(0.5 * (dims * math.log(2.0 * math.pi * math.e) + np.linalg.slogdet(part)[1]))
 
 
 def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
-    """Histogram entropy [nats] of particles ``poses`` (M, 3) with ``weights`` (M,), in the first ``dims`` coordinates.
+    """Return the entropy [nats] of a histogram of particles ``poses`` (M, 3) with ``weights`` (M,).
 
-    Comparable with :func:`gaussian_entropy` for beliefs wider than a cell and more particles than cells.
+    ``dims``: the number of leading coordinates that are considered. The result is comparable with :func:`gaussian_entropy` if the
+    belief is wider than a cell and there are more particles than cells.
     """
     even: Array32 = weights[None].astype(np.float32)
     at = np.ascontiguousarray(poses, dtype=float)[None]
@@ -107,8 +114,10 @@ def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
 
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
-    """Whether particles (M, 3) with weights (M,) are poorly described by a Gaussian: the entropy of its position exceeds theirs
-    by more than :data:`SEVERAL`, or the heading is unknown.
+    """True if particles (M, 3) with ``weights`` (M,) are poorly described by a Gaussian.
+
+    This is so if the heading is unknown. It is also so if the entropy of a Gaussian with their covariance exceeds the entropy of
+    their positions by more than :data:`SEVERAL`.
     """
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
@@ -131,12 +140,13 @@ def expected_gain(
     samples: int = SAMPLES,
     scans: int = SCANS,
 ) -> Array:
-    """Expected reduction of entropy (C,) [nats] on each of C paths.
+    """Return the expected reduction of entropy (C,) [nats] on each of C paths.
 
-    The belief has particles (M, 3) in the world frame with weights (M,). The entropy afterwards is that of the pose at the end.
-    ``space``: a particle whose path leads into a wall stops and measures no more.
-    ``places`` (M,): the mode of each particle; the entropy is then that of the mode index. ``noise``: of the odometry on the path,
-    none by default. ``samples``: number of particles that are weighted; ``scans`` of these draw measurements of all ``sensors``.
+    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is that of the pose at its end.
+    ``space``: a particle whose path leads into a wall stops there and makes no further measurements.
+    ``places`` (M,): the mode of each particle. If given, the entropy of the mode index is used instead of that of the pose.
+    ``noise``: the noise of the odometry on the path; None means no noise.
+    ``samples``: the number of particles that are weighted. ``scans``: the number of particles at which measurements are drawn.
     """
     if not paths:
         return np.empty(0)
@@ -145,7 +155,7 @@ def expected_gain(
         systematic(weights, rng, samples if len(particles) < FEWEST else min(samples, len(particles)))
     )
     poses = np.ascontiguousarray(particles[rows], dtype=float)
-    # one cell per mode
+    # if modes are given: put all particles of a mode into one cell of the histogram
     cells = None if places is None else np.multiply.outer(places[rows] + 0.5, (CELL[0], 0.0, 0.0))[None]
     count = len(poses)
     scans = min(scans, count)
@@ -161,16 +171,16 @@ def expected_gain(
     for c, (path, steps) in enumerate(zip(paths, stations, strict=True)):
         at = np.empty((len(steps), count, 3))
         sigmas = np.zeros((len(steps), 3)) if noise is None else _sigmas(path, steps, noise)
-        particle_kernels.look_poses(poses, path.poses, steps, last[c], sigmas, normals, at)
+        particle_kernels.station_poses(poses, path.poses, steps, last[c], sigmas, normals, at)
         stops = np.searchsorted(steps[1:-1], last[c], side="right")
         log_weights: Array32 = np.zeros((scans, count), dtype=np.float32)
         for forecast in sensors.forecasts:
             forecast.add_log_weights(at[1:-1], float(passed[c][-1]), stops, seed, log_weights)
         log_weights -= log_weights.max(axis=1, keepdims=True)
-        # a robot that reaches the end is there; a stopped one is near its last station
+        # the entropy at the end of the path, or at the last station if the robot stops before
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
         if cells is not None or (several and noise is None):
-            # the entropy at the end of the path, up to the alignment with the histogram's cells
+            # without noise, the entropy at the start is equal, apart from the alignment with the histogram's cells
             index = np.zeros_like(index)
         weighed = at if cells is None else cells
         posterior[c] = _entropies(weighed, index, np.exp(log_weights), POSE, several=several)
@@ -178,7 +188,9 @@ def expected_gain(
 
 
 def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, several: bool) -> Array:
-    """Entropies (J,) of particles at stations ``index`` (J,) of ``poses`` (S, M, 3), with weights (J, M)."""
+    """Return J entropies of particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of each
+    entropy.
+    ``weights`` (J, M): the weights for each entropy. ``several``: use a histogram instead of a Gaussian."""
     if several:
         out = np.empty(len(index))
         particle_kernels.cell_entropies(poses, index, weights, CELL, dims, out)
@@ -189,17 +201,19 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, seve
 
 
 def _stations(passed: Array) -> Places:
-    """Indices of the stations among the poses of a path, given the metres ``passed`` (S,): the start, the observations, each in
-    the middle of its part of the path, and the end.
+    """Return the indices of stations among the poses of a path: the start, the places of predicted measurements, and the end.
+
+    ``passed`` (S,) [m]: the distance up to each pose of the path. The path is divided into equal parts, and the measurements of
+    each part are predicted in its middle.
     """
-    count = min(max(1, round(passed[-1] / LOOK)), LOOKS)
+    count = min(max(1, round(passed[-1] / STATION_DISTANCE)), MOST_STATIONS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
     observations = np.searchsorted(passed, middles - 1e-9)
     return np.concatenate(([0], observations, [len(passed) - 1])).astype(np.int64)
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
-    """Standard deviations (S, 3) of the motion from one station to the next."""
+    """Return the standard deviations (S, 3) of the motion to each of S stations from the previous one, in the robot frame."""
     distance = np.diff(path.metres[steps])
     rotation = np.diff(path.turned[steps])
     out = np.zeros((len(steps), 3))
@@ -209,9 +223,10 @@ def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
 
 
 def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sensors) -> Array:
-    """Expected covariance (3, 3) of x, y, heading in the world frame at the end of a path.
+    """Return the expected covariance (3, 3) of x, y and heading in the world frame at the end of a path.
 
-    ``mean`` (3,), ``covariance`` (3, 3): of the belief at its start. The robot observes at each pose of the path but the first.
+    ``mean`` (3,), ``covariance`` (3, 3): the belief at the start of the path. The sensors measure at each pose of the path except
+    the first.
     """
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
@@ -225,15 +240,16 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
     ]
     for (start, end), information in zip(pairwise(states), by_pose, strict=True):
         body = propagate(body, odometry.relative_motion(sensors.odometry, start, end))
-        # equals the inverse of the summed information, also for a singular covariance
+        # the inverse of the sum of both information matrices, in a form that allows a singular covariance
         body = np.linalg.solve(np.eye(3) + body @ information, body)
         body = (body + body.T) / 2.0
     return se2.body_to_world(poses[-1], body)
 
 
 def fisher_gain(mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors) -> Array:
-    """Expected reduction of entropy (C,) [nats] on each of C paths; see :func:`expected_covariance`. Accuracy better than
-    :data:`~factorgraph_loc.planning.information.FINEST` counts nothing.
+    """Return the expected reduction of entropy (C,) [nats] on each of C paths, for a Gaussian belief (:func:`expected_covariance`).
+
+    Standard deviations below :data:`~factorgraph_loc.planning.information.FINEST` are not counted as a gain.
     """
     fine = np.diag(FINEST**2)
     entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine) for path in paths]

@@ -1,4 +1,4 @@
-"""Compiled kernels for :mod:`factorgraph_loc.planning.information`: particles along a path, and their covariance and entropy."""
+"""Compiled loops of :mod:`factorgraph_loc.planning.information`: particles along a path, and their covariance and entropy."""
 
 import math
 
@@ -10,21 +10,23 @@ from factors.se2 import Array
 
 
 @compiled
-def look_poses(
+def station_poses(
     particles: Array, along: Array, steps: Places, last: Places, sigmas: Array, normals: Array, out: Array
 ) -> None:
-    """Poses of M particles at S stations of a path, (S, M, 3): the start, the measurement poses and the end.
+    """Compute the poses of M particles at S stations of a path: the start, the poses of measurements, and the end.
 
-    ``particles`` (M, 3); ``along`` (P, 3): poses of the path; ``steps`` (S,): indices of the stations; ``last`` (M,): index of the
-    last pose that each particle reaches, where it stays; ``sigmas`` (S, 3): motion noise between stations in the robot frame, with
-    standard normal draws ``normals`` (S, M, 3).
+    ``particles`` (M, 3): the poses at the start. ``along`` (P, 3): the poses of the path, relative to the start.
+    ``steps`` (S,): the indices of the stations among the poses of the path.
+    ``last`` (M,): the index of the last pose that each particle reaches; the particle stays there.
+    ``sigmas`` (S, 3): standard deviations of the motion to each station, in the robot frame. ``normals`` (S, M, 3): standard normal
+    random numbers for the motion. ``out`` (S, M, 3): receives the poses.
     """
     count = len(particles)
     errors = np.zeros((count, 3))
     for k in range(len(steps)):
         end = along[steps[k]]
         begin = along[steps[k - 1]] if k else end
-        # adjoint of the inverse motion: the earlier error seen from the end
+        # adjoint of the inverse motion: transforms the error at the previous station to the frame of this one
         ce, se = math.cos(end[2]), math.sin(end[2])
         c, s = math.cos(end[2] - begin[2]), math.sin(end[2] - begin[2])
         back_x, back_y = (
@@ -49,8 +51,12 @@ def look_poses(
 
 @compiled
 def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> None:
-    """Weighted covariances (J, 3, 3) of M particles at stations ``index`` (J,) of ``poses`` (S, M, 3), with ``weights`` (J, M).
-    Headings are relative to the first particle's."""
+    """Compute J weighted covariances of M particles.
+
+    ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of each covariance. ``weights`` (J, M): the
+    weights for each covariance. ``out`` (J, 3, 3): receives the covariances. Headings are computed relative to the first
+    particle's.
+    """
     count = poses.shape[1]
     d = np.empty(3)
     first, second = np.empty(3), np.empty((3, 3))
@@ -77,8 +83,11 @@ def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> No
 
 @compiled
 def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, dims: int, out: Array) -> None:
-    """Entropies (J,) [nats] of histograms of the first ``dims`` coordinates with cells of size ``cell`` (3,); otherwise as
-    :func:`covariances`."""
+    """Compute J entropies [nats] of histograms of M particles.
+
+    ``cell`` (3,): the size of a cell in x, y and heading. ``dims``: the number of leading coordinates that are considered. ``out``
+    (J,): receives the entropies. Other arguments: see :func:`covariances`.
+    """
     stations, count, _ = poses.shape
     volume = 0.0
     for a in range(dims):
@@ -104,7 +113,8 @@ def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, d
 
 @compiled
 def _number_cells(poses: Array, cell: Array, dims: int, out: Places) -> None:
-    """Cell indices (M,) below M, equal for particles in one cell: a hash table with open addressing."""
+    """Number the cells of M particles by a hash table with open addressing. ``out`` (M,): receives for each particle a number
+    below M, which is equal for all particles in the same cell."""
     count = len(poses)
     size = 1
     while size < 4 * count:

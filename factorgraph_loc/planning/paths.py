@@ -1,4 +1,5 @@
-"""Candidate paths: arcs and straight lines, shortest paths in free space, and the free length before walls."""
+"""Candidate paths of a robot: arcs, straight lines, and shortest paths in free space; and the part of a path that is free of
+walls."""
 
 from __future__ import annotations
 
@@ -17,16 +18,18 @@ from factors import se2
 from factors.compiled import compiled
 from factors.se2 import Array
 
-STEP = 0.25  # m, between the poses of a path
-DIRECTIONS = 12  # number of initial turns
-CURVATURES = (-0.6, -0.25, 0.0, 0.25, 0.6)  # rad/m
+STEP = 0.25  # m between the poses of a path
+DIRECTIONS = 12  # number of directions of proposed paths
+CURVATURES = (-0.6, -0.25, 0.0, 0.25, 0.6)  # rad/m of proposed arcs
 SHORT = 0.5  # relative length of the short straight paths
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """``poses`` (S, 3) in the frame of the start pose, the first of them, at intervals of about :data:`STEP`, and the end; a turn
-    in place is an additional pose at the same position. ``kind``: how the path was proposed.
+    """A path of a robot.
+
+    ``poses`` (S, 3): in the frame of the start pose, at intervals of about :data:`STEP`. The first is the start pose, the last is
+    the end. A turn in place is an additional pose at the same position. ``kind``: how the path was proposed, such as "arc".
     """
 
     poses: Array
@@ -34,33 +37,35 @@ class Path:
 
     @cached_property
     def metres(self) -> Array:
-        """Distance (S,) [m] driven up to each pose."""
+        """The distance (S,) [m] driven up to each pose."""
         steps = se2.log(se2.between(self.poses[:-1], self.poses[1:]))
         return np.concatenate((np.zeros(1), np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
 
     @cached_property
     def turned(self) -> Array:
-        """Absolute angle (S,) [rad] turned up to each pose."""
+        """The sum of absolute turns (S,) [rad] up to each pose."""
         return np.concatenate((np.zeros(1), np.cumsum(np.abs(se2.wrap(np.diff(self.poses[:, 2]))))))
 
     @property
     def length(self) -> float:
-        """Length [m]."""
+        """The length [m] of the path."""
         return float(self.metres[-1])
 
     def passed(self, metres_per_radian: float) -> Array:
-        """The metres (S,) that a robot could have driven in the time up to each pose; a turn by a radian takes the time of
-        ``metres_per_radian``."""
+        """Return the distance (S,) [m] up to each pose, including turns by their duration.
+
+        ``metres_per_radian``: the distance that the robot drives in the time of a turn by one radian.
+        """
         steps = np.maximum(np.diff(self.metres), np.diff(self.turned) * metres_per_radian)
         return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
     def until(self, length: float) -> Path:
-        """The path up to the last pose within ``length`` [m]."""
+        """Return the part of the path up to the last pose whose distance from the start is at most ``length`` [m]."""
         return Path(self.poses[self.metres <= length + 1e-9], self.kind)
 
 
-def look_around() -> Path:
-    """A full turn in place."""
+def full_turn() -> Path:
+    """Return the path of a full turn in place."""
     count = 2 * DIRECTIONS
     poses = np.zeros((count + 1, 3))
     poses[:, 2] = se2.wrap(2.0 * math.pi * np.arange(count + 1) / count)
@@ -68,9 +73,12 @@ def look_around() -> Path:
 
 
 def primitives(length: float) -> list[Path]:
-    """Paths that begin with a turn in place, one set for each of :data:`DIRECTIONS` directions. A set has a straight path and two
-    gentle arcs of ``length`` [m], and a straight path of half the length. Ahead there are also two sharper arcs. Raises
-    InputError if the length is not positive."""
+    """Return arcs and straight paths in :data:`DIRECTIONS` directions.
+
+    Each path begins with a turn in place to its direction, except those straight ahead. In each direction there are a straight path
+    and two gentle arcs of ``length`` [m], and a straight path of half this length. Straight ahead there are also two sharper arcs.
+    Raises InputError if ``length`` is not positive.
+    """
     if not (math.isfinite(length) and length > 0.0):
         raise InputError(f"horizon is {length:g} m, expected a length above 0")
     out = []
@@ -91,12 +99,12 @@ def waypoint_paths(
     beyond: float = 0.0,
     within: float = math.inf,
 ) -> list[Path]:
-    """The shortest paths through free space from ``pose`` (3,) to ``targets`` (K, 2) [m] in the world (Dijkstra, 1959),
-    straightened.
+    """Return the shortest paths through free space to targets (Dijkstra, 1959). The paths are straightened.
 
-    The robot turns in place at the start and at corners. A pose too close to a wall starts from the nearest free cell; a target
-    outside of free space, or at the robot, has no path. ``nearest``: use only this many of the nearest targets, among those from
-    ``beyond`` to ``within`` [m] away on the grid.
+    ``pose`` (3,): the start. ``targets`` (K, 2) [m]: both are in the world frame. The robot turns in place at the start and at
+    corners. A start that is too close to a wall is replaced by the nearest free cell. Targets outside of free space, and those in
+    the cell of the robot, are left out. ``nearest``: the largest number of paths; those to the nearest targets are returned.
+    ``beyond``, ``within`` [m]: only targets at distances between these values are used.
     """
     start = _nearest_cell(space, pose[:2])
     ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))
@@ -113,8 +121,10 @@ def waypoint_paths(
 
 
 def waypoints(space: FreeSpace, count: int) -> Array:
-    """At most ``count`` places (K, 2) [m] spread over free space by farthest-point sampling (Gonzalez, Theoretical Computer
-    Science 38, 1985), starting with the one farthest from walls.
+    """Return at most ``count`` places (K, 2) [m] that are spread over free space.
+
+    The first place is farthest from walls. Each further place is farthest from the previous ones (farthest-point sampling:
+    Gonzalez, Theoretical Computer Science 38, 1985).
     """
     i, j = np.nonzero(space.index >= 0)
     distance = np.empty(len(space.centres))
@@ -128,9 +138,12 @@ def waypoints(space: FreeSpace, count: int) -> Array:
 
 
 def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: int = 1) -> NDArray[np.int64]:
-    """The last pose (C, M) of each of C paths that robots at ``poses`` (M, 3) in the world reach with the clearance to walls.
+    """Return how far robots can follow paths without coming too close to walls: the index (C, M) of the last pose that is
+    reached, for each of C paths and M robots.
 
-    A robot that is too close at the start may drive away from walls. ``between``: number of collision checks per step of a path.
+    ``poses`` (M, 3): the start poses of the robots in the world frame. A robot that starts too close to a wall may drive away
+    from it.
+    ``between``: the number of collision checks between two poses of a path.
     """
     first = np.cumsum([0, *(len(path.poses) for path in paths)])
     along = np.concatenate([path.poses for path in paths]) if paths else np.empty((0, 3))
@@ -141,7 +154,7 @@ def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: i
 
 
 def arc(turn: float, curvature: float, length: float) -> Path:
-    """A turn in place [rad] and an arc of ``length`` [m] with this curvature [rad/m]."""
+    """Return the path of a turn in place by ``turn`` [rad], followed by an arc of ``length`` [m] with ``curvature`` [rad/m]."""
     count = max(1, math.ceil(length / STEP - 1e-9))
     driven = np.minimum(STEP * np.arange(count + 1), length)
     poses = se2.exp(np.column_stack((driven, np.zeros(len(driven)), curvature * driven)))
@@ -152,7 +165,8 @@ def arc(turn: float, curvature: float, length: float) -> Path:
 
 
 def _driven(pose: Array, corners: Array) -> Array:
-    """Poses (S, 3) in the frame of ``pose`` (3,) of a robot that drives through ``corners`` (N, 2) of the world."""
+    """Return the poses (S, 3) of a robot that drives through ``corners`` (N, 2) in straight lines. ``pose`` (3,): the start.
+    Corners and start are in the world frame, the result is in the frame of the start."""
     parts = [np.zeros((1, 3))]
     start = pose[:2]
     if np.hypot(*(corners[0] - start)) < 1e-9:

@@ -1,11 +1,11 @@
 """Policies that choose the path of a robot with an uncertain pose.
 
-``information``: the path with the largest expected reduction of the belief's entropy, minus its cost. ``paper_literal``: the same
-with the sign as printed in the paper, which prefers the least informative path. ``random``, ``patrol`` and ``nearest_tags`` are
-for comparison.
+``information`` chooses the path with the largest expected reduction of the belief's entropy, minus the cost of its length.
+``paper_literal`` has the opposite sign, as printed in the paper, and prefers the least informative path. ``random``, ``patrol`` and
+``nearest_tags`` are for comparison.
 
-All get the same candidates: paths whose first metre is free by the proximity sensor, and a turn in place unless the robot has
-just done one. Only policies that compare candidates use paths to distant places.
+All policies get the same candidates. These are paths whose first metre is free according to the proximity sensor, and a turn in
+place unless the robot has just turned. Only policies that compare candidates use paths to distant places.
 """
 
 import math
@@ -27,22 +27,24 @@ from factorgraph_loc.text import quoted
 from factors import se2
 from factors.se2 import Array
 
-NOTHING = 0.3  # nats: gains below are within the noise of the expectation
-FEW = 0.6  # total weight of the modes that paths may start from
-EACH, OF_MODES = 48, 96  # particles per mode, and in total
-COMMITTED = 0.5  # fraction of an arc to complete before choosing again
-FAR = "waypoint"  # kind of paths to places
-FAR_PER_METRE = 0.02  # nats: prefers the shorter of equally informative paths
-AHEAD = 1.0  # m that must be free
-BACK = math.radians(135.0)  # a turn beyond which a patrol would go back
-NEAR = 3  # tags that determine a place
+NOTHING = 0.3  # nats: a smaller gain is not significant, because the expectation is noisy
+FEW = 0.6  # distant places are evaluated if the modes have a larger total weight
+EACH, OF_MODES = 48, 96  # particles drawn from each mode, and those of them that are weighted
+COMMITTED = 0.5  # fraction of an arc that is completed before the next choice
+FAR = "waypoint"  # kind of the paths to distant places
+FAR_PER_METRE = 0.02  # nats/m: small cost, so that the shorter of equally informative paths is chosen
+AHEAD = 1.0  # m at the start of a path that must be free
+BACK = math.radians(135.0)  # a patrol turns by more than this angle only if no other direction is free
+NEAR = 3  # number of nearest tags whose mean distance is compared
 
 
 @dataclass(frozen=True)
 class Situation:
-    """The input of a policy: the belief as ``particles`` (M, 3) with ``weights`` (M,), ``sensors`` for forecasts, walls
-    (``space``), and ``candidates`` with their ``free`` (C,) length [m] within the range of the proximity sensor. ``modes``: the
-    significant ones.
+    """The input of a policy.
+
+    ``particles`` (M, 3), ``weights`` (M,): the belief. ``modes``: its significant modes. ``sensors``: predict measurements.
+    ``space``: the free space between walls. ``candidates``: C paths. ``free`` (C,) [m]: the length of each path that is free of
+    walls, at most the range of the proximity sensor.
     """
 
     particles: Array
@@ -58,8 +60,10 @@ class Situation:
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen path, None if there is none, to follow for at most ``metres``; ``values`` (C,): scores of the candidates, NaN if
-    not evaluated, or (0,) if the policy does not compare.
+    """The choice of a policy.
+
+    ``path``: the chosen path, or None if there is no candidate. ``metres`` [m]: the distance after which the policy chooses again.
+    ``values`` (C,): the scores of the candidates, NaN if not evaluated; empty if the policy does not compare candidates.
     """
 
     path: Path | None
@@ -75,10 +79,10 @@ Policy = Callable[[Situation], Choice]
 
 
 def information(s: Situation, sign: float = 1.0) -> Choice:
-    """The path by its expected information; ``sign`` -1: as printed in the paper.
+    """Choose the path with the largest expected information. ``sign``: -1 gives the policy as printed in the paper.
 
-    Near paths come first. If none is worth its cost, distant places that distinguish few possible poses are evaluated; if these
-    yield nothing either, or the pose is unknown, the robot patrols.
+    Near paths are evaluated first. If no near path is worth its cost and the belief has few modes, paths to distant places are
+    evaluated. If these are not informative either, or if the pose is unknown, the robot patrols.
     """
     settings = s.settings.policy
     if not s.sensors.forecasts or not s.candidates:
@@ -98,30 +102,32 @@ def information(s: Situation, sign: float = 1.0) -> Choice:
         values[far] = sign * gains - _costs(s, far, FAR_PER_METRE)
         if np.max(gains) >= NOTHING:
             best = s.candidates[far[int(np.argmax(values[far]))]]
-            # a long path is followed to its end, not abandoned for a small gain
+            # follow a long path to its end: do not leave it for a small gain on another path
             return Choice(best, best.length, values)
     return replace(patrol(s), metres=settings.replan)
 
 
 def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Gains (C,) with respect to the whole belief."""
+    """Return the expected information (C,) [nats] of near paths, with respect to the whole belief."""
     samples = s.settings.policy.samples
     gains = expected_gain(s.sensors, s.particles, s.weights, paths, s.rng, samples=samples, space=s.space)
     if len(s.modes) != 1:
         return gains
-    # otherwise the robot would go back and forth to compensate the noise of the odometry
+    # add the loss by the noise of the odometry: without it the robot would prefer to drive back and forth
     alone, (mode,) = replace(s.sensors, forecasts=()), s.modes
     return gains + fisher_gain(mode.pose, mode.covariance, paths, alone)
 
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Gains (C,) on the mode index, or on the position if the belief has a single mode. On a long path particles would diverge and
-    run into walls that the real robot avoids by planning again.
+    """Return the expected information (C,) [nats] of long paths about which mode is true, or about the pose if there is one mode.
+
+    The pose of particles is not evaluated. On a long path particles diverge and run into walls, which the real robot avoids by
+    planning again.
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
         return fisher_gain(mode.pose, mode.covariance, paths, s.sensors)
-    # which of equal modes is the heavier is random
+    # the square root makes the weights more equal, because small differences between modes are random
     weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
     return expected_gain(
         s.sensors,
@@ -136,22 +142,23 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
-    """Costs (K,) [nats] of the candidates ``rows`` (K,)."""
+    """Return the costs (K,) [nats] of the candidates with the indices ``rows`` (K,)."""
     return per_metre * np.array([s.candidates[i].length for i in rows])
 
 
 def random(s: Situation) -> Choice:
-    """Any of the arcs, short straight paths and turns in place, to its end."""
+    """Choose a near path or a turn in place at random, and follow it to its end."""
     arcs = [p for p in s.candidates if p.kind != FAR]
     if not arcs:
         return NO_PATH
     path = arcs[int(s.rng.integers(len(arcs)))]
-    # a turn has length 0 and needs no free space
+    # a turn in place has length 0
     return Choice(path, max(path.length, s.settings.policy.replan))
 
 
 def patrol(s: Situation) -> Choice:
-    """Straight on until a wall is near, then in the direction with the most free space; back only if nothing else is free."""
+    """Drive straight ahead until a wall is near, then in the direction with the most free space. Turn back only if no other
+    direction is free."""
     straight = [(i, p) for i, p in enumerate(s.candidates) if _is_straight(p)]
     if not straight:
         return NO_PATH
@@ -160,7 +167,7 @@ def patrol(s: Situation) -> Choice:
     if turns.min() < 1e-6 and free[turns.argmin()] > AHEAD:
         best = int(turns.argmin())
     else:
-        # the longest free path; of equal ones that with the smallest turn
+        # the longest free path; among equally long ones the path with the smallest turn
         best = int(np.lexsort((turns, -free.round(1), turns > BACK))[0])
     direction = _direction(straight[best][1])
     length = s.settings.max_metres
@@ -172,7 +179,7 @@ def patrol(s: Situation) -> Choice:
 
 
 def nearest_tags(s: Situation) -> Choice:
-    """Towards the nearest tags, on average over the belief."""
+    """Choose the path whose end is nearest to tags, on average over the belief."""
     if not len(s.sensors.goals) or not s.candidates:
         return patrol(s)
     rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
@@ -188,21 +195,25 @@ paper_literal = partial(information, sign=-1.0)
 
 
 def policy(name: str) -> Policy:
-    """The policy of this module that has the name. Raises InputError for an unknown name."""
+    """Return the policy with this name. Raises InputError for an unknown name."""
     if name not in POLICIES:
-        raise InputError(f"no policy is called {quoted(name)}{nearest(name, list(POLICIES))}")
+        raise InputError(f"policy {quoted(name)} is not known{nearest(name, list(POLICIES))}")
     chosen: Policy = load(f"{__name__}:{name}")
     return chosen
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
-    """The paths whose first metre is free, shortened to the range of the sensor, with their free lengths."""
+    """Select the paths whose first metre is free. Returns them with their free lengths.
+
+    ``free`` (C,) [m]: the free length of each path. ``sight`` [m]: the range of the proximity sensor. A path that is not free up to
+    this range is shortened to its free length.
+    """
     keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length, sight) - 1e-9]
     return tuple(paths[i].until(float(free[i])) if free[i] < sight else paths[i] for i in keep), free[keep]
 
 
 def _direction(path: Path) -> float:
-    """The direction of a straight path [rad] relative to the robot's heading."""
+    """Return the direction [rad] of a straight path relative to the robot's heading."""
     return math.atan2(*path.poses[-1, 1::-1].tolist())
 
 

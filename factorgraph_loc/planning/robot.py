@@ -1,8 +1,8 @@
-"""A simulated robot that follows commands by its own odometry and reports measurements; its proximity sensor, which compares free
-lengths in several directions with the walls of the map.
+"""A simulated robot that follows paths by its own odometry and reports measurements, and its proximity sensor.
 
-Lengths of one reading are less independent than the model assumes, as they share errors of the grid and of the walls' shape; the
-likelihood is therefore tempered (:data:`TEMPERING`).
+The proximity sensor measures the free length up to the next wall in several directions. The measured lengths of one reading are not
+independent, because the grid of free space and the shape of the walls cause common errors. The likelihood is therefore tempered
+(:data:`TEMPERING`).
 """
 
 import math
@@ -28,16 +28,20 @@ from factorgraph_loc.simulation.simulate import generator
 from factors import se2
 from factors.se2 import Array
 
-SIGMA = 0.3  # m
-UNEXPECTED = 0.05  # likelihood of an unexpected length, relative to the Gaussian's peak
-TEMPERING = 0.25
-DRAWS = ("constants", "steps", "rfid", "lengths", "landmarks")  # the order determines the random sequences
-PERIOD = 1.0 / wheels.RATE  # s, of odometry and control
-BETWEEN = 5  # collision checks per step of a path
+SIGMA = 0.3  # m: standard deviation of a measured length
+UNEXPECTED = 0.05  # likelihood of an outlier, relative to the Gaussian's peak
+TEMPERING = 0.25  # exponent of the likelihood
+# names of the random generators; append only, because the order determines the random sequences
+DRAWS = ("constants", "steps", "rfid", "lengths", "landmarks")
+PERIOD = 1.0 / wheels.RATE  # s between two rows of odometry, and between two control steps
+BETWEEN = 5  # collision checks between two poses of a path
 
 
 class ProximitySensor:
-    """Measures free lengths up to ``sight`` [m] in :data:`~factorgraph_loc.planning.paths.DIRECTIONS` directions in ``space``."""
+    """A sensor that measures the free length to the next wall in D directions around the robot, up to its range ``sight`` [m].
+
+    D is :data:`~factorgraph_loc.planning.paths.DIRECTIONS`. ``space``: the free space between walls.
+    """
 
     def __init__(self, space: FreeSpace, sight: float) -> None:
         self.space = space
@@ -45,29 +49,31 @@ class ProximitySensor:
         self._sight = sight
 
     def expected(self, poses: Array) -> Array:
-        """Expected free lengths [m] (M, D) at poses (M, 3)."""
+        """Return the expected free lengths (M, D) [m] at ``poses`` (M, 3)."""
         steps = free_steps(self.space, poses, self._rays)
         return np.stack([ray.metres[at] for ray, at in zip(self._rays, steps, strict=True)], axis=1)
 
     def read(self, pose: Array, rng: np.random.Generator) -> Array:
-        """Measured free lengths [m] (D,) at a pose (3,)."""
+        """Simulate a measurement at the true ``pose`` (3,). Returns free lengths (D,) [m]."""
         true = self.expected(pose[None])[0]
         return np.asarray(np.clip(true + SIGMA * rng.standard_normal(len(true)), 0.0, self._sight))
 
     def log_likelihood(self, poses: Array, lengths: Array) -> Array:
-        """Log-likelihood (M,) of ``lengths`` (D,) at poses (M, 3), up to a constant: a Gaussian per length plus a floor for
-        unexpected ones (after Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, section 6.3.1, but not normalised).
+        """Return the log-likelihood (M,) of the measured ``lengths`` (D,) at ``poses`` (M, 3), up to a constant.
+
+        The likelihood of a length is a Gaussian plus a constant for outliers (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005,
+        section 6.3.1, but not normalised).
         """
         errors = (self.expected(poses) - lengths) / SIGMA
         return np.asarray(TEMPERING * np.log((1.0 - UNEXPECTED) * np.exp(-0.5 * errors**2) + UNEXPECTED).sum(axis=1))
 
 
 class SimulatedRobot:
-    """A simulated robot at its true pose.
+    """A simulated robot: it follows paths, and reports odometry and measurements.
 
-    Its odometry has the errors of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`: commands are followed by
-    the reported motion, and the true motion differs. Motion and sensors use separate random sequences, so that robots of one seed
-    have the same noise as long as they drive alike.
+    Its odometry has the errors of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`. The robot controls its
+    motion by the reported odometry, so that its true motion differs from the path. Motion and sensors use separate random
+    sequences. Two robots with the same seed therefore have the same noise as long as they drive the same path.
     """
 
     def __init__(
@@ -101,39 +107,42 @@ class SimulatedRobot:
         self._truth = [(0.0, *self.pose.tolist())]
 
     def trajectory(self) -> Trajectory:
-        """The true trajectory."""
+        """Return the true trajectory since the start."""
         rows = np.array(self._truth)
         return Trajectory(rows[:, 0], rows[:, 1:])
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Channels of its measurements."""
+        """The names of the channels on which the robot reports measurements."""
         return (IncrementOdometry.sensor, *(channel for channel, _ in self._order))
 
     @property
     def decisive(self) -> tuple[str, ...]:
-        """The channels after whose measurements it checks whether it is localized."""
+        """The channels of the main sensors. After their measurements the run checks whether the robot is localized."""
         any_decides = self._order[0][1].decides
         return tuple(channel for channel, sensor in self._order if sensor.decides or not any_decides)
 
     def begin(self) -> Iterator[Measurement]:
-        """Measurements before the first motion: a row of odometry without motion, and one of each sensor."""
+        """Yield the measurements before the first motion: a row of odometry without motion, and a measurement of each sensor."""
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
         yield from self._measure()
 
     def free_ahead(self, paths: Sequence[Path]) -> Array:
-        """Free length [m] (C,) of each of C paths, within the range of the proximity sensor."""
-        # as finely as it drives: a corner may lie between two poses of a path
+        """Return the free length (C,) [m] of each of C paths, at most the range of the proximity sensor."""
+        # check as often as the control does: the corner of a wall may be between two poses of a path
         steps = free_steps(self._space, self.pose[None], paths, BETWEEN)[:, 0]
         lengths = np.array([path.metres[step] for path, step in zip(paths, steps.tolist(), strict=True)])
         return np.asarray(np.minimum(lengths, self._settings.sight))
 
     def read_proximity(self) -> Array:
-        """Free lengths [m] (D,) measured by its proximity sensor."""
+        """Return the free lengths (D,) [m] that the proximity sensor measures at the current pose."""
         return self.proximity.read(self.pose, self._lengths)
 
     def drive(self, path: Array, metres: float) -> Iterator[Measurement]:
-        """Follow a path (S, 3) in the robot's frame for at most ``metres``, not counting turns in place; stop before a wall."""
+        """Follow a path for at most ``metres`` [m], and stop before a wall. Yields the measurements on the way.
+
+        ``path`` (S, 3): poses in the frame of the robot at the start of the path.
+        """
         for reported in self._reported_motions(path, metres):
             n1, n2, n3 = self._noise.standard_normal(3)
             root = math.sqrt(math.hypot(reported[0], reported[1]))
@@ -148,19 +157,20 @@ class SimulatedRobot:
             yield from self._passed(reported)
 
     def wait(self, seconds: float) -> Iterator[Measurement]:
-        """Stand still."""
+        """Stand still for about ``seconds`` [s]. Yields the measurements in this time."""
         for _ in range(max(1, round(seconds / PERIOD))):
             yield from self._passed(np.zeros(3))
 
     def _passed(self, reported: Array) -> Iterator[Measurement]:
-        """The measurements of one period."""
+        """Advance the time by one control period, and yield its measurements. ``reported`` (3,): the motion that odometry
+        reports."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))
         yield IncrementOdometry(self.t, float(reported[0]), float(reported[1]), float(reported[2]))
         yield from self._measure()
 
     def _measure(self) -> Iterator[Measurement]:
-        """The measurements of the sensors that are due."""
+        """Yield a measurement of each sensor whose next measurement is due."""
         for i, (channel, sensor) in enumerate(self._order):
             if self.t * sensor.rate >= self._measured[i] - 1e-6:
                 self._measured[i] += 1
@@ -168,7 +178,8 @@ class SimulatedRobot:
                 yield m if kind_of(channel) == channel else replace(m, source=channel)  # type: ignore[type-var]
 
     def _reported_motions(self, path: Array, metres: float) -> Array:
-        """Reported motions (N, 3) of one period each along a path, each in the robot's frame before it."""
+        """Return the motions (N, 3) of N control periods along a path, as odometry reports them. Each is in the frame of the robot
+        before the motion."""
         twists = se2.log(se2.between(path[:-1], path[1:]))
         lengths = np.hypot(twists[:, 0], twists[:, 1])
         seconds = np.maximum(lengths / self._settings.speed, np.abs(twists[:, 2]) / self._settings.turn_rate)
@@ -182,6 +193,7 @@ class SimulatedRobot:
         return se2.between(at[:-1], at[1:])
 
     def _is_free(self, target: Array) -> bool:
-        """Whether the robot may move there: to a free cell or, from a cell that is not free, to one no nearer to a wall."""
+        """True if the robot may move to ``target`` (3,): the cell there is free. From a cell that is not free, the robot may move
+        to any cell that is not nearer to a wall."""
         ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, target))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

@@ -1,4 +1,4 @@
-"""Camera images of a simulated drive, one by one or as files of a log."""
+"""Camera images of a simulated drive: single images, or image files of a log."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -24,24 +24,25 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
-# PNG is five times as large and ten times as slow; no chroma subsampling, as features use colours
+# JPEG, because PNG is five times as large and ten times as slow. Without chroma subsampling, because features use colours
 JPEG = (
     cv2.IMWRITE_JPEG_QUALITY,
     95,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
     cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 )
-MOMENT = 0.02  # s before and after, over which the robot's velocity is averaged
-PERIODS, AMPLITUDE = (8.0, 13.0, 29.0), 0.1  # s, of waves of the brightness; relative amplitude of each
-FEW = 40  # images for which starting processes does not pay
+MOMENT = 0.02  # s before and after an image, over which the robot's velocity is averaged
+PERIODS, AMPLITUDE = (8.0, 13.0, 29.0), 0.1  # variations of the brightness: periods in s, relative amplitude of each
+FEW = 40  # so few images are rendered by one process, because to start further processes takes longer
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """N images: ``film[i]`` (H, W, 3) BGR is reproducible and independent of the order of access.
+    """The N images of a simulated drive. ``film[i]`` renders image i, (H, W, 3) BGR. The result does not depend on other images.
 
-    ``times`` (N,) [s]: of the middle of the exposure; ``stamps`` (N,): the same by the camera's clock. ``truth``: the robot's
-    trajectory. ``renderer``: renders the images and knows what each pixel shows.
+    ``times`` (N,) [s]: the times of the middle of the exposures. ``stamps`` (N,) [s]: the same times by the camera's clock.
+    ``truth``: the true trajectory of the robot. ``renderer``: renders the images, and computes the 3-D point of a pixel.
+    ``seed``: that of the image noise.
     """
 
     renderer: Renderer
@@ -70,7 +71,7 @@ class Film:
             yield stamp, self[i]
 
     def _velocity(self, t: float) -> Array:
-        """Velocity in the world frame (3,) [m/s, m/s, rad/s]."""
+        """Return the robot's velocity (3,) at time ``t`` in the world frame, in m/s, m/s and rad/s."""
         a, b = max(t - MOMENT, float(self.truth.t[0])), min(t + MOMENT, float(self.truth.t[-1]))
         earlier, later = self.truth.at(np.array((a, b)))
         change = later - earlier
@@ -84,17 +85,18 @@ class Film:
 
 
 def film(settings: SimulationSettings, seed: int) -> Film:
-    """The images of the log that :func:`~factorgraph_loc.simulation.simulate` makes of the same settings and seed.
+    """Return the images of a simulated drive. The drive is that of :func:`~factorgraph_loc.simulation.simulate` with the same
+    settings and seed.
 
-    Raises InputError if the rig has no camera, or one above the furniture.
+    Raises InputError if the rig has no camera, or if the camera is higher than the furniture.
     """
     camera = settings.rig.find(CameraSettings)
     if camera is None:
-        raise InputError(f"rig {settings.rig.name}: has no camera, expected one to take images with")
+        raise InputError(f"rig {settings.rig.name}: has no camera, which is needed for images: add a section [camera]")
     if camera.z > LOWEST_BOX:
         raise InputError(
-            f"rig {settings.rig.name}: camera.z is {camera.z:g}, expected at most {LOWEST_BOX:g} m for simulated images, "
-            "as furniture has no top side"
+            f"rig {settings.rig.name}: camera.z is {camera.z:g}, expected at most {LOWEST_BOX:g} m for simulated images: "
+            "from above, simulated furniture cannot be rendered"
         )
     world_seed = seed if settings.world_seed is None else settings.world_seed
     world = make_world(settings.world, generator(world_seed, "world"))
@@ -114,12 +116,13 @@ def with_images(
     workers: int = 1,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> Log:
-    """Write images to ``folder`` for ``log``, simulated with the same settings and seed, and return the log with them.
+    """Render the images of a simulated log into files. Returns the log with these images.
 
-    ``workers``: number of processes for many images; ``progress``: called with the number of images done and of all. Raises
-    InputError as :func:`film` does.
+    ``log``: the log that was simulated with the same ``settings`` and ``seed``. ``folder``: receives the image files.
+    ``workers``: the number of processes. ``progress``: is called with the number of finished images and the number of all images.
+    Raises InputError as :func:`film` does.
     """
-    assert log.reference is not None, "a simulated log has one"
+    assert log.reference is not None, "a simulated log has a reference"
     times = times_of(settings.images.rate, log.reference)
     count = len(times)
     if workers == 1 or count <= FEW:
@@ -139,7 +142,7 @@ def _write_in_parallel(
     workers: int,
     progress: Callable[[float, float], None],
 ) -> None:
-    """Each process makes the scene and every n-th image."""
+    """Render ``count`` images by ``workers`` processes. Each process creates the scene and renders every n-th image."""
     write = partial(_write, settings, seed, folder)
     parts = [range(i, count, workers) for i in range(workers)]
     for _, outcome in run_each(

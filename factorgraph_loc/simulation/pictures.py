@@ -1,6 +1,6 @@
-"""Procedural pictures of objects on and before the walls of a simulated building, as BGR arrays of a given size in texels.
+"""Random pictures of objects on the walls of a simulated building, as BGR arrays. Their size is given in texels (texture pixels).
 
-They are random and have corners at several scales, as print, frames and edges of colour in a real office do.
+Like print, frames and coloured objects in a real office, they have corners at several scales.
 """
 
 import colorsys
@@ -19,41 +19,41 @@ PAPER: Colour = (232, 238, 238)
 
 
 def vivid(rng: np.random.Generator) -> Colour:
-    """A saturated colour."""
+    """Return a random saturated colour."""
     return _colour(rng.random(), rng.uniform(0.3, 0.85), rng.uniform(0.3, 0.9))
 
 
 def pale(rng: np.random.Generator) -> Colour:
-    """A colour of painted walls."""
+    """Return a random colour of painted walls."""
     return _colour(rng.random(), rng.uniform(0.04, 0.2), rng.uniform(0.66, 0.88))
 
 
 def wood(rng: np.random.Generator) -> Colour:
-    """A colour of wood."""
+    """Return a random colour of wood."""
     return _colour(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.65), rng.uniform(0.4, 0.8))
 
 
 def filled(height: int, width: int, colour: Colour) -> Canvas:
-    """A canvas (H, W, 3) of one colour."""
+    """Return a picture (H, W, 3) of one colour."""
     return np.full((height, width, 3), colour, dtype=np.uint8)
 
 
 def clouds(rng: np.random.Generator, height: int, width: int, cell: float) -> NDArray[np.float32]:
-    """Smooth noise (H, W) of standard deviation about 1 that varies over ``cell`` texels."""
+    """Return smooth noise (H, W) with a standard deviation of about 1 and a correlation length of about ``cell`` texels."""
     coarse = rng.standard_normal((2 + int(height / cell), 2 + int(width / cell))).astype(np.float32)
     return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
 
 
 def shaded(canvas: Canvas, factor: NDArray[np.float32]) -> Canvas:
-    """The picture multiplied by ``factor`` (H, W)."""
+    """Return a picture multiplied by ``factor`` (H, W)."""
     out = np.empty_like(canvas)
-    for i in range(0, len(canvas), 256):  # in strips, to bound the memory
+    for i in range(0, len(canvas), 256):  # in strips, to limit the memory
         out[i : i + 256] = np.clip(canvas[i : i + 256] * factor[i : i + 256, :, None], 0.0, 255.0)
     return out
 
 
 def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
-    """Paste a picture with its upper left corner at texel (x, y), clipped to the canvas."""
+    """Paste a picture into ``canvas`` with its upper left corner at texel (x, y). Parts outside of the canvas are clipped."""
     height, width = canvas.shape[:2]
     x0, y0 = max(x, 0), max(y, 0)
     x1, y1 = min(x + picture.shape[1], width), min(y + picture.shape[0], height)
@@ -62,7 +62,7 @@ def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, int], size: int, colour: Colour) -> None:
-    """Draw lines that look like print in ``box`` (x1, y1, x2, y2): letters of 5 x 3 dots of ``size`` texels."""
+    """Draw lines of random letters in ``box`` (x1, y1, x2, y2). A letter has 5 x 3 dots of ``size`` texels."""
     x1, y1, x2, y2 = box
     letters, lines = (x2 - x1) // (4 * size), (y2 - y1) // (8 * size)
     for line in range(lines):
@@ -76,7 +76,7 @@ def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, in
 
 
 def page(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A printed sheet with a headline, lines and possibly a figure."""
+    """Return a printed sheet with a headline, lines and possibly a figure."""
     out = filled(height, width, PAPER if rng.random() < 0.6 else pale(rng))
     edge = max(2, width // 12)
     top = height // 5
@@ -90,7 +90,7 @@ def page(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def abstract(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Overlapping shapes of many sizes on a background."""
+    """Return a picture of overlapping shapes of many sizes."""
     out = filled(height, width, vivid(rng))
     for scale in (0.5, 0.5, *([0.3] * 4), *([0.15] * 6), *([0.08] * 8)):
         at, radius = rng.uniform((0, 0), (width, height)), scale * min(width, height) * rng.uniform(0.6, 1.2) + 1.0
@@ -109,7 +109,7 @@ def abstract(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def poster(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Shapes in a frame, with a title below."""
+    """Return a poster: shapes in a frame, with a title below."""
     out = filled(height, width, PAPER if rng.random() < 0.5 else vivid(rng))
     edge, foot = max(3, width // 14), height // 5
     paste(out, abstract(rng, max(height - foot - edge, 8), max(width - 2 * edge, 8)), edge, edge)
@@ -119,7 +119,7 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def landscape(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Sky, hills and houses."""
+    """Return a picture of sky, hills and houses."""
     sky, far = np.array(vivid(rng), dtype=float), np.array(PAPER, dtype=float)
     share = np.linspace(0.0, 1.0, height)[:, None, None]
     out = np.broadcast_to((1.0 - share) * sky + share * far, (height, width, 3)).astype(np.uint8)
@@ -137,7 +137,7 @@ def landscape(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def painting(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A landscape or shapes in a wooden frame."""
+    """Return a landscape or shapes in a wooden frame."""
     frame = max(3, min(height, width) // 14)
     out = filled(height, width, wood(rng))
     inner = landscape if rng.random() < 0.6 else abstract
@@ -147,7 +147,7 @@ def painting(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def board(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A pin board with sheets on it."""
+    """Return a pin board with sheets on it."""
     out = shaded(filled(height, width, wood(rng)), 1.0 + 0.05 * clouds(rng, height, width, 2.0))
     for _ in range(max(4, height * width // 5000)):
         h = int(rng.uniform(30, 62))
@@ -160,7 +160,7 @@ def board(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def whiteboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Curves, boxes and words in a few colours of pen."""
+    """Return a whiteboard with curves, boxes and words in a few colours."""
     out = filled(height, width, (238, 240, 238))
     for _ in range(6):
         colour, at = vivid(rng), rng.uniform((10, 10), (max(width - 50, 11), max(height - 40, 11))).astype(int)
@@ -179,7 +179,7 @@ def whiteboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def window(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A view through a window, flat on the wall, without parallax."""
+    """Return a window with a landscape behind it. The landscape is drawn on the wall, so it has no parallax."""
     out = filled(height, width, (225, 228, 228))
     frame, panes = 10, max(1, width // 180)
     view = shaded(landscape(rng, height, width), np.full((height, width), 1.15, dtype=np.float32))
@@ -192,7 +192,7 @@ def window(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def books(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Shelves of books with titles along the spines."""
+    """Return shelves of books."""
     side = wood(rng)
     out = filled(height, width, (int(0.4 * side[0]), int(0.4 * side[1]), int(0.4 * side[2])))
     levels = max(1, round(height / 70.0))
@@ -218,7 +218,7 @@ def books(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def cupboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Doors or drawers with handles and stickers."""
+    """Return a cupboard with doors or drawers, handles and stickers."""
     grain = 1.0 + 0.06 * cv2.resize(clouds(rng, max(height // 12, 2), width, 2.0), (width, height))
     out = shaded(filled(height, width, wood(rng) if rng.random() < 0.7 else pale(rng)), grain.astype(np.float32))
     columns, rows = max(1, round(width / 90.0)), int(rng.integers(1, 5))
@@ -237,14 +237,14 @@ def cupboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def sign(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A plate with large print, as at a door."""
+    """Return a door plate with large print."""
     out = filled(height, width, vivid(rng))
     write(out, rng, (width // 8, height // 5, width, height), max(1, height // 14), PAPER)
     return out
 
 
 def extinguisher(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """A red bottle on a plate."""
+    """Return a fire extinguisher: a red bottle on a plate."""
     out = filled(height, width, PAPER)
     cv2.rectangle(out, (width // 4, height // 3), (3 * width // 4, height - 3), (30, 30, 200), -1)
     cv2.circle(out, (width // 2, height // 3), width // 4, (30, 30, 200), -1, cv2.LINE_AA)

@@ -1,9 +1,10 @@
-"""Ray casting in a building of vertical faces, and the colours that rays hit.
+"""Ray casting in a building of vertical faces, and the colours at the hit points.
 
-For a camera position, each of :data:`BINS` directions in the plan has a list of the faces that a ray may hit, nearest first. An
-oblique surface is sampled several times along the slant, each time from the mip level whose texels match the step.
+For a camera position, each of :data:`BINS` horizontal directions has a list of the faces that a ray may hit, nearest first. A
+texture has several mip levels, each with half the resolution of the previous one. A texture on an oblique surface is sampled at
+several places along the slant, in the mip level whose texels have about the distance of these places.
 
-Functions called per ray are inlined, as numba's reference counting of arrays at each call would double the run time.
+Functions that are called for each ray are inlined. Otherwise numba's reference counting of arrays would double the run time.
 """
 
 import math
@@ -15,28 +16,33 @@ from numpy.typing import NDArray
 from factors.compiled import compiled
 from factors.se2 import Array
 
-BINS = 2048  # directions in the plan
-LEVELS = 7  # mip levels of a texture, including the first
-TAPS = 4  # maximum number of texture samples on an oblique surface
-STEEPEST = 1e3  # maximum slant
-SLACK = 1e-9  # m, overlap of adjacent faces
-NEAREST = 1e-3  # m from a face's plane, within which the face is invisible
+BINS = 2048  # horizontal directions
+LEVELS = 7  # mip levels of a texture, including the original
+TAPS = 4  # largest number of texture samples on an oblique surface
+STEEPEST = 1e3  # largest slant: the ratio by which a pixel is stretched on an oblique surface
+SLACK = 1e-9  # m: overlap of adjacent faces
+NEAREST = 1e-3  # m: a face is invisible if the camera is nearer to its plane
 
-# columns of a table of faces relative to a camera: unit normal, distance from the plane (negative behind it), unit vector
-# along, coordinate of the camera's foot point along it, length, heights, distance of the nearest point in the plan, index in
-# the scene, and the inverses of length and height
+# columns of a table of faces relative to a camera:
+# NX, NY, AWAY: unit normal of the face, and the camera's distance from its plane (negative behind it)
+# AX, AY, FOOT, LENGTH: unit vector along the face, coordinate of the camera along it, length of the face
+# BOTTOM, TOP: heights. DISTANCE: horizontal distance of the nearest point. FACE: index in the scene
+# PER_LENGTH, PER_HEIGHT: inverses of the length, and of the difference of the heights
 NX, NY, AWAY, AX, AY, FOOT, LENGTH, BOTTOM, TOP, DISTANCE, FACE, PER_LENGTH, PER_HEIGHT = range(13)
-GROUND, CEILING, NOTHING = -1, -2, -3  # in place of a row of the table
+GROUND, CEILING, NOTHING = -1, -2, -3  # values for a ray that hits no face, in place of a row of the table
 
 Ints = NDArray[np.int64]
-Place = tuple[
-    float, float, float, float, float, float
-]  # of a camera, height of the building, inverses of its width and depth
+# position of a camera (x, y, z), height of the building, inverses of its width and depth
+Place = tuple[float, float, float, float, float, float]
 
 
 class Surroundings(NamedTuple):
-    """The faces visible from ``origin`` (3,): a ``table`` (M, 13); a ray in direction b may hit its rows
-    ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth and height of the building, and the inverses of the first two.
+    """The M faces of a building that are visible from a camera position, prepared for ray casting.
+
+    ``origin`` (3,) [m]: the camera position. ``table`` (M, 13): the faces, sorted by distance; its columns are the constants of
+    this module. ``starts`` (BINS + 1,), ``items``: a ray in horizontal direction b may hit the rows ``items[starts[b] : starts[b
+    + 1]]``.
+    ``size`` (5,): width, depth and height of the building, and the inverses of width and depth.
     """
 
     origin: Array
@@ -48,7 +54,11 @@ class Surroundings(NamedTuple):
 
 @compiled(error_model="numpy")
 def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size: Array) -> Surroundings:
-    """The faces visible from ``origin`` (3,), for :func:`cast`."""
+    """Return the faces that are visible from the camera position ``origin`` (3,).
+
+    ``faces`` (F, 4), ``bottoms`` (F,), ``tops`` (F,): all faces of the building and their heights. ``size``: see
+    :class:`Surroundings`.
+    """
     table = np.empty((len(faces), 13))
     lows, highs = np.empty(len(faces)), np.empty(len(faces))
     m = 0
@@ -96,8 +106,10 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size:
 
 @compiled(inline="always", error_model="numpy")
 def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: float, dz: float) -> tuple[int, float]:
-    """The first hit of the ray along (dx, dy, dz): a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`; and
-    its distance in lengths of the ray.
+    """Return what the ray along (dx, dy, dz) hits first, and the distance of the hit point.
+
+    The result is a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`. The distance is in units of the length of
+    the vector (dx, dy, dz). Arguments: see :class:`Surroundings` and ``Place``.
     """
     best, row = np.inf, NOTHING
     x0, y0, z0, top, per_width, per_depth = place
@@ -124,7 +136,7 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
         if t < best:
             best, row = t, i
     if CEILING <= row < 0:
-        # a ray of a camera outside of the building may miss it
+        # a ray from a camera outside of the building may miss floor and ceiling
         x, y = (x0 + best * dx) * per_width, (y0 + best * dy) * per_depth
         if not (-SLACK <= x <= 1.0 + SLACK and -SLACK <= y <= 1.0 + SLACK):
             best, row = np.inf, NOTHING
@@ -133,7 +145,8 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
 
 @compiled(error_model="numpy")
 def cast_all(around: Surroundings, rays: Array) -> Array:
-    """Distances (K,) in lengths of ``rays`` (K, 3), infinite without a hit."""
+    """Return the distances (K,) of the hit points of ``rays`` (K, 3), in units of the lengths of the rays; infinite without a
+    hit."""
     distance = np.empty(len(rays))
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
@@ -154,15 +167,20 @@ def expose(
     rows: NDArray[np.int16],
     out: NDArray[np.float32],
 ) -> None:
-    """Render the building: add to ``out`` (H, W, 3) the colours of pixels in ``directions`` (H, W, 2), at depth 1 in the camera
-    frame. At edges a pixel is the mean of four rays. ``pixel_at_one``: size of a pixel at 1 m in texels; ``rows`` (H, W): work
-    array.
+    """Render an image of the building. At edges of faces, a pixel is the mean of four rays.
+
+    ``texels`` (T, 3), ``layout``: the textures, see :class:`~factorgraph_loc.simulation.renderer.TexturedScene`.
+    ``directions`` (H, W, 2): x and y of each pixel's ray at depth 1 in the camera frame. ``rotation`` (3, 3): from camera to world.
+    ``pixel_at_one``: the size of a pixel at a depth of 1 m, in texels. ``rows`` (H, W): work array.
+    ``out`` (H, W, 3): the colours are added here.
     """
     height, width = directions.shape[:2]
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
     place = (origin[0], origin[1], origin[2], size[2], size[3], size[4])
-    for edges in range(2):  # one loop for both, as inlined code takes seconds to compile
+    for edges in range(
+        2
+    ):  # first all pixels, then edges; one loop for both, because inlined code takes seconds to compile
         for i in range(height):
             for j in range(width):
                 across, along, first = 0.0, 0.0, 4
@@ -200,7 +218,7 @@ def _shade(
     rotation: Array,
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
-    """The hit along (x, y, 1) in the camera frame, as in :func:`cast`, and its colour (blue, green, red)."""
+    """Return what the ray along (x, y, 1) in the camera frame hits, as in :func:`cast`, and its colour (blue, green, red)."""
     x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
@@ -224,7 +242,7 @@ def _shade(
         slant = math.sqrt(flat * flat + dz * dz) / abs(dz)
         along_x, along_y = dx / flat, dy / flat
     slant = min(slant, STEEPEST)
-    pixel = depth * pixel_at_one  # size of a pixel at that depth, in texels, across the slant
+    pixel = depth * pixel_at_one  # size of a pixel at this depth, in texels, perpendicular to the slant
     taps = 1
     if slant * pixel > 1.0 and slant >= 1.5:
         taps = min(int(slant + 0.5), TAPS)
@@ -248,7 +266,10 @@ def _shade(
 def _sample(
     texels: NDArray[np.uint8], first: int, x: float, y: float, width: int, height: int
 ) -> tuple[np.float32, np.float32, np.float32]:
-    """Bilinear sample (blue, green, red) of a picture at ``x``, ``y`` texels from its upper left corner."""
+    """Sample a texture by bilinear interpolation at ``x``, ``y`` texels from its upper left corner. Returns blue, green, red.
+
+    ``first``: the index of its first texel in ``texels``. ``width``, ``height``: its size in texels.
+    """
     x = min(max(x - 0.5, 0.0), width - 1.0)
     y = min(max(y - 0.5, 0.0), height - 1.0)
     i, j = int(y), int(x)
@@ -269,7 +290,8 @@ def _sample(
 
 @compiled(error_model="numpy")
 def _direction(x: float, y: float) -> float:
-    """A direction in the plan as a number in [0, BINS) that grows counter-clockwise, without trigonometric functions."""
+    """Return the horizontal direction of (x, y) as a number in [0, BINS) that grows counter-clockwise. It is not proportional to
+    the angle, because that would need a trigonometric function."""
     total = abs(x) + abs(y)
     if total == 0.0:
         return 0.0
@@ -286,11 +308,11 @@ def develop(
     read: float,
     shot: float,
 ) -> NDArray[np.uint8]:
-    """The 8-bit picture (H, W, 3) of ``light`` (H, W, 3) times ``gain`` (H, W), with sensor noise of variance read^2 + shot *
-    value.
+    """Return the 8-bit image (H, W, 3) of a camera sensor, with noise.
 
-    ``noise`` (H, W, 3): random integers that select from ``quantiles`` (Q,), Q a power of two, of a distribution with unit
-    variance.
+    ``light`` (H, W, 3): the rendered colours. ``gain`` (H, W): factor of each pixel. The noise of a pixel with this value has the
+    variance read^2 + shot * value. ``noise`` (H, W, 3): random integers, which select from ``quantiles`` (Q,). Q is a power of
+    two, and the quantiles are those of a distribution with unit variance.
     """
     height, width = gain.shape
     out = np.empty((height, width, 3), dtype=np.uint8)

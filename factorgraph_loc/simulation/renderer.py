@@ -1,8 +1,8 @@
 """Camera images of a textured building, with lens distortion, exposure, noise and motion blur.
 
-The building has vertical faces, a floor and a ceiling. A face is a rectangle above a segment in the plan, visible from the
-segment's left side. Furniture is lower than the room, but higher than cameras, so that its top is never visible. Textures have mip
-levels (Williams, "Pyramidal parametrics", SIGGRAPH 1983).
+The building has vertical faces, a floor and a ceiling. A face is a rectangle above a segment of the floor plan, visible from the
+left side of the segment only. Furniture is lower than the room but higher than cameras, so that its top is never visible. Textures
+have mip levels (Williams, "Pyramidal parametrics", SIGGRAPH 1983).
 """
 
 import math
@@ -27,27 +27,29 @@ from factors.se2 import Array
 
 Image = NDArray[np.uint8]
 
-ROOM_HEIGHT = 2.7  # m
-DOOR_HEIGHT = 2.05
-HIGHEST_BOX = 2.0
-TEXEL = 0.005  # m; larger in a building that would need more than MOST_TEXELS
-MOST_TEXELS = 50e6  # three bytes each, plus a third for the mip levels
-STEP = 2.0  # px between the sub-images that are averaged to a blurred one
-MOST_STEPS = 16
-CHECKED = 8  # stride in rows and columns of the pixels whose motion is evaluated
-STILL: Array = np.zeros(3)
-# quantiles of the normal distribution: ten times as fast as drawing from it
+ROOM_HEIGHT, DOOR_HEIGHT, HIGHEST_BOX = 2.7, 2.05, 2.0  # m; boxes are furniture
+TEXEL = 0.005  # m: size of a texel; larger in a building that would need more than MOST_TEXELS
+MOST_TEXELS = 50e6  # a texel needs three bytes, and the mip levels a third in addition
+STEP = 2.0  # px: motion between two of the sub-images whose mean is a blurred image
+MOST_STEPS = 16  # sub-images
+CHECKED = 8  # rows and columns of the grid of pixels whose motion is computed
+STILL: Array = np.zeros(3)  # no motion
+# quantiles of the normal distribution: to select from these is ten times as fast as to draw normal random numbers
 _QUANTILES = ndtri((np.arange(4096) + 0.5) / 4096)
 NORMAL = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedScene:
-    """``faces`` (F, 4) [m]: segments visible from the left; ``bottoms`` and ``tops`` (F,) [m] of them.
+    """A building with textures.
 
-    ``width``, ``depth``, ``height`` [m]: of floor and ceiling. ``texels`` (T, 3): BGR of all textures and levels; ``layout`` (F
-    + 2, LEVELS, 3): first texel, width and height of each level, floor and ceiling last. Columns run along a face, left to
-    right for the viewer, rows downwards; on floor and ceiling along x and y. ``texel`` [m].
+    ``faces`` (F, 4) [m]: segments (x1, y1, x2, y2), visible from their left side. ``bottoms``, ``tops`` (F,) [m]: heights of the
+    faces.
+    ``width``, ``depth`` [m]: size of floor and ceiling. ``height`` [m]: of the ceiling.
+    ``texels`` (T, 3): the BGR colours of all mip levels of all textures. Columns of a face's texture run from left to right for the
+    viewer, rows run downwards. On floor and ceiling, columns run along x and rows along y.
+    ``layout`` (F + 2, LEVELS, 3): index of the first texel, width and height of each level of each texture. The textures of floor
+    and ceiling come last. ``texel`` [m]: the size of a texel.
     """
 
     faces: Array
@@ -62,7 +64,8 @@ class TexturedScene:
 
 
 def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> TexturedScene:
-    """The building of a plan, with random textures and heights of furniture; tags with a facing appear as small labels."""
+    """Create the building of a plan, with random textures and random heights of furniture. ``tags`` with a facing are drawn on the
+    surfaces as small labels."""
     walls, boxes = plan.faces()
     doors = np.array([side for door in plan.doors for side in both_sides(door)]).reshape(-1, 4)
     faces = np.concatenate((walls, boxes, doors))
@@ -75,7 +78,7 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
     texel = max(TEXEL, math.sqrt(area / MOST_TEXELS))
     sizes = [(max(round(z / texel), 8), max(round(x / texel), 8)) for z, x in zip(tops - bottoms, lengths, strict=True)]
     across = round(plan.depth / texel), round(plan.width / texel)
-    are_outer = ~plan.indoors((faces[:, :2] + faces[:, 2:]) / 2.0)  # the outline itself is not indoors
+    are_outer = ~plan.indoors((faces[:, :2] + faces[:, 2:]) / 2.0)  # points on the outline count as outside
 
     def drawn() -> Iterator[Canvas]:
         for i, size in enumerate(sizes):
@@ -98,7 +101,7 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
 
 
 def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:
-    """Positions [m] of the tags just before a face: distance from the viewer's left end, and height."""
+    """Yield the position of each tag on a face: the distance [m] from the end that is left for the viewer, and the height [m]."""
     along = face[2:] - face[:2]
     length = math.hypot(*along)
     along = along / length
@@ -109,14 +112,18 @@ def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:
         if tag.facing is None or not 0.0 <= s <= length or not 0.0 <= away < 0.05:
             continue
         if normal @ (math.cos(tag.facing), math.sin(tag.facing)) > 0.9:
-            # the viewer stands on the segment's left side, so its end is on the viewer's left
+            # the viewer is on the left side of the segment, so the end of the segment is on the viewer's left
             yield length - s, tag.z
 
 
 def _stored(
     sizes: Sequence[tuple[int, int]], canvases: Iterable[Canvas]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Pack canvases of the given sizes and their mip levels in one array."""
+    """Store textures and their mip levels in one array.
+
+    ``sizes``: height and width of each texture. ``canvases``: the textures. Returns ``texels`` and ``layout`` of
+    :class:`TexturedScene`.
+    """
     layout = np.empty((len(sizes), LEVELS, 3), dtype=np.int64)
     total = 0
     for i, (height, width) in enumerate(sizes):
@@ -134,8 +141,10 @@ def _stored(
 
 
 class Renderer:
-    """A camera ``model`` in a ``scene``. Poses are of the camera in the world: ``position`` (3,) and ``rotation`` (3, 3), as
-    from :func:`factors.camera.model.camera_pose` for a robot on the floor.
+    """Renders images of a ``scene`` by a camera ``model``.
+
+    Arguments ``position`` (3,) and ``rotation`` (3, 3) are the camera pose in the world frame. For a robot on the floor it can be
+    computed by :func:`factors.camera.model.camera_pose`.
     """
 
     def __init__(self, scene: TexturedScene, model: CameraModel, settings: ImageSettings | None = None) -> None:
@@ -159,8 +168,11 @@ class Renderer:
         gain: float = 1.0,
         rng: np.random.Generator | None = None,
     ) -> Image:
-        """Render a BGR image (H, W, 3). ``velocity`` (3,) [m/s] and ``turn`` (3,) [rad/s] of the camera in the world frame blur
-        it; the pose is that in the middle of the exposure. ``gain``: of the brightness. Without ``rng`` there is no noise.
+        """Render a BGR image (H, W, 3).
+
+        ``position``, ``rotation``: the camera pose in the middle of the exposure. ``velocity`` (3,) [m/s], ``turn`` (3,) [rad/s]:
+        the motion of the camera in the world frame, which blurs the image. ``gain``: factor of the brightness. ``rng``: for the
+        noise; None renders an image without noise.
         """
         shape = (self.model.height, self.model.width, 3)
         light = np.zeros(shape, dtype=np.float32)
@@ -175,7 +187,8 @@ class Renderer:
         return np.asarray(raycasting.develop(light, brightness, noise, NORMAL, read, shot))
 
     def hits(self, pixels: Array, position: Array, rotation: Array) -> Array:
-        """The world points (K, 3) shown by ``pixels`` (K, 2), NaN if there is none."""
+        """Return the points (K, 3) of the scene that are visible at ``pixels`` (K, 2), in the world frame. A row is NaN if a
+        pixel shows nothing."""
         directions = reprojection.undistorted(self.model, np.asarray(pixels, dtype=float).reshape(-1, 2))
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
         distance: Array = raycasting.cast_all(self._surroundings(position), rays)
@@ -183,7 +196,7 @@ class Renderer:
         return np.asarray(position + distance[:, None] * rays)
 
     def _moments(self, position: Array, rotation: Array, velocity: Array, turn: Array) -> Array:
-        """Times (M,) of the sub-images, about the middle of the exposure."""
+        """Return the times (M,) [s] of the sub-images of a blurred image, relative to the middle of the exposure."""
         exposure = self.settings.exposure
         u = np.linspace(0.0, self.model.width - 1.0, CHECKED)
         v = np.linspace(0.0, self.model.height - 1.0, CHECKED)
@@ -215,5 +228,5 @@ class Renderer:
 
 
 def _turned(rotation: Array, turn: Array) -> Array:
-    """``rotation`` (3, 3) after a rotation vector (3,) [rad] in the world frame."""
+    """Return ``rotation`` (3, 3), turned by the rotation vector ``turn`` (3,) [rad] in the world frame."""
     return np.ascontiguousarray(np.asarray(gtsam.Rot3.Expmap(turn).matrix()) @ rotation)

@@ -1,4 +1,4 @@
-"""Settings of a simulation (world, drive, sensors, faults), presets, and files that change a preset."""
+"""Settings of a simulation: world, drive, sensors and faults. They come from presets, and from files that change a preset."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ from factorgraph_loc.sensors.registry import functions, sensors
 from factorgraph_loc.text import quoted
 
 MOST_TAGS = 10_000
-MOST_OBSERVATIONS = 50_000_000  # maximum number of simulated observations of one kind, which are all in memory
+MOST_OBSERVATIONS = 50_000_000  # largest number of simulated observations of one kind, to limit the memory
 Surface = Literal["wall", "shelf", "floor"]
 
 
 class WorldSettings(FileModel):
-    """A plan of rooms from the origin and its content, with either ``tags`` or ``density``."""
+    """Settings of the building and its tags, landmarks and points. Either ``tags`` or ``density`` must be given."""
 
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
-    """hall: one empty room; corridors: an H with a half-turn symmetry and three hanging tags, which alone distinguish its ends"""
+    """floor plan; office: rooms at a corridor. hall: one empty room. warehouse: rows of shelves. corridors: an H with a half-turn
+    symmetry, whose ends differ only by three hanging tags"""
     width: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 20.0
-    """size along x"""
+    """size of the building along x"""
     depth: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 12.0
-    """size along y"""
+    """size of the building along y"""
     tags: Annotated[int, Field(ge=0, le=MOST_TAGS)] | None = None
     """number of tags"""
     density: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("tags per m^2")] | None = None
     """density of tags, instead of their number"""
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)] = ("wall", "shelf")
-    """where tags are; shelf includes furniture"""
+    """surfaces that tags are placed on; shelf includes furniture"""
     tag_height: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 1.2
     """height of the tags that are not on the floor"""
     even: bool = False
@@ -44,14 +45,14 @@ class WorldSettings(FileModel):
     landmarks: Annotated[int, Field(ge=0, le=10_000)] = 0
     """number of landmarks on the walls"""
     points: Annotated[int, Field(ge=0, le=10_000)] = 0
-    """number of named points on walls and furniture for a camera"""
+    """number of named points on walls and furniture, which a camera observes"""
 
     @model_validator(mode="after")
     def _has_one_number(self) -> WorldSettings:
         if (self.tags is None) == (self.density is None):
-            raise ValueError("expected either tags or density")
+            raise ValueError("has both or neither of tags and density, expected exactly one of them")
         if self.tag_count() > MOST_TAGS:
-            raise ValueError(f"density makes {self.tag_count():,} tags, expected at most {MOST_TAGS:,}")
+            raise ValueError(f"density results in {self.tag_count():,} tags, expected at most {MOST_TAGS:,}")
         return self
 
     def tag_count(self) -> int:
@@ -61,7 +62,7 @@ class WorldSettings(FileModel):
 
 
 class DriveSettings(FileModel):
-    """A drive between random places."""
+    """Settings of the drive of the robot between random places."""
 
     duration: Annotated[float, Field(ge=1.0, le=36_000.0), InUnit("s")] = 600.0
     """duration of the log"""
@@ -70,39 +71,43 @@ class DriveSettings(FileModel):
     turn_rate: Annotated[float, Field(ge=0.01, le=6.0), InUnit("rad/s")] = 1.0
     """highest turn rate"""
     rate: Annotated[float, Field(ge=10.0, le=50.0), InUnit("1/s")] = 10.0
-    """poses of the reference per second"""
+    """rate of the poses of the reference trajectory"""
     clearance: Annotated[float, Field(ge=0.25, le=2.0), InUnit("m")] = 0.3
-    """least distance of the path from walls"""
+    """least distance of the robot's path from walls"""
 
 
 class ImageSettings(FileModel):
-    """Images of the rendered building. The noise of a pixel of value v (0 to 255) has the variance ``read_noise``^2 +
+    """Settings of the simulated images. A pixel of value v (0 to 255) has noise of the variance ``read_noise``^2 +
     ``shot_noise`` v."""
 
     rate: Hertz = 5.0
     """images per second"""
     exposure: Annotated[float, Field(ge=0.0, le=0.2), InUnit("s")] = 0.005
-    """exposure time, which blurs what moves; stamps are in the middle of it"""
+    """exposure time, which causes motion blur; the stamp of an image is the middle of its exposure"""
     read_noise: Annotated[float, Field(ge=0.0, le=50.0), InUnit("of 255")] = 1.5
-    """standard deviation of a dark pixel"""
+    """standard deviation of the noise of a black pixel"""
     shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """additional variance of a pixel per unit of its value"""
+    """additional variance of the noise of a pixel, per unit of its value"""
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.3
-    """relative loss of brightness at the corners"""
+    """relative loss of brightness in the corners of the image"""
 
 
 class SimulationSettings(FileModel):
-    """All settings but the seed. Sensors register further sections: ``sightings``, ``rssi`` and ``phase`` of reads, ``faults`` of
-    them, ``pixels``."""
+    """All settings of a simulation except the seed.
+
+    Sensors register further sections: ``sightings`` of landmarks, ``rssi`` and ``phase`` of RFID reads, ``faults`` of RFID reads,
+    and ``pixels`` of points.
+    """
 
     name: str = "office"
     """name of the log"""
     world: WorldSettings
     world_seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
-    """seed of the world, its appearance and its survey, for several drives in one world; by default the seed of the log"""
+    """seed of the building, its textures and the surveyed positions of tags, for several drives in one world; without it the seed
+    of the log is used"""
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
-    """inventory rounds of each antenna"""
+    """inventory rounds of each RFID antenna per second"""
     images: ImageSettings = ImageSettings()
     rig: Rig
 
@@ -116,12 +121,13 @@ class SimulationSettings(FileModel):
         for what, count in self.observation_counts().items():
             if count > MOST_OBSERVATIONS:
                 raise ValueError(
-                    f"{what} are observed {count:,.0f} times in all, expected at most {MOST_OBSERVATIONS:,}"
+                    f"{what} are observed {count:,.0f} times in total, expected at most {MOST_OBSERVATIONS:,}: "
+                    "reduce drive.duration or a rate"
                 )
         return self
 
     def observation_counts(self) -> dict[str, float]:
-        """The number of simulated observations of tags, landmarks and points, summed over all objects of a kind. Raises
+        """Return the expected number of simulated observations of each kind of objects (tags, landmarks, points). Raises
         ValueError if the settings are inconsistent.
         """
         counts: dict[str, float] = {}
@@ -143,7 +149,7 @@ def _add_sections() -> None:
 _add_sections()
 
 
-# eight antennas at the tags' height; the odometry's noise is that of wheel_odometry
+# the robot Rackham: eight antennas at the height of the tags, odometry with the noise of the simulated wheels
 RACKHAM_RIG: Mapping[str, Any] = {
     "name": "rackham",
     "sensors": ["odometry", "rfid"],
@@ -163,7 +169,7 @@ RACKHAM_RIG: Mapping[str, Any] = {
         "tempering": 1.0,
     },
     "bearing_range": {"range_sigma": 0.05, "range_sigma_relative": 0.02, "bearing_sigma": 0.02},
-    # slightly upwards: walls have more texture than floors
+    # the camera is pitched slightly upwards, because walls have more texture than floors
     "camera": {
         "fx": 410.0,
         "fy": 411.0,
@@ -176,21 +182,23 @@ RACKHAM_RIG: Mapping[str, Any] = {
     },
 }
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
-# Fades affect a fraction f of the time and have the mean duration d. p: probability of a read outside of fades. Relative to
-# independent rounds they increase the variance of the number of reads in many rounds at intervals dt by 1 + 2 rho / (1 - rho) f p
-# / (1 - (1 - f) p), with rho = exp(-dt / (d (1 - f))): 1.9 at p = 0.5. The inverse is too conservative as a tempering, since the
-# robot moves. This tempering makes the smoother's causal ANEES 3: 3.0 over six runs of 300 s, 2.8 at 0.6.
+# Reads with fades, in which a tag is not read for some time. Fades affect the fraction f of the time and have the mean duration
+# d. p is the probability of a read outside of fades. Fades increase the variance of the number of reads in many rounds at
+# intervals dt, by the factor 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p), with rho = exp(-dt / (d (1 - f))). This is 1.9 at p =
+# 0.5. The inverse would be too small as a tempering exponent, because the robot moves. With the exponent 0.7 the causal ANEES of
+# the smoother is 3.0 over six runs of 300 s, which is the ideal value. With 0.6 it is 2.8.
 _BURSTY: Mapping[str, Any] = {
     "faults": {"fading": {"duration": 2.0, "share": 0.2}},
     "rig": {"rfid": {"miss": 0.2, "tempering": 0.7}},
 }
 
 
-EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # setting one removes the other
+EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # pairs of keys: a change that sets one key removes the other
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``changes``, merged recursively; a table of another ``kind`` replaces the old one."""
+    """Merge nested tables. Returns ``base`` with the values of ``changes``. A table in ``changes`` with another ``kind`` replaces
+    the whole table in ``base``."""
     if "kind" in changes and changes["kind"] != base.get("kind"):
         return dict(changes)
     out = dict(base)
@@ -224,14 +232,17 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """The settings of a preset, with ``changes`` as nested tables. Raises InputError for a wrong preset, key or value."""
+    """Return the settings of a preset. ``changes``: nested tables of keys that differ from the preset. Raises InputError for a
+    wrong preset, key or value."""
     content = merged(_preset(name, "the settings"), changes or {})
     return parse_model(SimulationSettings, content, "the settings")
 
 
 def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """Read settings from a TOML file: ``preset`` (default office), and changes to it. ``rig`` may name a file below the folder.
-    Raises InputError with file, key and what is expected.
+    """Read settings from a TOML file, and apply ``changes``, which are nested tables.
+
+    The key ``preset`` of the file names the preset that the file changes, office if missing. The key ``rig`` may be the path of a
+    rig file in the folder of the settings file. Raises InputError for a file that is not valid.
     """
     content = read_toml(path)
     base = _preset(content.pop("preset", "office"), path)
@@ -246,7 +257,7 @@ def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> Simul
 
 
 def named_settings(what: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """The settings of a preset, or of a file if ``what`` looks like a path."""
+    """Return the settings of the preset ``what``, or of the file ``what`` if it ends with ``.toml``. ``changes``: nested tables."""
     return read_settings(Path(what), changes) if what.endswith(".toml") else preset(what, changes)
 
 

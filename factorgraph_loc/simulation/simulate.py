@@ -1,7 +1,7 @@
-"""Simulation of a log: world, drive and measurements from one seed.
+"""Simulation of a log: world, drive and measurements.
 
-A robot follows shortest paths between random places. Each part has a random generator of its own, so that a change to one does
-not affect the others.
+A robot follows shortest paths between random places. The simulation is reproducible from one seed. World, drive and each sensor
+have random generators of their own, so that a change to one of them does not affect the random numbers of the others.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from factorgraph_loc.version import __version__
 from factors import se2
 from factors.se2 import Array
 
-# of a log; append only, as their numbers determine the sequences
+# names of the random generators of a log; append only, because the index of a name determines its random sequence
 NAMES = (
     "world",
     "drive",
@@ -46,13 +46,15 @@ NAMES = (
 LOOKAHEAD = 0.3  # m: distance of the point of the path that the robot steers towards
 STEP = 0.02  # s, control period
 GAIN = 4.0  # rad/s per rad of heading error
-START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad
+START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations of the stated start pose
 
 
 def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.random.Generator:
-    """A generator for ``name``, seeded by its index among ``names`` or else by its hash.
+    """Return the random generator called ``name``. Generators with different names are independent.
 
-    ``seed``: a number, or the seed sequence of another generator.
+    ``seed``: a number, or the seed sequence of another generator. The generator is seeded by ``seed`` and by the index of
+    ``name`` in
+    ``names``, or by the hash of ``name`` if it is not in ``names``.
     """
     digest = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])
     key = names.index(name) if name in names else digest
@@ -61,7 +63,10 @@ def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.
 
 
 def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Trajectory:
-    """Poses at ``settings.rate`` from t = 0 to the duration, of a robot that drives between random places."""
+    """Simulate a robot that drives between random places of a world. Returns its poses at ``settings.rate``, starting at t = 0.
+
+    Raises InputError if the world has no room to drive in.
+    """
     space = free_space(world, settings.clearance)
     start = int(rng.integers(len(space.centres)))
     length, parts = 0.0, [space.centres[start][None]]
@@ -69,7 +74,9 @@ def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Tr
         goal = int(rng.integers(len(space.centres)))
         if goal == start:
             if len(space.centres) == 1:
-                raise InputError(f"world {world.name}: has no room to drive in, expected a larger one")
+                raise InputError(
+                    f"world {world.name}: has no room to drive in: make it larger, or reduce drive.clearance"
+                )
             continue
         leg = dense(shortest_path(space, start, goal))
         length += SPACING * len(leg)
@@ -81,7 +88,10 @@ def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Tr
 
 
 def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
-    """Pure pursuit: turn towards a point ahead on the path, and slow down for large heading errors."""
+    """Follow a path (N, 2) by pure pursuit: turn towards a point ahead on the path, and slow down if the heading error is large.
+
+    ``heading`` [rad]: that of the start pose. Returns the driven poses.
+    """
     every = max(1, round(1.0 / (settings.rate * STEP)))
     step = 1.0 / (settings.rate * every)
     count = int(settings.duration * settings.rate + 1e-9)
@@ -104,12 +114,11 @@ def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
 
 
 def simulate(settings: SimulationSettings, seed: int) -> Log:
-    """Simulate a log; the same ``settings`` and ``seed`` give the same log to the last bit.
+    """Simulate a log. The same ``settings`` and ``seed`` give exactly the same log.
 
-    Streams: odometry, rfid, bearing_range if the world has landmarks, sightings if it has points, and those of sensors from
-    other packages. The reference is the true trajectory. The stated start is the true pose plus an error drawn from its
-    covariance (:data:`START_SIGMAS`). World, drive and sensors use independent random generators. Raises InputError if there is no
-    space for the tags or for the robot.
+    The log has the streams odometry and rfid, bearing_range if the world has landmarks, sightings if it has points, and streams of
+    sensors from plugins. Its reference is the true trajectory. Its stated start is the true start pose plus a random error with the
+    standard deviations :data:`START_SIGMAS`. Raises InputError if the world has no room for the tags or for the robot.
     """
     of_world = seed if settings.world_seed is None else settings.world_seed
     world = make_world(settings.world, generator(of_world, "world"))
@@ -134,7 +143,10 @@ def simulate(settings: SimulationSettings, seed: int) -> Log:
 
 
 def simulated(function: Callable[[Ride], Simulated], ride: Ride, name: str) -> Simulated:
-    """The measurements of a sensor. Each of several of a kind, by ``name``, has random generators of its own."""
+    """Simulate the measurements of the sensor ``name`` by its ``function``.
+
+    A rig may have several sensors of one kind, with names such as ``camera.front``. Each of them has random generators of its own.
+    """
     kind, _, own = name.partition(".")
     if not own:
         return function(ride)
@@ -144,6 +156,6 @@ def simulated(function: Callable[[Ride], Simulated], ride: Ride, name: str) -> S
 
 
 def with_sensors(rig: Rig, streams: Iterable[str]) -> Rig:
-    """The rig with the channels of the log as the sensors that estimators use by default."""
+    """Return the rig with the channels of a log added to ``rig.sensors``, the sensors that estimators use by default."""
     sensors = (*rig.sensors, *(name for name in streams if name not in rig.sensors))
     return rig.model_copy(update={"sensors": sensors})

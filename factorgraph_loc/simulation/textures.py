@@ -1,4 +1,4 @@
-"""Textures of a simulated building: walls, furniture, floor and ceiling."""
+"""Random textures of a simulated building: walls, furniture, floor and ceiling. ``texel`` [m] is the size of a texel."""
 
 import cv2
 import numpy as np
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.simulation import pictures
 from factorgraph_loc.simulation.pictures import Canvas, Draw
 
-# objects on walls: probability, ranges of width and height [m], and range of the height of the centre
+# objects on walls: function that draws it, probability, ranges of width and height [m], range of the height of its centre [m]
 HANGING: tuple[tuple[Draw, float, tuple[float, float], tuple[float, float], tuple[float, float]], ...] = (
     (pictures.poster, 0.28, (0.4, 0.9), (0.5, 1.1), (1.2, 1.7)),
     (pictures.painting, 0.2, (0.4, 1.2), (0.35, 0.9), (1.2, 1.8)),
@@ -19,13 +19,13 @@ HANGING: tuple[tuple[Draw, float, tuple[float, float], tuple[float, float], tupl
     (pictures.extinguisher, 0.04, (0.22, 0.25), (0.5, 0.6), (0.7, 0.9)),
 )
 GAP = (0.05, 0.35)  # m between adjacent objects
-SKIRTING = 0.1  # m
-SMALL = (0.03, 0.12)  # m: size of sockets, switches, stickers, stains
-TILE = 0.6  # m, of floor and ceiling
+SKIRTING = 0.1  # m: height of the skirting board
+SMALL = (0.03, 0.12)  # m: range of the sizes of sockets, switches, stickers and stains
+TILE = 0.6  # m: size of the tiles of floor and ceiling
 
 
 def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, windows: bool) -> Canvas:
-    """A painted wall with objects, most of them at eye level; with ``windows``, some are windows."""
+    """Return the texture of a painted wall with objects, most of them at eye level. ``windows``: some objects are windows."""
     out = _painted(rng, height, width, texel)
     tall = height * texel
     x = rng.uniform(*GAP)
@@ -46,7 +46,7 @@ def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, win
 
 
 def lintel(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """The wall above a door: a plate and the upper edge of the frame."""
+    """Return the texture of the wall above a door, with a plate and the upper edge of the door frame."""
     out = _painted(rng, height, width, texel)
     plate = pictures.sign(rng, max(height // 3, 8), max(width // 2, 16))
     _hang(out, plate, width // 4, height // 3)
@@ -55,13 +55,13 @@ def lintel(rng: np.random.Generator, height: int, width: int, texel: float) -> C
 
 
 def furniture(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """One side of a cupboard or book shelf."""
+    """Return the texture of one side of a cupboard or book shelf."""
     draw = pictures.books if rng.random() < 0.5 else pictures.cupboard
     return draw(rng, height, width)
 
 
 def floor(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """Carpet tiles of a few shades, with threads, stains and scraps."""
+    """Return the texture of a floor: carpet tiles of a few shades, with threads, stains and scraps."""
     shade = np.array(_dull(rng))
     shades = shade * rng.uniform(0.75, 1.25, (4, 1)) + rng.uniform(-8.0, 8.0, (4, 3))
     side = round(TILE / texel)
@@ -86,7 +86,7 @@ def floor(rng: np.random.Generator, height: int, width: int, texel: float) -> Ca
 
 
 def ceiling(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """Panels in a grid: plain ones, lamps, vents, and a few with stains."""
+    """Return the texture of a ceiling: a grid of plain panels, lamps, vents and panels with stains."""
     out = pictures.shaded(pictures.filled(height, width, (196, 202, 202)), 1.0 + 0.02 * _grain(rng, height, width))
     side = round(TILE / texel)
     for y in range(0, height, side):
@@ -106,7 +106,7 @@ def ceiling(rng: np.random.Generator, height: int, width: int, texel: float) -> 
 
 
 def label(rng: np.random.Generator, texel: float) -> Canvas:
-    """An RFID tag: a white label with its antenna."""
+    """Return the texture of an RFID tag: a white label with its antenna."""
     width, height = round(0.1 / texel), round(0.04 / texel)
     out = pictures.filled(height, width, pictures.PAPER)
     out[height // 2, 2:-2] = pictures.INK
@@ -116,7 +116,7 @@ def label(rng: np.random.Generator, texel: float) -> Canvas:
 
 
 def _painted(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """One colour, or two with a border at about table height."""
+    """Return the texture of a wall in one colour, or in two colours with a border at about table height."""
     out = pictures.filled(height, width, pictures.pale(rng))
     if rng.random() < 0.4:
         below = height - round(rng.uniform(0.7, 1.1) / texel)
@@ -127,7 +127,7 @@ def _painted(rng: np.random.Generator, height: int, width: int, texel: float) ->
 
 
 def _hang(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
-    """Paste with a shadow to the right and below."""
+    """Paste ``picture`` at texel (x, y), with a shadow to the right and below."""
     height, width = picture.shape[:2]
     shadow = canvas[y + 3 : y + height + 3, x + 3 : x + width + 3]
     shadow[:] = (shadow * 0.7).astype(np.uint8)
@@ -135,7 +135,7 @@ def _hang(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def _low(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
-    """Sideboards, low shelves and stacks of paper at the foot of the wall, drawn flat."""
+    """Draw sideboards and low shelves at the foot of a wall."""
     height, width = canvas.shape[:2]
     x = rng.uniform(0.0, 1.0)
     while x < width * texel - 0.4:
@@ -146,7 +146,7 @@ def _low(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
 
 
 def _small_things(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
-    """Sockets, switches, vents and stickers at random positions, five per metre."""
+    """Draw sockets, switches, vents and stickers at random positions of a wall, five per metre."""
     height, width = canvas.shape[:2]
     for _ in range(int(5.0 * width * texel)):
         h, w = (max(3, round(rng.uniform(*SMALL) / texel)) for _ in range(2))
@@ -157,7 +157,7 @@ def _small_things(canvas: Canvas, rng: np.random.Generator, texel: float) -> Non
 
 
 def _lit(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
-    """Ceiling light: bright spots along the wall, darker in the corners and near the floor."""
+    """Return the texture of a wall in the light of the ceiling: with bright spots, and darker in the corners and near the floor."""
     height, width = canvas.shape[:2]
     factor = 1.0 + 0.05 * pictures.clouds(rng, height, width, 1.5 / texel)
     factor *= np.linspace(1.05, 0.85, height, dtype=np.float32)[:, None]
@@ -167,13 +167,13 @@ def _lit(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
 
 
 def _grain(rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
-    """Fine noise of unit variance with a period of 512 texels, too weak to be recognized."""
+    """Return fine noise (H, W) of unit variance. It repeats every 512 texels, which is not visible at small amplitudes."""
     tile = rng.standard_normal((512, 512)).astype(np.float32)
     return np.asarray(np.tile(tile, (height // 512 + 1, width // 512 + 1))[:height, :width])
 
 
 def _dull(rng: np.random.Generator) -> pictures.Colour:
-    """A colour of carpets."""
+    """Return a random colour of carpets."""
     share = rng.uniform(0.3, 0.6)
     blue, green, red = pictures.pale(rng)
     return int(share * blue), int(share * green), int(share * red)

@@ -1,4 +1,4 @@
-"""Worlds: floor plans of walls, furniture and shelves as segments, with tags, landmarks and points placed on them."""
+"""Simulated worlds: floor plans of walls, furniture and shelves, and the tags, landmarks and points on them."""
 
 import math
 from dataclasses import dataclass
@@ -17,23 +17,26 @@ from factors.se2 import Array
 
 Segment = tuple[float, float, float, float]
 ROOM_WIDTH = 5.0  # m, approximate
-CORRIDOR_WIDTH = 2.0
-DOOR_WIDTH = 1.0
-SHELF_DEPTH = 1.0
-AISLE_WIDTH = 3.0
-HALL_WIDTH = 3.0  # m, of the corridors of the H-shaped plan
-FROM_END = 2.0  # m, of a tag from the end of a corridor
+CORRIDOR_WIDTH = 2.0  # m
+DOOR_WIDTH = 1.0  # m
+SHELF_DEPTH = 1.0  # m
+AISLE_WIDTH = 3.0  # m
+HALL_WIDTH = 3.0  # m: width of the corridors of the H-shaped plan
+FROM_END = 2.0  # m: distance of a hanging tag from the end of its corridor
 LOWEST_BOX = 1.4  # m: least height of furniture and shelves
-STANDOFF = 0.02  # m, of a tag or point from its surface
-POINT_HEIGHTS = (0.3, 2.2)  # m, range on walls
+STANDOFF = 0.02  # m: distance of a tag or point from its surface
+POINT_HEIGHTS = (0.3, 2.2)  # m: range of the heights of points on walls
 IN_FRONT = 0.3  # m of free space needed before a tag
-CANDIDATES = 10  # candidate places for each tag; the farthest from the other tags is chosen
+CANDIDATES = 10  # random places for each tag; the one farthest from the other tags is chosen
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Outline and inner walls, ``boxes`` (furniture, shelves, closed rooms) as (x1, y1, x2, y2), and ``doors``, gaps in walls,
-    all in metres; ``hanging``: positions (x, y) of hanging tags, which replace tags on surfaces.
+    """The floor plan of a building. All lengths are in metres, segments and boxes are (x1, y1, x2, y2).
+
+    ``width``, ``depth``: the size along x and y; a corner is at the origin. ``walls``: the outline and inner walls.
+    ``boxes``: furniture, shelves and closed rooms. ``doors``: gaps in walls.
+    ``hanging``: positions (x, y) of hanging tags. If there are any, no tags are placed on surfaces.
     """
 
     width: float
@@ -44,18 +47,19 @@ class Plan:
     hanging: tuple[tuple[float, float], ...] = ()
 
     def segments(self) -> Array:
-        """All segments (S, 4) that block motion and sight."""
+        """Return all segments (S, 4) that block motion and sight."""
         return np.array([*self.walls, *(side for box in self.boxes for side in _sides(box))])
 
     def faces(self) -> tuple[Array, Array]:
-        """The sides of walls and of boxes as segments (F, 4) with the free side on the left. Inner walls have two."""
+        """Return the faces of walls and the faces of boxes, each as segments (F, 4) with the free side on their left. An inner
+        wall has two faces."""
         walls = np.array([face for wall in self.walls for face in both_sides(wall)]).reshape(-1, 4)
         middles = _places(walls, np.full(len(walls), 0.5))[:, :2]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
         return walls[self.indoors(middles)], np.array(boxes).reshape(-1, 4)
 
     def open(self, points: Array) -> NDArray[np.bool_]:
-        """Whether points (N, 2) are inside the building and outside of all boxes."""
+        """Return a mask (N,) of the ``points`` (N, 2) that are inside the building and outside of all boxes."""
         x, y = points.T
         out = self.indoors(points)
         for x1, y1, x2, y2 in self.boxes:
@@ -63,19 +67,19 @@ class Plan:
         return np.asarray(out)
 
     def indoors(self, points: Array) -> NDArray[np.bool_]:
-        """Whether points (N, 2) are inside the building."""
+        """Return a mask (N,) of the ``points`` (N, 2) that are inside the outline of the building."""
         x, y = points.T
         return np.asarray((x > 0.0) & (x < self.width) & (y > 0.0) & (y < self.depth))
 
 
 def both_sides(segment: Segment) -> tuple[Segment, Segment]:
-    """The segment and its reverse."""
+    """Return the segment and the reversed segment."""
     x1, y1, x2, y2 = segment
     return segment, (x2, y2, x1, y1)
 
 
 def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
-    """Make the plan named in ``settings``, with random doors and furniture."""
+    """Return the floor plan named in ``settings``, with random doors and furniture."""
     width, depth = settings.width, settings.depth
     outline = tuple(_sides((0.0, 0.0, width, depth)))
     if settings.plan == "hall":
@@ -88,9 +92,10 @@ def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
 
 
 def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
-    """Rooms on both sides of a corridor along x, each with a door to it and two pieces of furniture at its outer corners."""
+    """Return the plan of an office: rooms on both sides of a corridor along x. Each room has a door to the corridor and, if it is
+    large enough, furniture in its two outer corners."""
     if width < 4.0 or depth < 6.0:
-        raise InputError(f"world: an office of {width:g} x {depth:g} m has no rooms, expected at least 4 x 6 m")
+        raise InputError(f"world: {width:g} x {depth:g} m is too small for an office, expected at least 4 x 6 m")
     rooms = max(1, round(width / ROOM_WIDTH))
     low, high = (depth - CORRIDOR_WIDTH) / 2.0, (depth + CORRIDOR_WIDTH) / 2.0
     edges = np.linspace(0.0, width, rooms + 1)
@@ -108,7 +113,10 @@ def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.ra
 
 
 def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.random.Generator) -> list[Segment]:
-    """A cupboard in each outer corner of a room that is large enough to drive past them."""
+    """Return a cupboard for each outer corner of a room, as boxes. Returns none if the room is too small to drive past them.
+
+    ``span``: the x range of the room. ``inner``, ``outer``: the y coordinates of its walls at the corridor and at the outline.
+    """
     left, right = span
     deep, wide = abs(inner - outer), right - left
     if deep < 3.5 or wide < 4.0:
@@ -123,7 +131,7 @@ def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.ra
 
 
 def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
-    """Rows along x with aisles between them, long ones interrupted in the middle."""
+    """Return rows of shelves along x, with aisles between them. Long rows have a gap in the middle."""
     rows = max(1, math.floor((depth - AISLE_WIDTH) / (SHELF_DEPTH + AISLE_WIDTH)))
     pitch = (depth - rows * SHELF_DEPTH) / (rows + 1)
     margin = min(AISLE_WIDTH, width / 4.0)
@@ -135,10 +143,11 @@ def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
 
 
 def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
-    """An H with a half-turn symmetry: a corridor along x and one across each of its ends; the rest are closed rooms.
+    """Return an H-shaped plan with a half-turn symmetry: a corridor along x and a corridor across each of its ends. The rest of the
+    building are closed rooms.
 
-    A tag is in the middle, and one in an arm at each end, in opposite arms. Seen from the middle, both are on the left or both on
-    the right, at random.
+    One tag hangs in the middle of the H. Two more tags hang in opposite arms at its ends. As seen from the middle, both are on
+    the left or both are on the right. The side is random.
     """
     if width < 4.0 * HALL_WIDTH or depth < 3.0 * HALL_WIDTH:
         raise InputError(
@@ -156,16 +165,17 @@ def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np
 
 
 def _sides(box: Segment) -> list[Segment]:
-    """The four sides of a box, its inside on the left."""
+    """Return the four sides of a box as segments with the inside of the box on their left."""
     x1, y1, x2, y2 = box
     return [(x1, y1, x2, y1), (x2, y1, x2, y2), (x2, y2, x1, y2), (x1, y2, x1, y1)]
 
 
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
-    """A world with walls (including furniture and shelves), tags ``T000``..., landmarks ``L000``... and points ``P0000``....
+    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Its walls include the sides of
+    furniture and shelves.
 
-    Tags on surfaces face away from them; hanging tags and those on the floor (at height 0) have no facing. Raises InputError if
-    the plan lacks the surfaces.
+    A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no facing. Raises
+    InputError if the plan has too few places for the tags.
     """
     plan = make_plan(settings, rng)
     tags: dict[str, Tag] = {}
@@ -174,7 +184,7 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     upright = [faces for name, faces in (("wall", walls), ("shelf", boxes)) if name in settings.surfaces]
     faces = np.concatenate(upright) if upright else np.empty((0, 4))
     if settings.surfaces == ("shelf",) and not len(faces):
-        raise InputError(f"world: plan {settings.plan} has no shelves of this size, expected other surfaces")
+        raise InputError(f"world: plan {settings.plan} of this size has no shelves for tags: change surfaces")
     if plan.hanging and count > len(plan.hanging):
         raise InputError(f"world: tags is {count}, expected at most {len(plan.hanging)} in plan {settings.plan}")
     on_floor = 0
@@ -199,10 +209,10 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
 
 
 def _distribute(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
-    """``count`` places (x, y, direction away from the surface) along ``faces`` (F, 4), none behind furniture.
+    """Distribute ``count`` places over ``faces`` (F, 4). Returns (count, 3): x, y, and the direction away from the face.
 
-    Best-candidate sampling (Mitchell, SIGGRAPH 1991): each place is the farthest from the previous ones among
-    :data:`CANDIDATES`, which are uniform per metre.
+    For each place, :data:`CANDIDATES` places are drawn uniformly along the faces. The one farthest from the previous places is
+    chosen (best-candidate sampling: Mitchell, SIGGRAPH 1991). Places behind furniture are not chosen.
     """
     out = np.empty((count, 3))
     length = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
@@ -217,7 +227,8 @@ def _distribute(plan: Plan, faces: Array, count: int, rng: np.random.Generator) 
 
 
 def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.Generator) -> PointMap:
-    """Points spread over walls and furniture, at heights from :data:`POINT_HEIGHTS`, on furniture up to its top."""
+    """Return ``count`` points that are distributed over walls and furniture. Heights on walls are in the range
+    :data:`POINT_HEIGHTS`, heights on furniture are below the top of the furniture."""
     places = _distribute(plan, np.concatenate((walls, boxes)), count, rng)
     x, y, facing = places.T
     back = np.column_stack((x - 2.0 * STANDOFF * np.cos(facing), y - 2.0 * STANDOFF * np.sin(facing)))
@@ -228,7 +239,8 @@ def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.G
 
 
 def _even(settings: WorldSettings, count: int) -> Array:
-    """``count`` places along the two long walls of the outline, invariant to mirroring and half-turns."""
+    """Return ``count`` places (count, 3) at equal distances along the two walls of the outline that are parallel to x. For an even
+    count they are symmetric to reflections and half-turns. Columns: see :func:`_places`."""
     below, above = (count + 1) // 2, count // 2
     width, depth = settings.width, settings.depth
     rows = (((0.0, 0.0, width, 0.0), below), ((width, depth, 0.0, depth), above))
@@ -238,7 +250,10 @@ def _even(settings: WorldSettings, count: int) -> Array:
 
 
 def _places(faces: Array, along: Array) -> Array:
-    """Places (N, 3) at fractions ``along`` (N,) of faces (N, 4): x, y, and the direction to their left."""
+    """Return a place on each of N faces, as x, y and the direction [rad] to the left of the face (N, 3).
+
+    ``faces`` (N, 4): segments. ``along`` (N,): the position of the place, as a fraction of the face's length.
+    """
     dx, dy = faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1]
     facing = np.arctan2(dx, -dy)
     x = faces[:, 0] + along * dx + STANDOFF * np.cos(facing)

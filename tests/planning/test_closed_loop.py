@@ -13,7 +13,7 @@ from factorgraph_loc.maps.free_space import distance_to_walls, free_space
 from factorgraph_loc.model.belief import Belief, Mode
 from factorgraph_loc.model.setup import Setup
 from factorgraph_loc.planning import closed_loop
-from factorgraph_loc.planning.active_mcl import ActiveMcl, LengthsSeen
+from factorgraph_loc.planning.active_mcl import ActiveMcl, ProximityReading
 from factorgraph_loc.planning.closed_loop import ActiveRun, run_active
 from factorgraph_loc.planning.robot import SimulatedRobot
 from factorgraph_loc.planning.settings import ActiveSettings
@@ -112,7 +112,7 @@ def test_a_start_in_a_wall_is_an_error(start: tuple[float, float, float], messag
 
 @pytest.mark.parametrize(
     ("policy", "estimator", "message"),
-    [("informaton", "active_mcl", "did you mean information"), ("random", "ekf", "no estimator of active runs")],
+    [("informaton", "active_mcl", "did you mean information"), ("random", "ekf", "is not known for active runs")],
 )
 def test_wrong_names(policy: str, estimator: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
@@ -241,7 +241,7 @@ def test_a_corridor_tells_the_heading_and_leaves_both_its_directions():
     robot.pose = np.array((1.5, 7.0, math.pi / 2.0))
     population, now = estimator._search._population, estimator._motion.state(0.0)
     for _ in range(3):
-        population.add(now, LengthsSeen(robot.proximity, robot.read_proximity()))
+        population.add(now, ProximityReading(robot.proximity, robot.read_proximity()))
         population.advance()
     poses, weights = population.particles
     # along some corridor: those across are in the crossbar, where the robot would look along x

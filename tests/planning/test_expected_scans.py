@@ -129,7 +129,7 @@ def test_particles_follow_the_path_until_they_are_stopped():
     along, steps, particles, sigmas, normals = stations()
     last = np.arange(4000) % 25
     out = np.empty((5, 4000, 3))
-    particle_kernels.look_poses(particles, along, steps, last, sigmas, normals, out)
+    particle_kernels.station_poses(particles, along, steps, last, sigmas, normals, out)
     for k, step in enumerate(steps.tolist()):
         expected = se2.compose(particles, along[np.minimum(step, last)])
         np.testing.assert_allclose(out[k, :, :2], expected[:, :2], atol=1e-9)
@@ -140,7 +140,7 @@ def test_noise_on_the_way_adds_up_as_small_motions_do():
     """Against exact composition, draw by draw, and the standard deviations of 4000 draws to 6 % (5 of their own)."""
     along, steps, particles, sigmas, normals = stations(noise=1.0)
     out = np.empty((5, 4000, 3))
-    particle_kernels.look_poses(particles, along, steps, np.full(4000, 99), sigmas, normals, out)
+    particle_kernels.station_poses(particles, along, steps, np.full(4000, 99), sigmas, normals, out)
     exact = particles
     for k in range(1, 5):
         exact = se2.compose(exact, se2.between(along[steps[k - 1]], along[steps[k]]))

@@ -20,7 +20,7 @@ from factorgraph_loc.planning.information import (
     has_several_modes,
     particle_entropy,
 )
-from factorgraph_loc.planning.paths import Path, look_around, primitives, waypoint_paths
+from factorgraph_loc.planning.paths import Path, full_turn, primitives, waypoint_paths
 from factorgraph_loc.planning.policies import Situation, policy, usable
 from factorgraph_loc.planning.settings import ActiveSettings
 from factorgraph_loc.sensors.motion import odometry_model
@@ -337,7 +337,7 @@ def test_a_small_sample_chooses_nearly_as_well_as_a_large_one():
 
 def test_a_turn_in_place_tells_something_but_not_without_rounds():
     poses, weights = drawn(1000)
-    found, turn = beam((4.0, 2.0), (-1.0, 4.0)), [look_around()]
+    found, turn = beam((4.0, 2.0), (-1.0, 4.0)), [full_turn()]
     assert turn[0].length == 0.0
     assert turn[0].passed(0.5)[-1] == pytest.approx(np.pi)
     (gain,) = expected_gain(found, poses, weights, turn, np.random.default_rng(0))
