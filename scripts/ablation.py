@@ -1,4 +1,4 @@
-"""The optional mechanisms of the estimators, and how each is switched off in a process."""
+"""Mechanisms of the estimators that ``scripts/baseline ablate`` can switch off. :data:`MECHANISMS` has a function for each."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,22 +10,22 @@ from factors.rfid import tag_states
 
 
 def constant(owner: Any, name: str, value: Any) -> Callable[[], None]:
-    """Replace a method by one that returns ``value``, whatever it is called with."""
+    """Return a function that replaces the function ``name`` of ``owner`` by one that always returns ``value``."""
     return lambda: setattr(owner, name, lambda *_, **__: value)
 
 
 def attribute(owner: Any, name: str, value: Any) -> Callable[[], None]:
-    """Replace an attribute or a property by one that is always ``value``."""
+    """Return a function that replaces the attribute or property ``name`` of ``owner`` by one that always has ``value``."""
     return lambda: setattr(owner, name, property(lambda _: value, lambda _, __: None))
 
 
 def number(owner: Any, name: str, value: float) -> Callable[[], None]:
-    """Replace a constant."""
+    """Return a function that sets the constant ``name`` of ``owner`` to ``value``."""
     return lambda: setattr(owner, name, value)
 
 
 def without_state(place: int) -> Callable[[], None]:
-    """Give dead, weak or moved tags no prior probability."""
+    """Return a function that sets the prior probability of one state of a tag to zero. ``place``: 0 dead, 1 weak, 2 moved."""
 
     def switch() -> None:
         make = tag_states.TagStates.__init__

@@ -1,4 +1,4 @@
-"""The logs of scripts/baseline: how each is made, and which there are."""
+"""The logs of scripts/baseline: their names, and the functions that make them."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ from factors import se2
 sys.path.insert(0, str(Path(__file__).resolve().parent / "benchmarks"))
 from field_benchmark.cases import CASES
 
-CARRIED, FOUND = 60.0, 80.0  # s: in between the wheels stand still while the robot moves
+CARRIED, FOUND = 60.0, 80.0  # s: between these times the robot is carried and its wheels stand still
 
 ROBOTS = ("mrclam6-robot1", "mrclam6-robot3", "mrclam6-robot5", "woods-r5")
 RECORDED = (*ROBOTS, "woods-r1", "woods-r3", "plaza1", "plaza2")
@@ -31,7 +31,8 @@ FAULTS += ("deadantenna3", "lostreads0.2", "scale1.03")
 FAULTY = tuple(f"field-office-1-{fault}" for fault in FAULTS)
 BROKEN = tuple(f"fault-{case}-{seed}" for case in ("wall", "plaza", "moved") for seed in (1, 2, 3))
 
-# each function makes the logs of these names in a folder; ``programs`` is the folder of field.py
+# Each of the following functions makes the logs ``names`` in the folder ``logs``. ``programs`` is the folder of the program
+# field.py.
 
 
 def recorded(names: tuple[str, ...], logs: Path, _: Path) -> None:
@@ -40,7 +41,7 @@ def recorded(names: tuple[str, ...], logs: Path, _: Path) -> None:
 
 
 def carried(log: fgloc.Log) -> fgloc.Log:
-    """The log of a robot whose wheels stand still for a while although it moves; its sensors go on."""
+    """Return the log of a robot that is carried for some time: its odometry reports no motion, and its sensors still measure."""
     odometry, start = log.streams["odometry"], log.span()[0]
     moves = ~((odometry.t > start + CARRIED) & (odometry.t <= start + FOUND))
     motion = [name for name in ("v", "w", "dx", "dy", "dtheta") if hasattr(odometry, name)]
@@ -49,7 +50,8 @@ def carried(log: fgloc.Log) -> fgloc.Log:
 
 
 def office(names: tuple[str, ...], logs: Path, _: Path) -> None:
-    """An office with every sensor but images; with ranges or bearings alone; with a robot that is carried."""
+    """Make four logs of a simulated office: with all sensors except images, with bearings but no ranges, with ranges but no
+    bearings, and with a robot that is carried."""
     seed = int(names[0].rpartition("-")[2])
     world = {"tags": 30, "landmarks": 12, "points": 150}
     changes = {"drive": {"duration": 200.0}, "world": world, "rssi": {}, "phase": {}}
@@ -72,7 +74,8 @@ def office(names: tuple[str, ...], logs: Path, _: Path) -> None:
 
 
 def loops(reference: fgloc.Trajectory, rng: np.random.Generator) -> fgloc.LoopStream:
-    """Every ten seconds the pose relative to the nearest one from 30 s before or earlier, where that is within 2 m."""
+    """Return simulated loop closures. Every ten seconds the pose is measured relative to the nearest pose that is at least 30 s
+    older, if its distance is below 2 m."""
     rows = []
     for t, pose in zip(reference.t[::100], reference.poses[::100], strict=True):
         away = np.hypot(*(reference.poses[:, :2] - pose[:2]).T) + np.where(reference.t < t - 30.0, 0.0, np.inf)
@@ -84,7 +87,7 @@ def loops(reference: fgloc.Trajectory, rng: np.random.Generator) -> fgloc.LoopSt
 
 
 def camera(names: tuple[str, ...], logs: Path, _: Path) -> None:
-    """A second drive in a rendered office, in the map that is made from the images of the first one."""
+    """Make the log of a second drive through a rendered office. Its map is made from the images of the first drive."""
     seed = int(names[0].rpartition("-")[2])
     changes = {"drive": {"duration": 60.0}, "world_seed": 2 + seed}
     with tempfile.TemporaryDirectory(dir=logs) as temporary:
@@ -112,15 +115,15 @@ def faulty(names: tuple[str, ...], logs: Path, programs: Path) -> None:
 
 
 def broken(names: tuple[str, ...], logs: Path, _: Path) -> None:
-    """The log of a case of the benchmark of faults."""
+    """Make the log of a case of the benchmark of faults, ``scripts/bench field``."""
     _, case, seed = names[0].split("-")
     fgloc.write_native(CASES[case](int(seed))[0], logs / names[0])
 
 
 def run_field(programs: Path, *arguments: str) -> None:
-    """Have field.py make its logs, and run the fastest estimator on them."""
+    """Run field.py, which makes its logs. It also runs an estimator, which is the fastest one."""
     if not (programs / "field.py").is_file():
-        raise FileNotFoundError(f"{programs} holds no field.py")
+        raise FileNotFoundError(f"{programs}: contains no field.py: name its folder by --field")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     command = [sys.executable, str(programs / "field.py"), *arguments, "-e", "dead_reckoning"]
     subprocess.run(command, env={**os.environ, "PATH": path}, stdout=subprocess.DEVNULL, check=True)

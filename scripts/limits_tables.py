@@ -1,4 +1,5 @@
-"""The tables of docs/limits.md: the bounds of all columns and settings, from their descriptions."""
+"""The tables of docs/limits.md, which list the bounds of all columns and settings. They are made from the models of the
+settings."""
 
 from pydantic import BaseModel
 
@@ -19,7 +20,7 @@ FILES: dict[str, type[BaseModel]] = {
 ESTIMATORS: dict[str, type[BaseModel]] = {
     f"settings of {name}": registry.settings_type(name) for name in registry.ESTIMATORS
 }
-# the page of settings has the bounds of these, and of the estimators
+# docs/settings.md has the bounds of these settings, and of those of the estimators
 OTHERS: dict[str, type[BaseModel]] = {
     "`NAME.rig.toml`": Rig,
     "settings of simulations": SimulationSettings,
@@ -28,12 +29,12 @@ OTHERS: dict[str, type[BaseModel]] = {
 
 
 def numbers_of(model: type[BaseModel]) -> list[Setting]:
-    """All numbers in settings."""
+    """Return the settings of a model whose values are numbers."""
     return [setting for setting in settings_in(model) if "number" in setting.kind]
 
 
 def tables() -> list[str]:
-    """The lines of all tables, with their headings."""
+    """Return the lines of all tables, with their headings."""
     lines = [
         "### Columns",
         "",
@@ -52,7 +53,7 @@ def tables() -> list[str]:
 
 
 def _columns() -> list[str]:
-    """The table of all columns. Those that differ only in the name, or in the table, are one row."""
+    """Return the lines of the table of all columns. Columns that differ only in their name, or only in their table, are one row."""
     tables: dict[tuple[str, ...], dict[str, None]] = {}
     for table in (*all_tables(), POSES, POINTS):
         for column in (c for c in table.columns if c.name != STAMP.name):

@@ -1,4 +1,4 @@
-"""The packages of the project in layers, what each imports and what it shows: tree and table of docs/architecture.md."""
+"""The packages of the project in layers, their imports and their public names: the tree and the table of docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# from the ground up; packages of one layer may import one another, but not in a circle
+# the lowest layer comes first; packages of one layer may import each other, but not in a circle
 LAYERS = (
     ("factors", "errors", "text", "version", "threads", "processes", "drawing", "plugins"),
     ("files",),
@@ -38,20 +38,22 @@ MODULES = {
 
 
 def package_of(module: str) -> str:
-    """The package of a module below ``factorgraph_loc``, or ``factors``; that of ``factorgraph_loc`` itself has no name."""
+    """Return the name of the package of a module: the part below ``factorgraph_loc``, or ``factors``. It is empty for the package
+    ``factorgraph_loc`` itself."""
     top, _, below = module.partition(".")
     return top if top == "factors" else below.partition(".")[0]
 
 
 def named(module: str, *, at_once: bool = False) -> frozenset[tuple[str, str]]:
-    """What a module of this project imports, or names in a string, as (module, name in it), the name "" where it is the module
-    itself; ``at_once``: when it is itself imported."""
+    """Return what a module imports from this project, and what its strings name, as pairs (module, name in it). The name is empty
+    for a module itself. ``at_once``: only imports that are executed when the module is imported."""
     return names_in(MODULES[module], at_once=at_once)
 
 
 @cache
 def names_in(path: Path, *, at_once: bool = False) -> frozenset[tuple[str, str]]:
-    """Those of a file, see :func:`named`; of a page, those of the Python files that it shows."""
+    """Return the names that a Python file imports, as :func:`named` does. For a page of the docs, those of the Python files that it
+    shows."""
     shown = re.findall(r"```python\n# \S+\.py\n(.*?)```", path.read_text(), re.DOTALL)
     tree = ast.parse("\n".join(shown) if path.suffix == ".md" else path.read_text())
     found: set[tuple[str, str]] = set()
@@ -67,17 +69,20 @@ def names_in(path: Path, *, at_once: bool = False) -> frozenset[tuple[str, str]]
 
 
 def imported(module: str, *, at_once: bool = False) -> set[str]:
-    """The modules of this project that a module imports, or names in a string; ``at_once``: when it is itself imported."""
+    """Return the modules of this project that a module imports or that its strings name. ``at_once``: only imports that are
+    executed when the module is imported."""
     found = {m if (m := f"{place}.{name}") in MODULES else place for place, name in named(module, at_once=at_once)}
-    if at_once:  # and the packages that they are in
+    if at_once:  # an import also imports the packages that contain the module
         found |= {".".join(parts[:i]) for m in found for parts in (m.split("."),) for i in range(2, len(parts))}
         found = {m for m in found if not module.startswith(f"{m}.")}
     return {m for m in found if m in MODULES and m != module}
 
 
 def steps(place: str, name: str, user: str = "") -> Iterator[tuple[str, str]]:
-    """The (package, module or name in it) that whoever imports ``name`` from ``place`` passes, from the outside in, leaving out
-    the packages that ``user``, the module that imports it, is in itself."""
+    """Yield pairs (package, module or name in it) for an import of ``name`` from the module ``place``, the outermost package first.
+
+    Each second part must be public in its package. Packages that contain ``user``, the importing module, are left out.
+    """
     parts = [*place.split("."), *([name] if name else [])]
     for i in range(1, len(parts)):
         package = ".".join(parts[:i])
@@ -86,19 +91,19 @@ def steps(place: str, name: str, user: str = "") -> Iterator[tuple[str, str]]:
 
 
 def _face(path: Path) -> tuple[str, ...]:
-    """What a package lists as ``__all__``: what other packages may import of it."""
+    """Return the names in ``__all__`` of a package: the names that other packages may import."""
     for node in ast.parse(path.read_text()).body:
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "__all__":
             return tuple(ast.literal_eval(node.value))
     return ()
 
 
-# of each package below factorgraph_loc, whose own names are for scripts
+# public names of each package; the names of factorgraph_loc itself are for scripts, and are left out
 FACES = {m: _face(path) for m, path in MODULES.items() if path.name == "__init__.py" and m != "factorgraph_loc"}
 
 
 def tree() -> Iterator[str]:
-    """The lines of the tree of folders, the top layer first."""
+    """Yield the lines of the tree of folders, the top layer first."""
     yield from ("```text", "factorgraph_loc/")
     for packages in reversed(LAYERS):
         for package in packages:
@@ -111,7 +116,7 @@ def tree() -> Iterator[str]:
 
 
 def tables() -> Iterator[str]:
-    """The lines of the table of imports and public names."""
+    """Yield the lines of the table of imports and public names."""
     yield "| package | imports | modules | private modules | public |"
     yield "|---|---|---|---|---|"
     for package, face in sorted(FACES.items()):
@@ -129,13 +134,13 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _below(package: str) -> list[str]:
-    """The packages that one imports, the highest first; what stands on the ground is left out, as all may use it."""
+    """Return the packages that a package imports, the highest layer first. The lowest layer is left out."""
     found = {package_of(m) for module in MODULES if package_of(module) == package for m in imported(module)}
     return sorted((p for p in found - {package, ""} if HEIGHT[p]), key=lambda p: (-HEIGHT[p], p))
 
 
 def _what(package: str) -> str:
-    """The first sentence about a package."""
+    """Return the first sentence of the docstring of a package."""
     name = package if package == "factors" else f"factorgraph_loc.{package}"
     text = " ".join((ast.get_docstring(ast.parse(MODULES[name].read_text())) or "").split())
     return text.partition(". ")[0].rstrip(".").replace("``", "").replace(":mod:", "").replace("`", "") + "."

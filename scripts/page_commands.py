@@ -1,5 +1,7 @@
-"""What a page of the docs tells its readers to do: the commands in its console blocks, the lines after ``$``; its blocks of Python;
-and the files that it tells to write, blocks of TOML whose first line is a comment with the file's name.
+"""Extraction of the steps that a page of the docs asks its readers to do.
+
+The steps are the commands in console blocks (lines after ``$``), blocks of Python, and files to write. A file to write is a block
+of TOML whose first line is a comment with the name of the file.
 """
 
 import re
@@ -9,7 +11,7 @@ MORE = "..."
 _BLOCK = re.compile(r"^```(console|python|toml)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NAMED = re.compile(r"# ([\w.-]+\.toml)\b")
-# data of the reader's own or of others, installations, windows
+# commands that cannot be run in a test: they need data that is not in the package, install something, or open a window
 _ELSEWHERE = re.compile(
     r"\b(LOG|DATA|FOLDER)\b|(?<![\w/])(monday|tuesday|friday|another|hall)/(?!\S)"
     r"|^(pip|rerun) |^fgloc view"
@@ -18,8 +20,12 @@ _ELSEWHERE = re.compile(
 
 @dataclass(frozen=True)
 class Step:
-    """A ``command``, with what the page shows of its output; or else the ``content`` of the ``file`` to write, or without a name
-    of the Python to execute."""
+    """A step of a page: a command, a file to write, or Python code to execute.
+
+    ``command``: None for files and code. ``shown``: the output of the command on the page. ``file``: the name of a file, None for
+    code.
+    ``content``: that of the file, or the code.
+    """
 
     command: str | None = None
     shown: str = ""
@@ -28,18 +34,18 @@ class Step:
 
 
 def commands(text: str) -> list[str]:
-    """All commands of a page, without comments."""
+    """Return all commands of a page, without comments."""
     return [command for kind, block in _BLOCK.findall(text) if kind == "console" for command, _ in _typed(block)]
 
 
 def runnable(text: str) -> list[str]:
-    """Those that need no data, and neither install anything nor open a window."""
+    """Return the commands of a page that can be run in a test: they need no data, install nothing and open no window."""
     return [command for command in commands(text) if not _ELSEWHERE.search(command)]
 
 
 def steps(text: str, *, shown: bool = False) -> list[Step]:
-    """The runnable commands, the files and the Python of a page, in their order; ``shown``: of the commands those in blocks with
-    an output, and no Python."""
+    """Return the steps of a page in their order, without commands that cannot be run. ``shown``: only files, and commands in
+    console blocks that show an output."""
     found = []
     for kind, block in _BLOCK.findall(text):
         if kind == "console":
@@ -54,15 +60,16 @@ def steps(text: str, *, shown: bool = False) -> list[Step]:
 
 
 def tables(text: str) -> list[str]:
-    """The blocks of TOML of a page."""
+    """Return the blocks of TOML of a page."""
     return [block for kind, block in _BLOCK.findall(text) if kind == "toml"]
 
 
 def not_as_shown(shown: str, printed: str) -> str | None:
-    """The first line of an output on a page that is not in what a command prints; None without one.
+    """Compare the output on a page with the printed output of a command. Returns the first line that differs, or None if both
+    agree.
 
-    A line ``...`` stands for any lines, a word ``...`` at the end of one for any words. Numbers may differ by 5 % or by one in
-    their last decimal, and those that tell how long something took, by anything.
+    A line ``...`` on the page matches any number of lines, and a word ``...`` at the end of a line any number of words. Numbers may
+    differ by 5 % or by one in their last digit. Durations may differ by any amount.
     """
     left = [line.split() for line in printed.splitlines() if line.strip()]
     skips = False
@@ -81,7 +88,7 @@ def _alike(shown: list[str], printed: list[str]) -> bool:
     if shown[-1] == MORE:
         shown, printed = shown[:-1], printed[: len(shown) - 1]
     timed = set(range(len(shown))) if shown[:1] == ["time:"] else set()
-    if re.fullmatch(r"\d+/\d+", shown[-1]):  # a row of a comparison: time per update, and ratio to real time
+    if re.fullmatch(r"\d+/\d+", shown[-1]):  # a row of fgloc compare: two of its columns are durations
         timed = {len(shown) - 4, len(shown) - 3}
     return len(shown) == len(printed) and all(
         _is_near(a, b, timed=i in timed) for i, (a, b) in enumerate(zip(shown, printed, strict=True))
@@ -89,8 +96,8 @@ def _alike(shown: list[str], printed: list[str]) -> bool:
 
 
 def _is_near(shown: str, printed: str, *, timed: bool) -> bool:
-    """Whether two words are the same, but for their numbers, which are near each other."""
-    if set(shown) | set(printed) == {"─"}:  # below the head of a table
+    """True if two words are equal, apart from numbers, and their numbers are nearly equal. ``timed``: the numbers are durations."""
+    if set(shown) | set(printed) == {"─"}:  # the line below the head of a table
         return True
     numbers = list(zip(_NUMBER.findall(shown), _NUMBER.findall(printed), strict=False))
     last = [10.0 ** -len(a.partition(".")[2]) if "." in a else 0.0 for a, _ in numbers]
@@ -101,7 +108,7 @@ def _is_near(shown: str, printed: str, *, timed: bool) -> bool:
 
 
 def _typed(block: str) -> list[tuple[str, str]]:
-    """The commands of a console block without comments, each with the lines below it."""
+    """Return the commands of a console block without comments, each with the lines below it, which are its output."""
     parts = re.split(r"^\$ ", block, flags=re.MULTILINE)[1:]
     typed = (part.partition("\n") for part in parts)
     return [(re.sub(r" +# .*", "", command), shown) for command, _, shown in typed]

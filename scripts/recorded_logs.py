@@ -1,4 +1,4 @@
-"""Recorded logs by name: those of ``fgloc datasets``, and those that scripts/convert writes."""
+"""Recorded logs by name: those that ``fgloc datasets`` lists, and those that scripts/convert writes."""
 
 import re
 from pathlib import Path
@@ -18,8 +18,8 @@ CONVERTED = {
 
 
 def recorded_log(name: str, data_root: Path | None = None, odometry_seed: int = 0) -> Log:
-    """The log ``name``. ``data_root``: the data folder, by default the environment's FGLOC_DATA; ``odometry_seed``: of the
-    simulated odometry of the aisle's runs."""
+    """Read the recorded log ``name``. ``data_root``: the data folder; None uses the environment variable FGLOC_DATA.
+    ``odometry_seed``: the seed of the simulated odometry of rfid-aisle logs."""
     found = re.fullmatch(r"(woods-r|rfid-aisle-run)(\d+)", name)
     if found is None:
         return read_log(name, data_root=data_root)
@@ -30,7 +30,7 @@ def recorded_log(name: str, data_root: Path | None = None, odometry_seed: int = 
 
 
 def present_logs(data_root: Path | None = None) -> set[str]:
-    """The names of the logs whose files are in the data folder."""
+    """Return the names of the recorded logs whose files are in the data folder."""
     known = {dataset.name for dataset in describe(data_root) if dataset.present}
     if "mrclam6-robot1" not in known:
         return known

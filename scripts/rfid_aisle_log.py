@@ -1,7 +1,7 @@
-"""The recordings of a robot with three UHF RFID antennas between shelves: a folder with ``tags.csv`` and a folder for each run.
+"""Reader of the rfid-aisle recordings: a robot with three UHF RFID antennas between shelves.
 
-A run has reads and reference poses but no odometry, which is simulated:
-:func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`.
+The recordings are a folder with ``tags.csv`` and a folder for each run. A run has reads and reference poses. It has no odometry,
+which is simulated by :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`.
 """
 
 from pathlib import Path
@@ -23,8 +23,8 @@ from factorgraph_loc.text import Notice, notice
 from factors import se2
 
 ANTENNAS = ("first", "second", "third")
-EPC, CARRIER, PHASE, RSSI, HOST_CLOCK = 1, 3, 4, 5, 7  # columns of a file of reads: MHz, degrees, dBm, us
-THINNING = 4  # the reference has 200 Hz
+EPC, CARRIER, PHASE, RSSI, HOST_CLOCK = 1, 3, 4, 5, 7  # columns of a file of reads; units: none, MHz, degrees, dBm, us
+THINNING = 4  # every fourth pose of the reference, which has 200 Hz, is stored
 TAGS = TagsFile(
     file="tags.csv",
     columns={"epc": "epc", "x": "x_m", "y": "y_m", "z": "z_m", "facing": "facing_deg"},
@@ -38,7 +38,7 @@ ABOUT = {
 
 
 def read_rfid_aisle(folder: Path, run: int, odometry_seed: int = 0) -> Log:
-    """A run of the recordings in ``folder``; t = 0 at the first pose of the reference."""
+    """Read a run of the recordings in ``folder``. The time 0 is that of the first pose of the reference."""
     files = folder / f"run{run}"
     reference, t0_ns = read_reference(files / "reference_pose.txt")
     odometry = wheel_odometry(reference, odometry_seed)
@@ -56,16 +56,17 @@ def read_rfid_aisle(folder: Path, run: int, odometry_seed: int = 0) -> Log:
 
 
 def read_reference(path: Path) -> tuple[Trajectory, int]:
-    """All poses, in seconds after the first one, and the time of that."""
+    """Read the reference. Returns its poses, with times in seconds after the first pose, and the stamp of the first pose [ns]."""
     x, y, heading, t = np.loadtxt(path).T
-    t_ns = np.rint(t * 1e6).astype(np.int64) * 1000  # doubles at such times resolve microseconds
+    t_ns = np.rint(t * 1e6).astype(np.int64) * 1000  # the resolution of such large doubles is about a microsecond
     keep = checks.in_order(path, np.arange(1, len(t) + 1), t_ns, [])
     poses = np.column_stack((x, y, se2.wrap(heading)))
     return Trajectory(checks.seconds(t_ns[keep], int(t_ns[0])), poses[keep]), int(t_ns[0])
 
 
 def read_reads(folder: Path, t0_ns: int, end: float) -> tuple[RfidStream, tuple[Notice, ...]]:
-    """The inventory rounds of all antennas that are within the odometry, 0 to ``end`` seconds, and warnings."""
+    """Read the inventory rounds of all antennas at times from 0 to ``end`` [s], where there is odometry. Returns them with
+    warnings."""
     tables = [np.loadtxt(folder / f"{antenna}.txt", dtype=str, ndmin=2).reshape(-1, 8) for antenna in ANTENNAS]
     table = np.concatenate(tables)
     t_ns = table[:, HOST_CLOCK].astype(np.int64) * 1000

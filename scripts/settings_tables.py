@@ -1,4 +1,4 @@
-"""The tables of docs/settings.md: what can be set, from the models of the settings."""
+"""The tables of docs/settings.md, which list all settings. They are made from the models of the settings."""
 
 from collections.abc import Iterable, Sequence
 
@@ -11,7 +11,7 @@ from factorgraph_loc.sensors.registry import about, sections_of, sensor
 
 
 def tables() -> list[str]:
-    """The lines of all tables, with their headings."""
+    """Return the lines of all tables, with their headings."""
     return [*_estimators(), *_rig(), *_simulations(), *_active()][:-1]
 
 
@@ -40,13 +40,14 @@ def _active() -> list[str]:
 
 
 def _own(settings: Sequence[Setting]) -> list[str]:
-    """A table of settings of one owner, without the tables whose keys are listed."""
+    """Return the table of the settings of one section. A setting that is a table itself is left out if its keys are listed."""
     listed = {s.key.rpartition(".")[0] for s in settings}
     return _table((s.key, "", s) for s in settings if s.kind != TABLE or s.key not in listed)
 
 
 def _table(settings: Iterable[tuple[str, str, Setting]], *, owned: bool = False) -> list[str]:
-    """A table of settings, each with its key and its owner. Those that differ only in the owner, or in the key, are one row."""
+    """Return a table of settings, each given with its key and its owner (an estimator). Settings that differ only in the owner,
+    or only in the key, are one row. ``owned``: with a column of owners."""
     owners: dict[tuple[str, ...], list[str]] = {}
     for key, owner, s in settings:
         owners.setdefault((key, default_text(s), values_text(s), s.meaning), []).append(owner)

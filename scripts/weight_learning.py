@@ -1,4 +1,4 @@
-"""Learning of the weights of the 35 values from images of planar scenes with known homographies."""
+"""Learning of the weights of colour features from images of planar scenes with known homographies."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from factorgraph_loc.vision.keypoints import Float
 from factors.se2 import Array
 
 COUNT = 1000  # points per image
-SHARE = 0.04  # of the mean variance, added to all as a regularisation
+SHARE = 0.04  # this fraction of the mean variance is added to each variance as a regularisation
 
 
 def learn_weights(sequences: Several[Sequence]) -> Weights:
-    """Weights from all pairs of images of each sequence, from points with equal position and scale by the homographies."""
+    """Learn weights from all pairs of images of each sequence. Used are the points that have equal position and scale in both
+    images, according to the homography."""
     pairs = [pair for sequence in sequences for pair in matched_values(sequence)]
     return learn(np.vstack([first for first, _ in pairs]), np.vstack([second for _, second in pairs]))
 
 
 def matched_values(sequence: Sequence) -> list[tuple[Float, Float]]:
-    """For each pair of images the values (N, 35) of the N points in both."""
+    """Return for each pair of images of a sequence the values (N, 35) of N common points, in the first and in the second image."""
     features = ColourExtractor(COUNT)
     described = []
     for image in (sequence.first, *sequence.others):
@@ -46,7 +47,8 @@ def matched_values(sequence: Sequence) -> list[tuple[Float, Float]]:
 
 
 def learn(first: Float, second: Float) -> Weights:
-    """Weights from the values (N, 35) of N points in one image and (N, 35) of the same points in another."""
+    """Learn weights from the values (N, 35) of N points in a first image, and the values (N, 35) of the same points in a second
+    image."""
     used = np.delete(np.arange(VALUES), OWN_SCALE)
     half = (first[:, used].astype(float) - second[:, used]) / np.sqrt(2.0)
     within = half.T @ half / len(half)

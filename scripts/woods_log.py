@@ -1,4 +1,5 @@
-"""The University of Toronto's "Lost in the Woods" (``dataset2.mat``): wheel odometry and a laser that detects known trunks."""
+"""Reader of "Lost in the Woods" of the University of Toronto (``dataset2.mat``): wheel odometry, and a laser that detects known
+tree trunks."""
 
 from pathlib import Path
 
@@ -23,13 +24,13 @@ ABOUT = {
 
 
 def read_woods(path: Path, max_range: float) -> Log:
-    """The drive, with the sightings of landmarks nearer than ``max_range`` [m]; t = 0 at the first row."""
+    """Read the log, with the sightings of landmarks nearer than ``max_range`` [m]. The time 0 is that of the first row."""
     with path.open("rb") as file:
         fields = loadmat(file)
     t_ns = checks.stamps(path, np.arange(1, len(fields["t"]) + 1), fields["t"][:, 0])
     t = checks.seconds(t_ns, int(t_ns[0]))
     v, w, x, y, heading, valid = (fields[n][:, 0] for n in ("v", "om", "x_true", "y_true", "th_true", "true_valid"))
-    ranges, bearings = fields["r"], fields["b"]  # (N, 17), a range of 0 if the landmark is not seen
+    ranges, bearings = fields["r"], fields["b"]  # (N, 17); the range is 0 if the landmark is not detected
     row, column = np.nonzero((ranges > 0.0) & (ranges < max_range))
     names = [str(k + 1) for k in column.tolist()]
     known = valid > 0

@@ -95,7 +95,7 @@ def test_an_enclosed_robot_waits_and_gives_up(monkeypatch: pytest.MonkeyPatch, p
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        ((0.05, 3.0, 0.0), "start .* m from one"),
+        ((0.05, 3.0, 0.0), "start .* m from a wall"),
         ((-5.0, 3.0, 0.0), "start"),
         ((3.0, 3.0, 0.0), None),
     ],

@@ -1,4 +1,4 @@
-"""Distance until localized, by policy and estimator: runs and their tables."""
+"""The distance that a robot drives until it is localized, for each policy and estimator: runs and tables."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ SETTINGS = ActiveSettings()
 
 
 def policies(options: Options) -> Report:
-    """Policies in three worlds, with the filter of the paper."""
+    """Compare all policies in three worlds, with the estimator ActiveMCL."""
     report = Report("policies", options)
     rows = compared(report, ("active_mcl",), POLICIES, WORLDS, options.count(200))
-    # in the dense office robots are localized almost without driving
+    # the office is left out: with its many tags, robots are localized almost without driving
     report.table(*difference_cells([row for row in rows if row["world"] != "office"]))
     return report
 
 
 def estimators(options: Options) -> Report:
-    """The same policies on top of other estimators."""
+    """Compare three policies in two worlds, with each estimator."""
     report = Report("estimators", options)
     compared(report, ESTIMATORS, POLICIES[:3], WORLDS[1:], options.count(10))
     return report
@@ -38,7 +38,8 @@ def estimators(options: Options) -> Report:
 def compared(
     report: Report, estimators: Sequence[str], policies: Sequence[str], worlds: Sequence[str], count: int
 ) -> list[dict[str, Any]]:
-    """The rows of all runs, after their summary in the report."""
+    """Run all combinations, and add their summary to the report. Returns a row of scores per run. ``count``: runs per
+    combination."""
     options, folder = report.options, report.options.out / report.name
     rows: list[dict[str, Any]] = []
     for world in worlds:

@@ -1,4 +1,4 @@
-"""Many simulated logs, each run by several estimators in one process, of which only the errors are kept."""
+"""Errors of several estimators on a simulated log. Only the errors are stored, not the results of the runs."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Series:
-    """Errors at the scored stamps ``t`` (N,) of the reference: ``position`` [m], ``heading`` [rad, absolute] and ``nees``, each
-    (N,); NaN where undefined."""
+    """The errors of a trajectory at N stamps of the reference. They are NaN where the trajectory has no pose.
+
+    ``t`` (N,) [s]. ``position`` (N,) [m], ``heading`` (N,) [rad]: absolute errors. ``nees`` (N,): normalised squared errors of
+    the pose.
+    """
 
     t: Array
     position: Array
@@ -38,13 +41,17 @@ class Series:
         return float(np.sqrt(np.nanmean(np.square(self.heading))))
 
     def where(self, keep: NDArray[np.bool_]) -> Series:
-        """The errors at the selected times (N,)."""
+        """Return the errors at the times of the mask ``keep`` (N,)."""
         return Series(self.t[keep], self.position[keep], self.heading[keep], self.nees[keep])
 
 
 @dataclass(frozen=True)
 class RunErrors:
-    """Errors of one run: ``causal``, NaN before the first localized estimate; ``final``; ``status`` at each tick."""
+    """The errors of one run.
+
+    ``causal``: of the estimates during the run, NaN before the first localized one. ``final``: of the final trajectory.
+    ``status``: at each tick.
+    """
 
     causal: Series
     final: Series
@@ -52,7 +59,7 @@ class RunErrors:
     timings: Timings
 
     def share(self, status: Status) -> float:
-        """Fraction of the ticks with this status."""
+        """Return the fraction of the ticks with this status."""
         return self.status.count(status) / len(self.status)
 
 
@@ -62,20 +69,24 @@ def run_ensemble(
     configs: Mapping[str, RunConfig],
     change: Callable[[Log, int], Log] = lambda log, _: log,
 ) -> dict[str, RunErrors]:
-    """The errors of each run, by label, on a simulated log; ``change`` is applied to the log and its seed."""
+    """Simulate a log, run estimators on it, and return their errors by label.
+
+    ``configs``: the runs by label. ``change``: a function that changes the log before the runs. Its arguments are log and seed.
+    """
     log = change(simulate(settings, seed), seed)
     return {label: run_errors(run(log, config), log) for label, config in configs.items()}
 
 
 def run_errors(result: RunResult, log: Log) -> RunErrors:
-    """The errors of a run on a log with reference."""
+    """Return the errors of a run on a log with a reference."""
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
     gap = result.max_gap
     return RunErrors(series(causal, log, gap), series(result.final, log, gap), result.status, result.timings)
 
 
 def series(trajectory: Trajectory, log: Log, max_gap: float = MAX_GAP) -> Series:
-    """The errors of a trajectory against the reference of its log, as :func:`~factorgraph_loc.evaluation.metrics.errors`."""
+    """Return the errors of a trajectory relative to the reference of its log
+    (:func:`~factorgraph_loc.evaluation.metrics.errors`)."""
     assert log.reference is not None, "a log to score has a reference"
     e = errors(trajectory, log.reference, max_gap)
     t = log.reference.t[thinned(log.reference.t)]
@@ -85,6 +96,6 @@ def series(trajectory: Trajectory, log: Log, max_gap: float = MAX_GAP) -> Series
 
 
 def stacked(runs: Sequence[Series]) -> Array:
-    """NEES (R, N) of runs at the first N times, which all of them have."""
+    """Return the NEES (R, N) of R runs at their first N times. N is the number of times of the shortest run."""
     count = min(len(one.nees) for one in runs)
     return np.stack([one.nees[:count] for one in runs])

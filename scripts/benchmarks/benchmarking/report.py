@@ -1,4 +1,4 @@
-"""Common parts of the sections: options, parallel jobs, tables, errors of many runs."""
+"""Common parts of the sections of benchmarks: options, parallel jobs, tables, and errors of many runs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from factorgraph_loc.evaluation.statistics import pooled_rms
 from factorgraph_loc.fitting.shares import wilson
 from factorgraph_loc.processes import run_each
 
-ENOUGH = 10  # trials for an interval of a share
-NOTHING = "–"
+ENOUGH = 10  # least number of trials for a confidence interval
+NOTHING = "–"  # an empty cell
 KINDS = ("causal", "final")
 ACCURACY = (
     "causal [m]",
@@ -34,8 +34,11 @@ ACCURACY = (
 
 @dataclass(frozen=True)
 class Options:
-    """``seeds``: number of simulated logs of each kind, ``duration`` [s]: of simulated drives, None for each section's default;
-    ``jobs``: parallel processes."""
+    """The options of ``scripts/bench``.
+
+    ``seeds``: the number of simulated logs of each kind. ``duration`` [s]: of simulated drives. If one of both is None, each
+    section uses its default. ``jobs``: the number of parallel processes. ``out``: the folder of results.
+    """
 
     seeds: int | None
     jobs: int
@@ -51,13 +54,13 @@ class Options:
 
     @property
     def drives(self) -> Path:
-        """The folder of rendered drives."""
+        """The folder of the images of rendered drives."""
         return self.out / "drives"
 
 
 @dataclass
 class Report:
-    """The Markdown of a section, and its failures."""
+    """The results of a section: ``lines`` of Markdown, and ``failed``, a line for each failure."""
 
     name: str
     options: Options
@@ -74,7 +77,8 @@ class Report:
     def collect(
         self, function: Callable[..., Any], jobs: Mapping[Any, tuple[Any, ...]], workers: int | None = None
     ) -> dict[Any, Any]:
-        """The results of ``function`` for the arguments of each job, by the key of the job, without those that failed."""
+        """Call ``function`` with the arguments of each job, in parallel processes. Returns the results by the key of the job.
+        Failed jobs are left out, and their errors are added to ``failed``."""
         keys, found = list(jobs), dict[Any, Any]()
         call = partial(_called, function)
         for i, outcome in run_each(call, list(jobs.values()), workers or self.options.jobs):
@@ -89,7 +93,7 @@ class Report:
         return {key: found[key] for key in keys if key in found}
 
     def tell(self, done: float, total: float) -> None:
-        """Print how much is done."""
+        """Print the progress of the section."""
         end = "\n" if done == total else ""
         print(f"\r{self.name}: {done:.0f} of {total:.0f}", end=end, file=sys.stderr, flush=True)
 
@@ -99,23 +103,23 @@ def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
 
 
 def rmses(runs: Sequence[Series]) -> np.ndarray:
-    """Position RMSE of each run."""
+    """Return the position RMSE [m] of each run."""
     return np.array([one.position_rmse() for one in runs])
 
 
 def pooled(runs: Sequence[Series]) -> tuple[float, float]:
-    """Position [m] and heading [degrees] RMSE, pooled over runs."""
+    """Return the RMSE of position [m] and heading [degrees], pooled over runs."""
     return pooled_rms(rmses(runs).tolist()), float(np.degrees(pooled_rms([one.heading_rmse() for one in runs])))
 
 
 def together(runs: Sequence[Series]) -> np.ndarray:
-    """The position errors of all times of all runs."""
+    """Return the position errors [m] of all runs at all times in one array."""
     errors = np.concatenate([one.position for one in runs])
     return np.asarray(errors[np.isfinite(errors)])
 
 
 def spread_cell(runs: Sequence[Series]) -> str:
-    """RMSE / median / p95 [m] / heading RMSE [degrees] / ANEES over runs."""
+    """Return a cell with position RMSE / median / 95th percentile [m] / heading RMSE [degrees] / ANEES, pooled over runs."""
     position, heading = pooled(runs)
     errors = together(runs)
     nees = np.mean([np.nanmean(one.nees) for one in runs])
@@ -123,13 +127,13 @@ def spread_cell(runs: Sequence[Series]) -> str:
 
 
 def accuracy_cells(runs: Sequence[RunErrors]) -> tuple[str, ...]:
-    """The cells of :data:`ACCURACY`, pooled over runs; NEES is that of a pose, 3 where covariances are right."""
+    """Return the cells of the columns :data:`ACCURACY`, pooled over runs. The ANEES of a pose is 3 if covariances are correct."""
     cells: list[str] = []
     nees, inside = [], []
     for kind in KINDS:
         members: list[Series] = [getattr(one, kind) for one in runs]
         grid = stacked(members)
-        if not np.isfinite(grid).any():  # an offline estimator
+        if not np.isfinite(grid).any():  # an offline estimator has no causal estimates
             cells += [NOTHING, NOTHING]
             nees.append(NOTHING)
             inside.append(NOTHING)
@@ -143,7 +147,8 @@ def accuracy_cells(runs: Sequence[RunErrors]) -> tuple[str, ...]:
 
 
 def ratio_cells(a: Sequence[Series], b: Sequence[Series]) -> tuple[str, str]:
-    """The ratio of pooled RMSEs with its interval, and the worst of a single log."""
+    """Return two cells: the ratio of the pooled RMSEs of the runs ``a`` and ``b`` with its interval, and the largest ratio of a
+    single log."""
     return ratio_text(rmse_ratio(rmses(a), rmses(b)))
 
 
@@ -152,6 +157,6 @@ def ratio_text(ratio: Ratio) -> tuple[str, str]:
 
 
 def share_text(successes: int, count: int) -> str:
-    """A count, with its interval in per cent if there are at least :data:`ENOUGH`."""
+    """Return the text "successes of count", with a confidence interval in per cent if there are at least :data:`ENOUGH` trials."""
     low, high = wilson(successes, count)
     return f"{successes} of {count}" + (f" ({100 * low:.0f} % to {100 * high:.0f} %)" if count >= ENOUGH else "")

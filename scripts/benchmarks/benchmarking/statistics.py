@@ -1,4 +1,4 @@
-"""Statistics of many runs of one kind: consistency at each time, ratios of errors, counts, times.
+"""Statistics of many runs of one kind: consistency of covariances, ratios of errors, and times.
 
 NEES over runs: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.2.
 """
@@ -21,9 +21,11 @@ _SEED = 0  # of the bootstrap, for reproducible intervals
 
 
 def share_in_band(nees: Array, dof: int = 3) -> float:
-    """Fraction of the times at which the mean NEES over runs is in its 95 % band; 95 % for a consistent estimator.
+    """Return the fraction of the times at which the mean NEES over runs is in its 95 % interval. It is 0.95 for a consistent
+    estimator.
 
-    ``nees`` (R, N): of R independent runs at N times, NaN where missing. Times without any run do not count; NaN if all are.
+    ``nees`` (R, N): of R independent runs at N times, NaN where missing. ``dof``: degrees of freedom. Times without any value are
+    left out. Returns NaN if there are no values.
     """
     known = np.isfinite(nees)
     count = known.sum(axis=0)
@@ -35,7 +37,8 @@ def share_in_band(nees: Array, dof: int = 3) -> float:
 
 @dataclass(frozen=True)
 class Ratio:
-    """Of pooled RMSEs, with the 95 % interval ``low`` to ``high``; ``worst``: the largest of a single run."""
+    """A ratio of two pooled RMSEs. ``value``: the ratio. ``low``, ``high``: its 95 % interval. ``worst``: the largest ratio of a
+    single log."""
 
     value: float
     low: float
@@ -44,7 +47,8 @@ class Ratio:
 
 
 def rmse_ratio(a: Array, b: Array) -> Ratio:
-    """RMSEs ``a`` (R,) over ``b`` (R,) of the same R logs, pooled; the interval is a percentile bootstrap over the logs, paired."""
+    """Return the ratio of pooled RMSEs, ``a`` over ``b``. Both are arrays (R,) of the RMSEs on the same R logs. The interval is a
+    paired percentile bootstrap over logs."""
     drawn = np.random.default_rng(_SEED).integers(len(a), size=(DRAWS, len(a)))
     squares = np.mean(np.square(a)[drawn], axis=1) / np.mean(np.square(b)[drawn], axis=1)
     tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
@@ -54,10 +58,10 @@ def rmse_ratio(a: Array, b: Array) -> Ratio:
 
 
 def first_held(t: Array, good: NDArray[np.bool_], hold: float) -> float:
-    """The first of the times ``t`` (N,), ascending, from which on all are ``good`` (N,) for ``hold`` seconds; NaN if there is
-    none.
+    """Return the first time from which on an estimate is good for ``hold`` [s], or NaN if there is none.
 
-    Times less than ``hold`` before the end do not count.
+    ``t`` (N,) [s]: ascending times. ``good`` (N,): mask of the times at which the estimate is good. Times less than ``hold``
+    before the last time are not considered.
     """
     bad = np.concatenate((np.zeros(1, dtype=np.int64), np.cumsum(~good)))
     end = np.searchsorted(t, t + hold + 1e-9, side="right")

@@ -1,4 +1,4 @@
-"""Processor times of runs on one log; one process at a time."""
+"""Computing times of runs on one log, measured in one process at a time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log, cut
 from factorgraph_loc.model.result import Timings
 
-WARM_UP = 20.0  # s of the log, which are run before to exclude compilation
+WARM_UP = 20.0  # s: the first part of the log is run before, so that compilation is not measured
 HEADS = (
     "estimator",
     "update median / p99 / max [ms]",
@@ -23,7 +23,7 @@ HEADS = (
 
 
 def times_table(report: Report, load: Callable[[], Log], configs: Mapping[str, RunConfig]) -> None:
-    """Add a table of the times of runs to a report."""
+    """Measure the times of runs, and add a table of them to a report. ``load``: returns the log. ``configs``: the runs by label."""
     jobs = {label: (load, config) for label, config in configs.items()}
     found: Mapping[str, Timings] = report.collect(timed, jobs, workers=1)
     rows = []
@@ -39,7 +39,7 @@ def times_table(report: Report, load: Callable[[], Log], configs: Mapping[str, R
 
 
 def timed(load: Callable[[], Log], config: RunConfig) -> Timings:
-    """The times of a run on the log that ``load`` makes."""
+    """Return the times of a run on the log that ``load`` returns."""
     log = load()
     first = log.span()[0]
     run(cut(log, first, first + WARM_UP), config)

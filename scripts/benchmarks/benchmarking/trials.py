@@ -1,4 +1,4 @@
-"""Trials of an unknown start and of kidnapping, made from a recorded log by cutting and joining."""
+"""Trials of an unknown start and of kidnapping on a recorded log. A kidnapping is simulated by joining two parts of the log."""
 
 from __future__ import annotations
 
@@ -16,18 +16,23 @@ from factors import se2
 from factors.se2 import Array
 
 POSITION, HEADING = 0.5, math.radians(15.0)  # m, rad: an estimate with smaller errors is correct
-HOLD = 10.0  # s that it must remain correct
-LANDMARKS = 3  # number of different landmarks sufficient for localization
-START_TIME, RECOVERY_TIME = 60.0, 30.0  # s
+HOLD = 10.0  # s for which an estimate must remain correct
+LANDMARKS = 3  # number of different landmarks that are sufficient for localization
+START_TIME, RECOVERY_TIME = 60.0, 30.0  # s: deadlines
 BEFORE = 30.0  # s of driving before the kidnapping
-JUMP = 0.2  # s between the two parts of a kidnapping
+JUMP = 0.2  # s between the two joined parts of the log
 REFERENCE_GAP = 0.1  # s between reference poses that may be interpolated
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial. ``right``: localized (or recovered) correctly in time; ``false``: the first claim to be localized was wrong
-    (after a kidnapping: localized was claimed at the deadline without recovery); ``seconds``: until correct, NaN if never."""
+    """The result of one trial.
+
+    ``t`` [s]: the time of the start or of the kidnapping. ``right``: True if the robot was correctly localized in time.
+    ``false``: True if the first estimate with the status localized was wrong. After a kidnapping: True if the status was
+    localized at the deadline, and the robot had not recovered. ``seconds`` [s]: the time until the estimate was correct, NaN if
+    it never was.
+    """
 
     t: float
     right: bool
@@ -36,10 +41,10 @@ class Trial:
 
 
 def start_trials(log: Log, estimator: str, count: int) -> list[Trial]:
-    """Unknown starts at ``count`` times spread evenly over a log with reference, as long as 3 landmarks are still to be seen.
+    """Start an estimator with an unknown pose at ``count`` times, distributed evenly over a log with a reference.
 
-    A start is correct if the estimator is localized within 60 s, or within the time in which it sees 3 different landmarks if
-    that is longer, and then stays within 0.5 m and 15 degrees for 10 s.
+    After each start, 3 different landmarks are still measured. A start is correct if the estimator is localized within 60 s, or
+    until 3 different landmarks were measured, if that takes longer. Its error must then be below 0.5 m and 15 degrees for 10 s.
     """
     stamps, names = _sightings(log)
     first, last = log.span()[0], _third(stamps[::-1], names[::-1], log.span()[0])
@@ -60,9 +65,11 @@ def start_trials(log: Log, estimator: str, count: int) -> list[Trial]:
 
 
 def kidnapping_trials(log: Log, estimator: str, count: int) -> list[Trial]:
-    """A robot that is kidnapped, ``count`` times, from one time of the log to one half the log later (or earlier).
+    """Simulate ``count`` kidnappings. In each, the robot is moved from its pose at one time of the log to its pose half a log
+    later (or earlier).
 
-    It is recovered if it is correct for 10 s, within 30 s of having seen 3 different landmarks at the new place.
+    The estimator has recovered if it is correct for 10 s. This must begin within 30 s after 3 different landmarks were measured
+    at the new place.
     """
     first, last = log.span()
     stamps, names = _sightings(log)
@@ -86,7 +93,7 @@ def kidnapping_trials(log: Log, estimator: str, count: int) -> list[Trial]:
 
 
 def _sightings(log: Log) -> tuple[Array, NDArray[np.str_]]:
-    """Stamps and names of the landmarks of the map that are seen."""
+    """Return the stamps and names of all measurements of landmarks that are in the map."""
     stream = log.streams["bearing_range"]
     assert isinstance(stream, BearingRangeStream)
     names = np.array(stream.landmark)
@@ -95,13 +102,14 @@ def _sightings(log: Log) -> tuple[Array, NDArray[np.str_]]:
 
 
 def _third(stamps: Array, names: NDArray[np.str_], otherwise: float) -> float:
-    """The time of the third different landmark; ``otherwise`` if there is none."""
+    """Return the time of the first measurement of a third different landmark, or ``otherwise`` if there is none."""
     _, first = np.unique(names, return_index=True)
     return float(stamps[np.sort(first)[LANDMARKS - 1]]) if len(first) >= LANDMARKS else otherwise
 
 
 def is_right(result: RunResult, log: Log) -> NDArray[np.bool_]:
-    """Which causal estimates are correct; in a gap of the reference, as the one before (at the beginning, the one after)."""
+    """Return a mask of the causal estimates that are correct. An estimate in a gap of the reference has the value of the estimate
+    before the gap, or at the beginning of the log that of the first estimate with a reference."""
     assert log.reference is not None
     truth = log.reference.at(result.t, max_gap=REFERENCE_GAP)
     error = result.poses - truth
@@ -115,7 +123,7 @@ def is_right(result: RunResult, log: Log) -> NDArray[np.bool_]:
 
 
 def _holds(t: Array, right: NDArray[np.bool_], first: int) -> bool:
-    """Whether all estimates of the following 10 s are correct."""
+    """True if all estimates are correct for 10 s from index ``first`` on."""
     during = (t >= t[first]) & (t <= t[first] + HOLD)
     return bool(right[during].all())
 
@@ -124,5 +132,5 @@ TRIALS_OF = {"unknown start": start_trials, "kidnapping": kidnapping_trials}
 
 
 def run_trials(kind: str, log: Log, estimator: str, count: int) -> list[Trial]:
-    """``count`` trials of a kind of :data:`TRIALS_OF` on a log."""
+    """Run ``count`` trials on a log. ``kind``: a key of :data:`TRIALS_OF`."""
     return TRIALS_OF[kind](log, estimator, count)

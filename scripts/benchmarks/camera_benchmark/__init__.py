@@ -1,4 +1,4 @@
-"""Localization by a camera: the sections of docs/camera-results.md."""
+"""Benchmark of localization by a camera: the sections of docs/camera-results.md."""
 
 from camera_benchmark import faults, office, sevenscenes, slam, speed
 

@@ -1,6 +1,6 @@
-"""Drives through rendered offices: image files, which are stored, and the map from another drive.
+"""Drives through rendered offices, and maps made from other drives through the same offices.
 
-Stored images are named by a hash of everything that they depend on.
+Images are stored in folders. The name of a folder is a hash of all settings and of the code that the images depend on.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from factorgraph_loc.simulation.settings import SimulationSettings
 from factorgraph_loc.vision.feature_cache import VARIABLE
 
 TAGS = 20
-RATE, MAP_RATE = 5.0, 2.0  # images/s
-FEATURE, COUNT = "colour", 500  # per image
+RATE, MAP_RATE = 5.0, 2.0  # images/s of a drive, and of its mapping drive
+FEATURE, COUNT = "colour", 500  # kind of features, and their number per image
 MAP_DURATION = 600.0  # s
-MAP_SEED = 100_000  # added to the seed of a drive for that of its mapping drive
+MAP_SEED = 100_000  # the seed of a mapping drive is that of the drive plus this number
 SIGMAS = np.array(
     (REFERENCE_POSITION_SIGMA, REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)
 )  # of that drive's poses
@@ -39,7 +39,8 @@ SIGMAS = np.array(
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive with ``seed`` through the office ``world``, ``duration`` [s] long, with ``rate`` images a second."""
+    """A drive through a simulated office. ``world``: the seed of the office. ``seed``: that of the drive. ``duration`` [s].
+    ``rate``: images per second."""
 
     world: int
     seed: int
@@ -57,12 +58,12 @@ class Drive:
         return preset("office", changes)
 
     def mapping(self) -> Drive:
-        """The other drive through the same office, from which the map is learnt."""
+        """Return the mapping drive: another drive through the same office, from whose images the map is made."""
         return replace(self, seed=self.seed + MAP_SEED, duration=MAP_DURATION, rate=MAP_RATE)
 
 
 def log_of(drive: Drive, folder: Path) -> Log:
-    """The log of a drive with images, without a map of points. Images and their features are stored in ``folder``."""
+    """Return the log of a drive with images, without a map of points. Images and their features are stored in ``folder``."""
     os.environ[VARIABLE] = str(folder / "features")
     settings = drive.settings()
     log = simulate(settings, drive.seed)
@@ -71,13 +72,13 @@ def log_of(drive: Drive, folder: Path) -> Log:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as name:
             with_images(log, settings, drive.seed, Path(name))
-            Path(name).rename(path)  # the context manager does not mind
+            Path(name).rename(path)  # the context manager accepts that its folder is gone
     times = film(settings, drive.seed).stamps
     return replace(log, streams={**log.streams, "camera": ImageStream(times, sorted(path.glob("*.jpg")))})
 
 
 def map_of(drive: Drive, folder: Path) -> PointMap:
-    """The map from the mapping drive of a drive, with poses as accurate as a reference."""
+    """Return the map of points from the mapping drive of a drive. The poses of the mapping drive have the errors of a reference."""
     other = drive.mapping()
     path = folder / f"{_key(other)}-{code_of('mapping')}.points.parquet"
     if not path.exists():
@@ -94,7 +95,7 @@ def with_map(log: Log, points: PointMap) -> Log:
 
 
 def with_errors(log: Log, seed: int) -> Log:
-    """The log with a reference that has errors as stated."""
+    """Return the log with random errors added to its reference, and with their covariances."""
     truth = log.reference
     assert truth is not None
     noise = SIGMAS * np.random.default_rng(seed).standard_normal((len(truth), 3))
@@ -109,7 +110,7 @@ def _key(drive: Drive) -> str:
 
 @cache
 def code_of(package: str) -> str:
-    """A hash of the code of a package of the library."""
+    """Return a hash of the code of a package of factorgraph_loc."""
     digest = hashlib.sha256()
     folder = resources.files(f"factorgraph_loc.{package}")
     for file in sorted(folder.iterdir(), key=lambda file: file.name):

@@ -1,4 +1,4 @@
-"""One fault at a time: its effect on the errors, the messages about it, and the recovery."""
+"""Faults of cameras and images, one at a time: their effect on the errors, the messages about them, and the recovery."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SHOWN = 110  # characters of a message
 def section(options: Options) -> Report:
     report = Report("faults", options)
     drives = [Drive(FIRST + i, FIRST + i, options.seconds(DURATION)) for i in range(options.count(SEEDS))]
-    # write and map a drive's images once, before several processes need them
+    # render and map the images of each drive first, because several processes need them later
     ready = report.collect(prepared, {("drive", drive.seed): (drive, options.drives) for drive in drives})
     jobs = {
         (fault, drive.seed): (fault, drive, options.drives)
@@ -80,7 +80,7 @@ def prepared(drive: Drive, folder: Path) -> int:
 
 
 def faulty(fault: str, drive: Drive, folder: Path) -> dict[str, Attempt]:
-    """All runs on a drive with a fault, from image files."""
+    """Run all configurations on a drive with a fault. Returns the outcomes by label."""
     log = with_map(log_of(drive, folder), map_of(drive, folder))
     files = folder / "faults" / f"{re.sub(r'[^a-z0-9]+', '-', fault.lower())}-{drive.seed}"
     outcomes: dict[str, Attempt] = {}
@@ -92,7 +92,7 @@ def faulty(fault: str, drive: Drive, folder: Path) -> dict[str, Attempt]:
 
 
 def without_map(log: Log) -> Log:
-    """The log with a map that has no points."""
+    """Return the log without the points of its map."""
     return replace(log, world=log.world.model_copy(update={"points": None}))
 
 
@@ -106,13 +106,13 @@ def cell(runs: Sequence[Attempt], right: Sequence[Attempt]) -> str:
 
 
 def at_end(runs: Sequence[Attempt]) -> float:
-    """The causal error [m] at the end of the worst of the runs."""
+    """Return the causal RMSE [m] of the last part of the runs, that of the worst run."""
     causal = [one.errors.causal for one in runs if one.errors is not None]
     return max((one.where(one.t > one.t[-1] - AFTERWARDS).position_rmse() for one in causal), default=0.0)
 
 
 def said(one: Attempt, right: Attempt) -> str:
-    """Messages that do not occur without the fault."""
+    """Return the messages of the run ``one`` that do not occur in ``right``, the run without the fault."""
     if one.failure:
         return short(one.failure)
     new = [warning for warning in one.warnings if warning not in right.warnings]

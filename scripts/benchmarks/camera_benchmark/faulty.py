@@ -1,4 +1,4 @@
-"""Faults of a camera, of its images, and of its calibration: each is a change of a log."""
+"""Faults of a camera, of its images, and of its calibration. Each fault is a function that returns a changed log."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.camera.use import frontend_of
 from factorgraph_loc.simulation.filming import JPEG
 
-EACH = 5  # images that are missing, truncated, or of another size
-BLACK, BLACK_FROM = 100, 40.0  # images, s
-BLIND_FROM, BLIND = 40.0, 60.0  # s
-WRONG = 0.4
-MOVED, MOVED_RADIUS = 1.0, 0.5  # m; everything in that radius moves together
-FOCAL, OFFSET = 0.05, 0.1  # relative, s
-PERIOD = 8.0  # s, of the motion of the object in the way
-GREY = 128
+EACH = 5  # number of images that are missing, truncated, and of another size
+BLACK, BLACK_FROM = 100, 40.0  # number of black images, and time of the first [s]
+BLIND_FROM, BLIND = 40.0, 60.0  # s: begin and duration
+WRONG = 0.4  # fraction of the features
+MOVED, MOVED_RADIUS = 1.0, 0.5  # m: displacement of points; size of the region that moves
+FOCAL, OFFSET = 0.05, 0.1  # relative error of the focal length; error of the stamps [s]
+PERIOD = 8.0  # s: period of the motion of the object that covers the images
+GREY = 128  # value of the pixels if nothing is in view
 
 
 @dataclass(frozen=True)
 class Given:
-    """A ``log`` with image files, a generator ``rng``, and a ``folder`` for other files."""
+    """The input of a fault: a ``log`` with image files, a random generator ``rng``, and a ``folder`` for changed images."""
 
     log: Log
     rng: np.random.Generator
@@ -45,7 +45,7 @@ def right(given: Given) -> Log:
 
 
 def damaged(given: Given) -> Log:
-    """Some images are missing, some truncated, some of half the size."""
+    """Return the log with some image files missing, some truncated, and some of half the size."""
     stream = images_of(given.log)
     files = list(stream.file)
     given.folder.mkdir(parents=True, exist_ok=True)
@@ -64,20 +64,20 @@ def damaged(given: Given) -> Log:
 
 
 def black(given: Given) -> Log:
-    """A hundred black images in a row."""
+    """Return the log with a hundred consecutive black images."""
     stream = images_of(given.log)
     first = int(np.searchsorted(stream.t, BLACK_FROM))
     return blank(given.log, range(first, min(first + BLACK, len(stream.t))), 0, given.folder)
 
 
 def nothing_in_view(given: Given) -> Log:
-    """For a minute the camera sees a grey surface."""
+    """Return the log with images of a grey surface for one minute."""
     t = images_of(given.log).t
     return blank(given.log, np.flatnonzero((t >= BLIND_FROM) & (t < BLIND_FROM + BLIND)).tolist(), GREY, given.folder)
 
 
 def object_in_the_way(given: Given) -> Log:
-    """A textured object covers a third of every image, and moves to and fro."""
+    """Return the log with a textured object that covers a third of each image and moves from side to side."""
     stream = images_of(given.log)
     given.folder.mkdir(parents=True, exist_ok=True)
     camera = camera_of(given.log)
@@ -95,19 +95,19 @@ def object_in_the_way(given: Given) -> Log:
 
 
 def wrong_matches(given: Given) -> Log:
-    """Four in ten features of every image have the descriptors of others."""
+    """Return the log with exchanged descriptors of four in ten features of each image."""
     stream = features_of(given.log)
     frames = []
     for frame in stream.frame:
         rows = given.rng.permutation(len(frame.pixels))[: round(WRONG * len(frame.pixels))]
-        looks = frame.descriptors.copy()
-        looks[rows] = looks[np.roll(rows, 1)]
-        frames.append(replace(frame, descriptors=looks))
+        descriptors = frame.descriptors.copy()
+        descriptors[rows] = descriptors[np.roll(rows, 1)]
+        frames.append(replace(frame, descriptors=descriptors))
     return with_stream(given.log, replace(stream, frame=frames))
 
 
 def moved_landmark(given: Given) -> Log:
-    """One part of the map, with the most points around it, has moved by a metre."""
+    """Return the log with a map in which the region with most points is moved by one metre."""
     points = given.log.world.points
     if points is None:
         return given.log
@@ -127,13 +127,13 @@ def wrong_focal(given: Given) -> Log:
 
 
 def late_stamps(given: Given) -> Log:
-    """Images are stamped too late."""
+    """Return the log with stamps of images that are too late."""
     stream = images_of(given.log)
     return with_stream(given.log, replace(stream, t=stream.t + OFFSET))
 
 
 def estimated(change: Change, **uncertainty: float) -> Change:
-    """The fault, with estimation of the wrong constant."""
+    """Return a fault like ``change`` in which the wrong constant has an uncertainty, so that it is estimated."""
 
     def changed(given: Given) -> Log:
         log = change(given)
@@ -143,7 +143,7 @@ def estimated(change: Change, **uncertainty: float) -> Change:
 
 
 def out_of_order(given: Given) -> Log:
-    """Every fifth image arrives after the one that follows it."""
+    """Return the log in which every fifth image arrives after the next image."""
     stream = images_of(given.log)
     order = np.arange(len(stream.t))
     for i in range(0, len(order) - 1, 5):
@@ -152,7 +152,7 @@ def out_of_order(given: Given) -> Log:
 
 
 def other_resolution(given: Given) -> Log:
-    """The rig has the calibration of images of half the size."""
+    """Return the log with a rig whose calibration is that of images of half the size."""
     camera = camera_of(given.log)
     halves = {name: getattr(camera, name) / 2.0 for name in ("fx", "fy", "cx", "cy")}
     return with_camera(given.log, width=camera.width // 2, height=camera.height // 2, **halves)
@@ -201,7 +201,7 @@ def with_camera(log: Log, **changes: Any) -> Log:
 
 
 def blank(log: Log, which: Sequence[int], value: int, folder: Path) -> Log:
-    """Replace the images ``which`` by one grey value."""
+    """Return the log with the images ``which`` replaced by an image of one grey ``value``."""
     stream, camera = images_of(log), camera_of(log)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "blank.jpg"

@@ -1,4 +1,4 @@
-"""What tells where the frame of a drive without a map of points lies: the stated start, and tags."""
+"""The accuracy with which stated start and tags determine the frame of a drive without a map of points."""
 
 from __future__ import annotations
 
@@ -18,16 +18,20 @@ from factors.rfid.detection import RfidLikelihood, TagReadCounts
 
 @dataclass(frozen=True)
 class FrameKnown:
-    """``nees`` of the stated start; ``least``: root mean square error [m] along the path that start and tags leave at least, even
-    where the form of the path is known exactly."""
+    """The accuracy of the frame of a drive. ``nees``: the NEES of the stated start. ``least``: a lower bound of the root mean
+    square error along the path [m]. It holds even if the shape of the path is exactly known."""
 
     nees: float
     least: float
 
 
 def frame_known(log: Log) -> FrameKnown:
-    """The bound is that of a pose that moves the whole path, by the Fisher information of all rounds at the true poses and of the
-    start (van Trees, "Detection, Estimation, and Modulation Theory", part I, 1968, section 2.4)."""
+    """Return the accuracy of the frame of a simulated log.
+
+    The lower bound is the Cramer-Rao bound of a pose that moves the whole path. The Fisher information is that of the stated
+    start and of all inventory rounds at the true poses (van Trees, "Detection, Estimation, and Modulation Theory", part I, 1968,
+    section 2.4).
+    """
     truth, start = log.reference, log.start
     assert truth is not None, "a log to score has a reference"
     assert start is not None, "a simulated log has a start"
@@ -49,7 +53,7 @@ def frame_known(log: Log) -> FrameKnown:
 
 
 def sentence(known: Sequence[FrameKnown]) -> str:
-    """What a reader of the errors has to know of all drives."""
+    """Return a text for the page about the errors of the starts of all drives and their lower bound."""
     count = len(known)
     tails = (1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0
     low, high = (chi2.ppf(tail, 3 * count) / count for tail in tails)

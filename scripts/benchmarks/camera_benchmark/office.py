@@ -1,4 +1,4 @@
-"""Rendered offices with a map from another drive: every estimator with every sensor that it uses."""
+"""Rendered offices with a map from another drive: each estimator, with each set of sensors that it can use."""
 
 from __future__ import annotations
 
@@ -84,6 +84,6 @@ def comparisons(report: Report, found: Attempts) -> None:
 
 
 def localized(drive: Drive, folder: Path, configs: Mapping[str, RunConfig]) -> tuple[dict[str, Attempt], int]:
-    """All runs on one drive, and the number of points in its map."""
+    """Run all configurations on one drive. Returns the outcomes by label, and the number of points in the map."""
     points = map_of(drive, folder)
     return attempts(with_map(log_of(drive, folder), points), configs), len(points)

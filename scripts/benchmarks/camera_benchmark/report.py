@@ -1,4 +1,4 @@
-"""Runs that may fail, and the cells of tables that compare them."""
+"""Runs that may fail, and cells of tables that compare their errors."""
 
 from __future__ import annotations
 
@@ -19,8 +19,11 @@ from factorgraph_loc.text import Notice
 
 @dataclass(frozen=True)
 class Attempt:
-    """A run: ``errors``, ``figures`` (:func:`factorgraph_loc.evaluation.metrics.score`) and ``warnings``; or its ``failure``.
-    ``events``: the text of each, without its time."""
+    """The outcome of a run.
+
+    ``errors``: None if the run failed. ``figures``: its scores (:func:`factorgraph_loc.evaluation.metrics.score`). ``events``:
+    the texts of events, without times. ``failure``: the error message of a failed run, otherwise empty.
+    """
 
     errors: RunErrors | None
     figures: Mapping[str, Any]
@@ -33,7 +36,7 @@ Attempts = Mapping[int, Mapping[str, Attempt]]  # by seed, then by label
 
 
 def attempt(log: Log, config: RunConfig) -> Attempt:
-    """Run an estimator; a failure is a result."""
+    """Run an estimator on a log. An exception is caught and becomes the ``failure`` of the outcome."""
     try:
         result = run(log, config)
     except FglocError as error:
@@ -49,13 +52,13 @@ def attempts(log: Log, configs: Mapping[str, RunConfig]) -> dict[str, Attempt]:
 
 
 def failures(report: Report, found: Attempts) -> None:
-    """Report failed runs."""
+    """Add a line for each failed run to ``report.failed``."""
     for seed, runs in sorted(found.items()):
         report.failed += [f"{label}, seed {seed}: {one.failure}" for label, one in runs.items() if one.failure]
 
 
 def succeeded(found: Attempts, label: str) -> dict[int, RunErrors]:
-    """The errors of a label, by seed."""
+    """Return the errors of the successful runs with a ``label``, by seed."""
     return {
         seed: runs[label].errors  # type: ignore[misc]
         for seed, runs in sorted(found.items())
@@ -64,7 +67,8 @@ def succeeded(found: Attempts, label: str) -> dict[int, RunErrors]:
 
 
 def ratio_cell(found: Attempts, label: str, to: str, kind: str) -> tuple[str, str]:
-    """Pooled position RMSE of one label by that of another with its interval, and the largest of a single log."""
+    """Return two cells: the pooled position RMSE of the runs ``label``, divided by that of the runs ``to``, with its interval;
+    and the largest ratio of a single log. ``kind``: "causal" or "final"."""
     a, b = succeeded(found, label), succeeded(found, to)
     both = sorted(a.keys() & b.keys())
     first, second = ([getattr(of[seed], kind) for seed in both] for of in (a, b))

@@ -1,7 +1,8 @@
-"""Real images: some of 7-Scenes are mapped, others are located in that map one by one, with each kind of feature.
+"""Real images of the data set 7-Scenes: a map is made from some images, and other images are located in this map one by one.
 
-7-Scenes has ``frame-NUMBER.color.jpg`` and ``frame-NUMBER.pose.txt``, 4x4 from camera to world (Shotton et al., "Scene coordinate
-regression forests for camera relocalization in RGB-D images", CVPR 2013).
+This is done with each kind of feature. The files of 7-Scenes are ``frame-NUMBER.color.jpg`` and ``frame-NUMBER.pose.txt``, a matrix
+(4, 4) from camera to world (Shotton et al., "Scene coordinate regression forests for camera relocalization in RGB-D images", CVPR
+2013).
 """
 
 from __future__ import annotations
@@ -33,20 +34,19 @@ COUNT = 1500
 MAPPED = np.arange(0, 200, 2)
 QUERIES = {"A": np.arange(1, 200, 2), "B": np.arange(200, 300)}
 RATE = 15.0  # Hz, nominal: the recording has no stamps
-# camera-intrinsics.txt is that of the depth camera; no calibration comes with the colour images, so the focal length is nominal
+# the focal length is nominal: camera-intrinsics.txt is that of the depth camera, and the colour images have no calibration
 CAMERA = CameraSettings(width=640, height=480, fx=525, fy=525, cx=320, cy=240)
-TURN_SIGMA, SHIFT_SIGMA = 0.002, 0.003  # rad, m: of the reference
-GUESSED = (
-    0.01  # rad, m: standard deviation of a relocalized pose, beside its own, where all points in view are matched again
-)
-ROUNDS = 2  # of matching again
-FEWEST = 12  # points that must agree
+TURN_SIGMA, SHIFT_SIGMA = 0.002, 0.003  # rad, m: standard deviations of the reference
+GUESSED = 0.01  # rad, m: standard deviation that is added to a relocalized pose before points are matched again
+ROUNDS = 2  # number of times that points are matched again
+FEWEST = 12  # least number of points that must agree
 NEAR, TURNED = 0.05, 5.0  # m, degrees: an image with smaller errors is located
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Of each image: ``position`` (F,) [m] of the camera's centre and ``angle`` (F,) [degrees], infinite if it is not located."""
+    """The errors of F located images. ``position`` (F,) [m]: of the camera's centre. ``angle`` (F,) [degrees]: of the rotation.
+    Both are infinite if an image is not located."""
 
     position: Array
     angle: Array
@@ -95,14 +95,14 @@ def read(folder: Path) -> tuple[Log, Cameras]:
 
 
 def mapped(frames: list[CameraFrame], cameras: Cameras) -> MadePoints:
-    """A map of the points that frames show. The lens is a variable of its bundle adjustment."""
+    """Make a map of points from frames with known cameras. The calibration of the camera is adjusted too."""
     known = np.diag(np.repeat(np.square((TURN_SIGMA, SHIFT_SIGMA)), 3))
     posed = PosedFrames(frames, cameras, np.repeat(known[None], len(frames), axis=0))
     return map_points(CAMERA.model(), posed, PointSettings(distance=0.0, angle=0.0, lens=True))
 
 
 def errors_of(made: MadePoints, frames: list[CameraFrame], truth: Cameras) -> Errors:
-    """The errors of frames that are located in a map."""
+    """Locate each frame in a map, and return the errors. ``truth``: the true camera poses."""
     associator = Associator(made.points, made.model)
     position, angle = np.full(len(frames), np.inf), np.full(len(frames), np.inf)
     for i, frame in enumerate(frames):
@@ -114,7 +114,8 @@ def errors_of(made: MadePoints, frames: list[CameraFrame], truth: Cameras) -> Er
 
 
 def camera_of(associator: Associator, made: MadePoints, frame: CameraFrame) -> tuple[Array, Array] | None:
-    """Position (3,) and rotation (3, 3) of a camera: relocalized, then by all points of the map that are in view."""
+    """Locate a frame in a map: relocalize it, and then match all visible points of the map. Returns position (3,) and rotation
+    (3, 3) of the camera, or None."""
     found = associator.relocalized(frame)
     if found is None:
         return None

@@ -1,4 +1,5 @@
-"""SLAM: points are estimated with the poses; identified points in many worlds, images in a few."""
+"""SLAM by a camera: points are estimated together with the poses. Named points are used in many worlds, rendered images in a
+few."""
 
 from __future__ import annotations
 
@@ -15,9 +16,9 @@ from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation import preset, simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
 
-RUNS, DURATION = 50, 120.0  # s; identified points
-RENDERED_RUNS, RENDERED_DURATION = 5, 300.0  # s; images
-FIRST, FIRST_RENDERED = 5000, 7000  # the latter as in the section office
+RUNS, DURATION = 50, 120.0  # with named points: number of drives, and their duration [s]
+RENDERED_RUNS, RENDERED_DURATION = 5, 300.0  # with images: number of drives, and their duration [s]
+FIRST, FIRST_RENDERED = 5000, 7000  # first seeds; those of images are the same as in the section office
 POINTS = 600
 NO_MAP = {"landmarks": "unknown"}
 TARGET = 0.15  # m
@@ -25,7 +26,7 @@ ODOMETRY = ("odometry",)
 
 
 def configs(seen: str) -> dict[str, RunConfig]:
-    """The runs with the sensor ``seen``."""
+    """Return the runs by label. ``seen``: the name of the camera's sensor, "camera" or "sightings"."""
     return {
         "dead_reckoning": RunConfig("dead_reckoning", sensors=ODOMETRY),
         "smoother": RunConfig("smoother", NO_MAP, (*ODOMETRY, seen)),
@@ -84,19 +85,19 @@ def aligned_cells(found: Attempts, label: str) -> tuple[str, str]:
 
 
 def mapped(drive: Drive, folder: Path | None) -> dict[str, Attempt]:
-    """All runs on a drive, whose images are rendered if there is a ``folder`` for them."""
+    """Run all configurations on a drive. ``folder``: the folder of rendered images; None uses named points instead of images."""
     if folder is not None:
         return attempts(log_of(drive, folder), configs("camera"))
     return attempts(simulate(settings(drive, folder), drive.seed), configs("sightings"))
 
 
 def frame(drive: Drive, folder: Path | None) -> FrameKnown:
-    """What tells where the frame of a drive lies."""
+    """Return the accuracy with which start and tags determine the frame of a drive."""
     return frame_known(simulate(settings(drive, folder), drive.seed))
 
 
 def settings(drive: Drive, folder: Path | None) -> SimulationSettings:
-    """Those of a drive, with identified points unless it is rendered."""
+    """Return the settings of the simulation of a drive. If ``folder`` is None, the world has named points."""
     if folder is not None:
         return drive.settings()
     world = {"tags": TAGS, "points": POINTS}

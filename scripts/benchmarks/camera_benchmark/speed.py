@@ -1,4 +1,4 @@
-"""Run times; one process at a time, except for parallel feature detection."""
+"""Computing times with a camera, measured in one process at a time. Only the detection of features uses several threads."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from factorgraph_loc.vision.association import Associator
 from factorgraph_loc.vision.feature_cache import VARIABLE
 from factorgraph_loc.vision.tracks import FeatureTracker
 
-POINTS = 3000  # enough for 20 in view nearly always
+POINTS = 3000  # so many that nearly always at least 20 are in view
 SEED = 0
-WARM_UP = 20.0  # s of another drive, to exclude compilation
+WARM_UP = 20.0  # s of another drive, which is run before, so that compilation is not measured
 DURATION = 300.0  # s
 FIRST = 6000
 IMAGES, RENDERED = 600, 200
@@ -38,7 +38,8 @@ ALL, SEEN = ("odometry", "rfid", "sightings"), ("odometry", "sightings")
 
 @dataclass(frozen=True)
 class Steps:
-    """A run whose steps are timed: its measurements, the configuration, and the targets [ms], median and 99 %."""
+    """A run whose steps are timed. ``what``: a description for the table. ``changes``: settings of the simulation. ``target``
+    [ms]: the targets of median and 99th percentile, as a text."""
 
     what: str
     changes: Mapping[str, Any]
@@ -64,7 +65,8 @@ STEPS = (
 
 @dataclass(frozen=True)
 class Links:
-    """Seconds for a drive with ``images``, and a map of ``points``."""
+    """The computing times of a drive with ``images`` and a map of ``points`` [s]: to detect features, to track them, to match
+    them with the map, and to run the smoother."""
 
     images: int
     feature: str
@@ -83,7 +85,7 @@ def section(options: Options) -> Report:
 
 
 def chain(report: Report, options: Options) -> None:
-    """From images to poses, and the rendering speed."""
+    """Report the times of all steps from images to poses, and the speed of the renderer."""
     for links in report.collect(chained, {"chain": (options.drives,)}, workers=1).values():
         report.say(
             f"{links.images} files of 640 x 480 px, at most {COUNT} features (`{links.feature}`) in each, in a map of "
@@ -117,7 +119,7 @@ def estimators(report: Report, duration: float) -> None:
 
 
 def chained(kept: Path) -> Links:
-    """From the files of a drive to its poses, without a cache."""
+    """Measure the times of all steps from image files to poses, without cached features."""
     drive = Drive(FIRST, FIRST, IMAGES / RATE)
     points = map_of(drive, kept)
     config = RunConfig("smoother", {"lag": 10.0}, ("odometry", "rfid", "camera"))
@@ -144,7 +146,7 @@ def chained(kept: Path) -> Links:
 
 
 def rendered() -> float:
-    """Images per second, without the scene and compilation."""
+    """Return the number of rendered images per second. The creation of the scene and compilation are not measured."""
     drive = Drive(FIRST, FIRST, RENDERED / RATE)
     images = iter(film(drive.settings(), drive.seed))
     next(images)
@@ -155,7 +157,7 @@ def rendered() -> float:
 
 @contextmanager
 def spent(owner: object, name: str) -> Iterator[list[float]]:
-    """Record the seconds of each call of a function of a module or class."""
+    """Record the duration [s] of each call of the function ``name`` of a module or class. Yields the list of durations."""
     function, seconds = getattr(owner, name), []
 
     def timed_call(*arguments: Any, **named: Any) -> Any:
@@ -173,7 +175,8 @@ def spent(owner: object, name: str) -> Iterator[list[float]]:
 
 
 def timed(steps: Steps, duration: float) -> tuple[np.ndarray, float, str]:
-    """Milliseconds (M,) of each step, mean number of points per image, and number of points with known depth."""
+    """Run and time the steps. Returns the time (M,) [ms] of each step, the mean number of points per image, and the number of
+    estimated points as a text."""
     run(simulate(preset("office", changed(steps, WARM_UP)), SEED + 1), steps.config)
     log = simulate(preset("office", changed(steps, duration)), SEED)
     _, counts = np.unique(log.streams["sightings"].t, return_counts=True)
