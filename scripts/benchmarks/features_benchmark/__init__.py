@@ -1,4 +1,4 @@
-"""Point features of images: the sections of docs/features.md."""
+"""Benchmark of point features of images: the sections of docs/features.md."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ SPEED_SIZE, SPEED_COUNT, ROUNDS = (640, 480), 500, 15
 
 
 def oxford(options: Options) -> list[Sequence]:
-    """The sequences of images."""
+    """Return the image sequences of the Oxford data set."""
     root = find_data_root(options.data_root, "features")
     return find_sequences([root / "oxford_affine" / name for name in SEQUENCES])
 
 
 def sequences_section(options: Options) -> Report:
-    """All features on the sequences, and as chance random points with the sizes of SIFT's."""
+    """Evaluate all features on image sequences. Random points with the sizes of SIFT's points show the scores of chance."""
     report, sequences = Report("sequences", options), oxford(options)
     others = [
         Feature("colour, of grey images", of_grey()),
@@ -47,7 +47,7 @@ def sequences_section(options: Options) -> Report:
 
 
 def of_grey():
-    """Colour features without colours."""
+    """Return a detector of colour features that uses grey images."""
     features = ColourExtractor(COUNT)
 
     def find(image):
@@ -57,13 +57,13 @@ def of_grey():
 
 
 def each_once():
-    """A detector of SIFT's points without duplicates for several orientations."""
+    """Return a detector of SIFT's points. A point with several orientations is returned once."""
     every = extractor(STANDARD, 10 * COUNT)
     return lambda image: (distinct(every.detect(image))[:COUNT], None)
 
 
 def chance():
-    """A detector of as many random points as SIFT finds in an image, with the same sizes."""
+    """Return a detector of random points. Their number and sizes are those of SIFT's points in the same image."""
     rng = np.random.default_rng(0)
     standard = extractor(STANDARD, COUNT)
 
@@ -77,7 +77,8 @@ def chance():
 
 
 def speed_section(options: Options) -> Report:
-    """Time each feature in turn, many times, so that other load affects all of them alike."""
+    """Measure the computing time of each feature. Features take turns many times, so that other load affects all of them
+    equally."""
     report = Report("speed", options)
     cv2.setNumThreads(1)
     (scene,) = (sequence.first for sequence in oxford(options) if sequence.name == "graf")

@@ -1,4 +1,4 @@
-"""Faults that nobody told the rig: what the estimators make of them, and which they name."""
+"""Benchmark of faults that the rig does not contain: the errors of the estimators, and the faults that they detect."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WRONG = 0.5  # m
 
 
 def section(name: str, options: Options) -> Report:
-    """A table of one case."""
+    """Run all estimators on a case, and return its table. ``name``: a key of :data:`CASES`."""
     report = Report(name, options)
     jobs = {(e, seed): (name, seed, e) for e in ESTIMATORS for seed in range(1, options.count(SEEDS) + 1)}
     rows = report.collect(figures, jobs)
@@ -28,7 +28,7 @@ def section(name: str, options: Options) -> Report:
 
 
 def figures(name: str, seed: int, estimator: str) -> tuple[str, ...]:
-    """The cells of a row."""
+    """Run an estimator on a case with and without the fault. Returns the cells of a row."""
     log, right = CASES[name](seed)
     run, without = fgloc.run(log, estimator), fgloc.run(right, estimator)
     result, scores = run.result, run.scores

@@ -1,8 +1,12 @@
-"""Logs of robots with faults that nobody told the rig, each beside the log or the rig without the fault.
+"""Logs with faults that rig and map do not contain. Each is returned together with the log without the fault.
 
-wall: wheels turn at a wall for 10 s, in view of four radio anchors. blocked: one of these anchors reads 1.2 m too far for 40 s.
-plaza: wheels report 1 m/s too much for 10 s, in the recording Plaza2. slip: 0.5 m, twice, among tags. carried: for 20 s, wheels at
-rest, reads go on. moved: a quarter of the tags is 1 m off. turned: all antennas by 10 degrees. late: reads are stamped 0.15 s late.
+wall: the robot is stopped by a wall, and its wheels turn for 10 s; it measures ranges to four radio anchors.
+blocked: the ranges to one of these anchors are 1.2 m too long for 40 s.
+plaza: the wheels report 1 m/s too much for 10 s, in the recording Plaza2.
+slip: the wheels slip by 0.5 m, twice; the robot reads tags.
+carried: the robot is carried for 20 s with resting wheels, and reads tags on the way.
+moved: a quarter of the tags is 1 m away from its position in the map.
+turned: all antennas are turned by 10 degrees. late: the stamps of reads are 0.15 s too late.
 """
 
 from collections.abc import Callable
@@ -29,7 +33,8 @@ Case = tuple[Log, Log]  # with the fault, and without it
 
 
 def radios(seed: int, *, slips: float = 0.0, blocked: float = 0.0) -> Log:
-    """A circle of 120 s among radio anchors. From 40 s on the wheels slip, or anchor c is blocked, for so long [s]."""
+    """Simulate a drive of 120 s in a circle among radio anchors. ``slips``, ``blocked`` [s]: from 40 s on, the wheels slip for this
+    time, and the radio of anchor c is blocked for this time."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, 120.0, STEP)
     stands = (t >= 40.0) & (t < 40.0 + slips)
     poses = [np.array((4.0, 2.0, 0.3))]
@@ -49,7 +54,8 @@ def radios(seed: int, *, slips: float = 0.0, blocked: float = 0.0) -> Log:
 
 
 def wheels_changed(log: Log, begin: float, end: float, share: float, more: float) -> Log:
-    """The log whose odometry reports ``share`` of its motion in a time, and ``more`` metres in each second of that."""
+    """Return the log with changed odometry between the times ``begin`` and ``end`` [s]. The reported motion is multiplied by
+    ``share``, and ``more`` [m/s] is added to its speed."""
     odometry = log.streams["odometry"]
     within = (odometry.t > begin) & (odometry.t <= end)
     kept, dt = np.where(within, share, 1.0), np.diff(odometry.t, prepend=odometry.t[0])
@@ -59,7 +65,7 @@ def wheels_changed(log: Log, begin: float, end: float, share: float, more: float
 
 
 def office(seed: int, seconds: float, **faults: float) -> Log:
-    """A drive among 40 tags."""
+    """Simulate a drive through an office with 40 tags. ``faults``: settings of simulated faults."""
     return fgloc.simulate("office", seed, changes={"drive": {"duration": seconds}, "faults": faults})
 
 
@@ -98,7 +104,7 @@ def late(seed: int) -> Case:
     return replace(log, streams={**log.streams, "rfid": replace(reads, t=reads.t + LATE)}), log
 
 
-# the log of a case and the one without its fault, for a seed
+# by name of the case, a function that returns for a seed the log with the fault and the log without it
 CASES: dict[str, Callable[[int], Case]] = {
     "wall": lambda seed: (radios(seed, slips=10.0), radios(seed)),
     "blocked": lambda seed: (radios(seed, blocked=40.0), radios(seed)),

@@ -1,4 +1,4 @@
-"""Localization by landmarks on recorded logs: sections of docs/results.md and docs/consistency.md, and the quick benchmark."""
+"""Benchmark of localization by landmarks on recorded logs: sections of docs/results.md and docs/consistency.md, and --quick."""
 
 from landmarks_benchmark import peers, speed, starts
 

@@ -1,4 +1,4 @@
-"""What is measured: a workload returns its processor time, and those of this project beside the references."""
+"""Workloads whose processor time is measured: estimators of this project, and reference programs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ CONFIGS: Mapping[str, RunConfig] = {
 
 @dataclass(frozen=True)
 class Times:
-    """Processor times: ``seconds`` of a workload, ``update_ms`` (M,) of its updates; ``position`` [m]: its RMSE."""
+    """The processor times of a workload. ``seconds``: the total. ``update_ms`` (M,): of each update. ``position`` [m]: the
+    position RMSE of its estimates."""
 
     seconds: float
     update_ms: Array = field(default_factory=lambda: np.empty(0))
@@ -45,7 +46,7 @@ Name = TypeVar("Name")
 
 
 def timed_loop(loop: Loop, problem: Problem) -> Work:
-    """The workload of a reference program."""
+    """Return the workload of a reference program. A workload is a function that runs it once and returns its times."""
 
     def work() -> Times:
         started = process_time()
@@ -57,7 +58,8 @@ def timed_loop(loop: Loop, problem: Problem) -> Work:
 
 
 def timed_run(log: Log, config: RunConfig, problem: Problem | None = None) -> Work:
-    """The workload of an estimator; its error is known with the problem of the log."""
+    """Return the workload of an estimator of this project. With ``problem``, which has the true poses, its error is computed
+    too."""
 
     def work() -> Times:
         with patch(f"{RUNS}.run.perf_counter", process_time), patch(f"{RUNS}.causal_run.perf_counter", process_time):
@@ -72,14 +74,18 @@ def timed_run(log: Log, config: RunConfig, problem: Problem | None = None) -> Wo
 
 
 def seconds_of(result: RunResult) -> float:
-    """Of the loop over the measurements; and to the final trajectory, where the whole problem is solved for it."""
+    """Return the processor time [s] of the loop over the measurements. For estimators that solve the whole problem at the end,
+    the time of the final trajectory is added."""
     estimator, settings = result.config["estimator"], result.config["settings"]
     whole = estimator == "batch" or (estimator == "smoother" and settings.get("lag") is None)
     return result.timings.causal_seconds + (result.timings.final_seconds if whole else 0.0)
 
 
 def least(pairs: Mapping[Name, tuple[Work, Work]], rounds: int) -> dict[Name, tuple[Times, Times]]:
-    """The least times of both workloads of each pair. A round before, which compiles, does not count."""
+    """Run pairs of workloads several times in turn. Returns the smallest times of both workloads of each pair.
+
+    Before the measured ``rounds``, each workload runs once, so that compilation is not measured.
+    """
     found: dict[Name, tuple[list[Times], list[Times]]] = {name: ([], []) for name in pairs}
     for i in range(rounds + 1):
         for name, works in pairs.items():

@@ -1,6 +1,6 @@
-"""Our estimators beside loops around other packages, on one recorded log, with the same noise and scorer.
+"""Comparison of the estimators of this project with programs that use other packages, on one recorded log and with the same noise.
 
-What counts is the processor time of the loop alone. All take turns, and the least of the times of each counts.
+The processor time of the loop over the measurements is compared. All programs take turns, and the smallest time of each is used.
 """
 
 from __future__ import annotations

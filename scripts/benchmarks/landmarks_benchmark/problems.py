@@ -1,4 +1,4 @@
-"""Logs of odometry and landmarks as plain numbers, which reference programs take, and the log that the quick benchmark makes."""
+"""Conversion of logs with odometry and landmarks to plain numbers for reference programs, and the log of the quick benchmark."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ SIGHTINGS = {"rate": 5.0, "field_of_view": 1.2}
 
 
 def landmark_log(seconds: float) -> Log:
-    """A drive through an office whose walls carry landmarks, seen by a camera that measures depths."""
+    """Simulate a drive of ``seconds`` [s] through an office with landmarks on its walls. A camera measures their depth and
+    bearing."""
     world = {"tags": 1, "landmarks": 30}
     settings = {"world": world, "drive": {"duration": seconds}, "rig": RIG, "sightings": SIGHTINGS}
     log = simulate(preset("office", settings), SEED)
@@ -46,7 +47,7 @@ def landmark_log(seconds: float) -> Log:
 
 
 def problem_of(log: Log) -> Problem:
-    """The problem of a log with odometry, landmarks at known places, and a reference."""
+    """Convert a log with odometry, landmarks at known positions, and a reference to plain numbers."""
     prior, _ = resolve_prior(log, None)
     assert prior is not None
     assert log.reference is not None
@@ -74,7 +75,7 @@ def problem_of(log: Log) -> Problem:
 
 
 def _moves(log: Log, stamps: Array) -> Array:
-    """The motion between neighbouring ``stamps``: until when, for how long, speed and turn rate."""
+    """Return the motions (N, 4) between consecutive ``stamps``: end [s], duration [s], speed [m/s] and turn rate [rad/s]."""
     motion = whole_motion(log, SENSORS)
     states = [motion.state(t) for t in stamps.tolist()]
     moves = []
@@ -87,7 +88,7 @@ def _moves(log: Log, stamps: Array) -> Array:
 
 
 def _sightings(log: Log, start: float) -> tuple[Array, Array]:
-    """``sightings`` and ``raw`` of a problem."""
+    """Return the arrays ``sightings`` and ``raw`` of :class:`Problem`, for measurements from the time ``start`` [s] on."""
     model = log.rig.of(BearingRangeSettings).model()
     seen: list[Sequence[float]] = []
     raw: list[Sequence[float]] = []

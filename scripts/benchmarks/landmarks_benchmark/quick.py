@@ -1,7 +1,8 @@
-"""The quick benchmark: how long our estimators take, as ratios to fixed reference workloads of the same run.
+"""The quick benchmark: the computing times of estimators, divided by the times of reference workloads in the same run.
 
-A reference is plain code that this project's changes do not touch, so that its time stands for the speed of the machine at that
-moment. Both take turns, and the least of the times of each counts. All is processor time, in one process, on simulated logs.
+A reference workload is plain code that does not depend on this project. Its time shows the speed of the machine at that moment.
+Estimator and reference take turns, and the smallest time of each is used. All times are processor times in one process, on
+simulated logs.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from landmarks_benchmark.ours import CONFIGS, PARTICLES, Times, Work, least, tim
 from landmarks_benchmark.problems import landmark_log, problem_of
 from landmarks_benchmark.programs import gtsam_loops, numpy_filters
 
-SECONDS = 120.0  # of the drive among landmarks
-OTHER_SECONDS = 30.0  # of those among tags and points
+SECONDS = 120.0  # duration of the drive among landmarks
+OTHER_SECONDS = 30.0  # duration of the drives among tags and among points
 ROUNDS = 3
 BESIDE = {
     "EKF": "numpy EKF",
@@ -41,12 +42,11 @@ BESIDE = {
     "particle filter, 5,000": "numpy particles",
     "batch": "GTSAM, batch",
 }
-WORSE = 1.25  # times the stored ratio
-"""A ratio that is farther above the stored one is a loss of speed."""
+WORSE = 1.25  # an estimator has become slower if its ratio exceeds the stored ratio by this factor
 
 
 def losses(found: Mapping[str, float], stored: Mapping[str, float]) -> list[str]:
-    """A line for each ratio that is worse than the stored one by more than :data:`WORSE`."""
+    """Return a line for each ratio in ``found`` that exceeds the ``stored`` one by more than the factor :data:`WORSE`."""
     return [
         f"{name}: {found[name]:.2f}, was {before:.2f}"
         for name, before in stored.items()
@@ -55,16 +55,19 @@ def losses(found: Mapping[str, float], stored: Mapping[str, float]) -> list[str]
 
 
 def read_ratios(path: Path) -> dict[str, float]:
-    """The ratios that a run stored. Raises InputError if the file holds none."""
+    """Read the ratios that an earlier run stored. Raises InputError if the file contains none."""
     try:
         ratios = json.loads(read_text(path))["ratios"]
         return {str(name): float(value) for name, value in ratios.items()}
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: expected a table that scripts/bench --quick has stored") from error
+        raise InputError(
+            f"{path}: contains no ratios, expected a file that scripts/bench --quick has written"
+        ) from error
 
 
 def quick(out: Path, against: Path | None) -> int:
-    """Measure, print the table, and store it; the exit code is 1 if a ratio is worse than the one of ``against``."""
+    """Measure all ratios, print them as a table, and store them in ``out``. Returns the exit code: 1 if a ratio is worse than
+    that in the file ``against``, otherwise 0."""
     stored = read_ratios(against) if against is not None else {}
     out.parent.mkdir(parents=True, exist_ok=True)
     pairs, beside = workloads()
@@ -84,7 +87,8 @@ def quick(out: Path, against: Path | None) -> int:
 
 
 def workloads() -> tuple[dict[str, tuple[Work, Work]], dict[str, str]]:
-    """All pairs of ours and a reference, and the name of the reference, by name."""
+    """Return all pairs of a workload of this project and a reference workload, and the names of the references, both by name of the
+    workload."""
     log, tags, points, picture = landmark_log(SECONDS), _tags(), _points(), _picture()
     problem = problem_of(log)
     references = {
@@ -112,7 +116,8 @@ def workloads() -> tuple[dict[str, tuple[Work, Work]], dict[str, str]]:
 
 
 def _pushed(log: Log) -> Times:
-    """The measurements of a log, one after the other, with an estimate after each stamp with landmarks."""
+    """Push the measurements of a log to a localizer, and ask for an estimate after each measurement of landmarks. Returns the
+    time."""
     assert log.start is not None
     localizer = Localizer(log.rig, log.world, "ekf", settings={"self_calibration": False})
     localizer.initialize(log.start.pose, np.diag(np.square(log.start.sigmas)), log.start.t)

@@ -1,4 +1,4 @@
-"""Times of estimators on one log, and of the command line."""
+"""Computing times of estimators on one log, and the time to start the command line."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def section(options: Options) -> Report:
     }
     rows = []
     for key, trials in report.collect(run_trials, jobs).items():
-        # stamps corrected by the rig may lie slightly before the cut
+        # by the time offsets of the rig, the first estimate may be slightly before the start: the time is then 0
         median = max(0.0, np.nanmedian([trial.seconds for trial in trials]))
         at = ", ".join(f"{trial.t:.0f}" for trial in trials if not trial.right) or NOTHING
         right, false = (sum(getattr(trial, what) for trial in trials) for what in ("right", "false"))

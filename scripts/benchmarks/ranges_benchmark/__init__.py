@@ -1,4 +1,4 @@
-"""Ranges to beacons at unknown positions: the section of docs/ranges.md."""
+"""Benchmark of ranges to beacons at unknown positions: a section of docs/ranges.md."""
 
 from ranges_benchmark import pyfg
 

@@ -1,4 +1,5 @@
-"""GTSAM alone on the factor graph of a PyFG file: from the true poses, and incrementally without them."""
+"""Solutions of the factor graph of a PyFG file by GTSAM alone: a batch solution from the true poses, and an incremental
+solution."""
 
 from __future__ import annotations
 
@@ -14,16 +15,21 @@ from scipy.optimize import least_squares
 Array = NDArray[np.float64]
 Range = tuple[str, float, float]  # to a beacon, with its variance
 
-EVERY, READ_EVERY = 25, 200  # poses per update, and per estimate of all poses
-WAITING, PATIENCE = 100, 400  # ranges before a beacon is located; after so many one is in spite of an alternative
-STARTS = 12  # positions around the path
-ALTERNATIVE, BETTER = 3.0, 1.5  # m from the best position; ratio of costs at which one is no alternative
+EVERY, READ_EVERY = 25, 200  # number of poses between two updates, and between two estimates of all poses
+# a beacon is located after WAITING ranges. While another position is about as likely, it waits for up to PATIENCE ranges
+WAITING, PATIENCE = 100, 400
+STARTS = 12  # number of initial positions around the path
+# another position is an alternative if it is ALTERNATIVE m away from the best one and its cost is less than BETTER times as large
+ALTERNATIVE, BETTER = 3.0, 1.5
 
 
 @dataclass
 class Graph:
-    """``poses`` (N, 3): the true ones; ``beacons``: the true positions; ``steps``: motions (N-1, 3) and covariances; ``ranges``: by
-    number of their pose."""
+    """The content of a PyFG file.
+
+    ``poses`` (N, 3): the true poses. ``beacons``: the true positions by name. ``steps``: the measured motions between consecutive
+    poses, with their noise. ``ranges``: the measured ranges by number of the pose.
+    """
 
     poses: Array
     beacons: dict[str, Array]
@@ -32,7 +38,7 @@ class Graph:
 
     @staticmethod
     def of(path: Path) -> Graph:
-        """The graph of a file."""
+        """Read a PyFG file."""
         poses, numbers, beacons, steps = [], {}, {}, []
         ranges: dict[int, list[Range]] = defaultdict(list)
         for kind, *cells in (line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()):
@@ -52,33 +58,33 @@ class Graph:
         return Graph(np.array(poses), beacons, steps, ranges)
 
     def start(self, pose: gtsam.Pose2) -> gtsam.NonlinearFactor:
-        """An exact prior of the first pose."""
+        """Return a prior that fixes the first pose."""
         return gtsam.PriorFactorPose2(key("x", 0), pose, gtsam.noiseModel.Isotropic.Sigma(3, 1e-3))
 
     def step(self, i: int) -> gtsam.NonlinearFactor:
-        """The motion to pose ``i``."""
+        """Return the factor of the motion to pose number ``i``."""
         move, noise = self.steps[i - 1]
         return gtsam.BetweenFactorPose2(key("x", i - 1), key("x", i), move, noise)
 
     def range(self, i: int, measured: Range) -> gtsam.NonlinearFactor:
-        """A range from pose ``i``."""
+        """Return the factor of a range from pose number ``i``."""
         name, distance, variance = measured
         return gtsam.RangeFactor2D(
             key("x", i), self.beacon(name), distance, gtsam.noiseModel.Isotropic.Variance(1, variance)
         )
 
     def beacon(self, name: str) -> int:
-        """The key of a beacon."""
+        """Return the key of the position of a beacon."""
         return key("l", list(self.beacons).index(name))
 
 
 def key(letter: str, number: int) -> int:
-    """The key of a variable."""
+    """Return GTSAM's key of a variable."""
     return int(gtsam.symbol(letter, number))
 
 
 def from_truth(graph: Graph) -> Array:
-    """The positions (N, 2) after Levenberg-Marquardt from the true poses and beacons."""
+    """Solve the graph by Levenberg-Marquardt, starting at the true poses and beacons. Returns the positions (N, 2) of the poses."""
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     factors.add(graph.start(gtsam.Pose2(*graph.poses[0])))
     for i, pose in enumerate(graph.poses):
@@ -94,7 +100,10 @@ def from_truth(graph: Graph) -> Array:
 
 
 def incremental(graph: Graph) -> Array:
-    """The positions (N, 2) of iSAM2, which locates each beacon once, by least squares from starts around the path."""
+    """Solve the graph by iSAM2, without true values. Returns the positions (N, 2) of the poses.
+
+    The initial position of a beacon is computed by least squares, starting from several positions around the path.
+    """
     isam, factors, values = gtsam.ISAM2(gtsam.ISAM2Params()), gtsam.NonlinearFactorGraph(), gtsam.Values()
     known: set[str] = set()
     waiting: dict[str, list[tuple[int, Range]]] = defaultdict(list)
@@ -134,7 +143,10 @@ def incremental(graph: Graph) -> Array:
 
 
 def located(poses: list[gtsam.Pose2], rows: list[tuple[int, Range]]) -> Array | None:
-    """The position (2,) that explains ranges, None if there is an alternative."""
+    """Locate a beacon by its ranges. Returns its position (2,), or None if another position explains the ranges nearly as well.
+
+    ``rows``: pairs of the number of a pose and a range. ``poses``: the current estimates.
+    """
     places = np.array([poses[i].translation() for i, _ in rows])
     distances = np.array([distance for _, (_, distance, _) in rows])
     angles = np.arange(STARTS) * 2.0 * np.pi / STARTS

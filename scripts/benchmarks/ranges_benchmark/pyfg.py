@@ -1,4 +1,4 @@
-"""PyFG files of ranges to beacons at unknown positions: the smoother beside GTSAM alone."""
+"""The smoother compared with GTSAM alone, on PyFG files of ranges to beacons at unknown positions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ranges_benchmark import graphs
 FILES = ("pyfg/plaza1.pyfg", "pyfg/plaza2.pyfg")
 T = TypeVar("T")
 CONFIG = RunConfig("smoother", {"landmarks": "unknown"})
-WARM_UP = 60.0  # s of the log, which are run before to exclude compilation
+WARM_UP = 60.0  # s: the first part of the log is run before, so that compilation is not measured
 HEADS = ("file", "estimator", "final, aligned [m]", "beacons, aligned [m]", "processor time [s]", "ratio to iSAM2")
 
 
@@ -37,7 +37,7 @@ def section(options: Options) -> Report:
 
 
 def compared(path: Path) -> list[tuple[str, ...]]:
-    """The rows of one file."""
+    """Solve one file by three methods, and return the rows of the table."""
     log, graph = read_log(path), graphs.Graph.of(path)
     run(cut(log, 0.0, WARM_UP), CONFIG)
     truth, from_truth = timed(lambda: graphs.from_truth(graph))
@@ -63,12 +63,12 @@ def compared(path: Path) -> list[tuple[str, ...]]:
 
 
 def timed(call: Callable[[], T]) -> tuple[T, float]:
-    """A result, and the processor time that it took [s]."""
+    """Call a function. Returns its result and its processor time [s]."""
     started = time.process_time()
     return call(), time.process_time() - started
 
 
 def aligned(positions: Array, poses: Array) -> float:
-    """The root mean square error [m] of positions (N, 2) after alignment with true poses (N, 3)."""
+    """Align ``positions`` (N, 2) with the true ``poses`` (N, 3), and return the root mean square error [m]."""
     moved = se2.transform_from(se2.align_points(positions, poses[:, :2]), positions)
     return float(np.sqrt(np.mean(np.sum((moved - poses[:, :2]) ** 2, axis=1))))

@@ -1,4 +1,4 @@
-"""Public recordings: the section of docs/recordings.md."""
+"""Benchmark on public recordings: the section of docs/recordings.md."""
 
 from recordings_benchmark.recordings import section
 

@@ -1,4 +1,4 @@
-"""The list of recordings: origin, licence, and conversion."""
+"""The list of public recordings, with origin, licence and conversion."""
 
 from __future__ import annotations
 
@@ -12,9 +12,13 @@ LIST = Path(__file__).with_name("recordings.toml")
 
 @dataclass(frozen=True)
 class Recording:
-    """``kind``: conversion function of :mod:`recordings_benchmark.prepare`, with its ``options``. ``prior``: of logs without a
-    start; ``seconds``: maximum duration. ``odometry``, ``others``: origin of the odometry, and the other sensors, as texts for
-    the table. ``files``: the URL of each by its local name."""
+    """A public recording.
+
+    ``kind``, ``options``: the conversion function in :mod:`recordings_benchmark.prepare`, and its options.
+    ``odometry``, ``others``: texts for the table: the origin of the odometry, and the other sensors.
+    ``files``: the URL of each file by its local name. ``prior``: the start of the runs, None for that of the log. ``seconds``:
+    only so much of the recording is used, None for all.
+    """
 
     name: str
     title: str
@@ -30,7 +34,7 @@ class Recording:
 
 
 def listed() -> tuple[Recording, ...]:
-    """Those of ``recordings.toml``."""
+    """Return the recordings of ``recordings.toml``."""
     content = tomllib.loads(LIST.read_text(encoding="utf-8"))
     found = []
     for entry in content["recording"]:

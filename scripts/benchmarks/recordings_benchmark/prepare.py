@@ -1,4 +1,4 @@
-"""Conversion of recordings to logs."""
+"""Download of public recordings, and their conversion to logs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ from factors.se2 import Array
 from recordings_benchmark.listed import Recording
 
 ODOMETRY_SEED = 1
-# the trolley's anchors [m], and position of its tag 0; its body frame is upside down, so that y is to the right
+# recording of a trolley: positions of the anchors [m], and of tag 0 in the body frame. This frame is upside down, with y to the
+# right
 ANCHORS = (
     (-3.4203, 3.0053),
     (0.0016, 3.0110),
@@ -42,12 +43,14 @@ ANCHORS = (
     (-3.4858, -0.0098),
 )
 TAG = (-0.0689, 0.1423)
-TAGS, THINNED = 3, 10  # ranges per row; decimation factor, to 10 Hz
+TAGS, THINNED = 3, 10  # number of tags in a row; every tenth row is used, which results in 10 Hz
 
 
 def prepare(recording: Recording, folder: Path, out: Path) -> Log:
-    """The log of a recording with files in ``folder``, also written to ``out``. Raises InputError for damaged files, and for
-    missing ones that cannot be fetched."""
+    """Convert a recording to a log, and write the log to ``out``. Missing files are downloaded to ``folder``.
+
+    Raises InputError for damaged files, and for files that cannot be downloaded.
+    """
     paths = [folder / name for name in recording.files]
     for path, url in zip(paths, recording.files.values(), strict=True):
         try:
@@ -55,7 +58,7 @@ def prepare(recording: Recording, folder: Path, out: Path) -> Log:
                 with replacing(path) as temporary:
                     urlretrieve(url, temporary)
         except OSError as error:
-            raise InputError(f"{path}: cannot be fetched from {url}: {error}") from error
+            raise InputError(f"{path}: cannot be downloaded from {url}: {error}") from error
     if recording.kind == "bag":
         return _bag(recording, paths[0], out)
     log = KINDS[recording.kind](recording, paths)
@@ -64,7 +67,7 @@ def prepare(recording: Recording, folder: Path, out: Path) -> Log:
     target = out / recording.name
     if not target.exists():
         write_native(log, target)
-    # use what was written
+    # return the log as read from its files
     return load(target)[0]
 
 
@@ -79,7 +82,7 @@ def _bag(recording: Recording, path: Path, out: Path) -> Log:
 
 
 def _librsf(recording: Recording, paths: list[Path]) -> Log:
-    """libRSF's text format: lines of a name, a stamp and numbers."""
+    """Convert files in the text format of libRSF. A line has a name, a stamp and numbers."""
     rows: dict[str, list[list[float]]] = {}
     for path in paths:
         for line in path.read_text(encoding="utf-8").splitlines():
@@ -89,12 +92,12 @@ def _librsf(recording: Recording, paths: list[Path]) -> Log:
     landmarks: dict[str, Landmark] = {}
     streams: dict[str, Stream] = {}
     if "odom2diff" in tables:
-        # as in libRSF's own factor (OdometryFactor2DDifferential.h): left before right, and half of the track
+        # columns as in libRSF's factor (OdometryFactor2DDifferential.h): left and right speed, unused, half of the track width
         t, left, right, _, half = tables["odom2diff"].T[:5]
         streams["odometry"] = VelocityStream(t, (left + right) / 2.0, (right - left) / (2.0 * half))
     else:
         t, *velocity = tables["odom2"].T[:4]
-        # a row contains the motion up to its stamp
+        # a row contains the velocity from the previous stamp to its stamp
         moves = np.stack(velocity, axis=-1) * np.diff(t, prepend=t[0])[:, None]
         streams["odometry"] = IncrementStream(t, *np.ascontiguousarray(moves.T))
     if "range2" in tables:
@@ -110,7 +113,8 @@ def _librsf(recording: Recording, paths: list[Path]) -> Log:
 
 
 def _trajectory(recording: Recording, paths: list[Path]) -> Log:
-    """A reference only: the odometry is simulated, or the motion between the poses of another program."""
+    """Convert files of poses. The first file is the reference. The odometry is the motion between the poses of the second file.
+    If there is no second file, the odometry is simulated."""
     axis = "xyz".index(recording.options.get("axis", "x"))
     if recording.options["format"] == "kitti":
         times = paths.pop(1)
@@ -129,14 +133,16 @@ def _trajectory(recording: Recording, paths: list[Path]) -> Log:
 
 
 def _planar(path: PosePath, axis: int) -> Trajectory:
-    """Poses from above; ``axis``: the one whose direction is the heading. A camera, or the IMU of EuRoC, looks along z."""
+    """Project poses in space to the plane. ``axis``: the body axis whose direction is the heading. It is z for a camera and for
+    the IMU of EuRoC."""
     ahead = path.rotations[:, :, axis]
     poses = np.column_stack((path.positions[:, :2], np.arctan2(ahead[:, 1], ahead[:, 0])))
     return Trajectory(path.seconds(), poses)
 
 
 def _trolley(recording: Recording, paths: list[Path]) -> Log:
-    """Ranges of one tag of three, and motion capture, from which wheel odometry is simulated."""
+    """Convert the recording of a trolley with radio ranges and motion capture. The ranges of one of its three tags are used. Its
+    wheel odometry is simulated from the motion capture."""
     capture, ranges = (_dated(path) for path in paths)
     t0 = float(max(capture[0, 0], ranges[0, 0]))
     x, y, qw, qx, qy, qz = capture[:, (1, 2, 4, 5, 6, 7)].T
@@ -159,7 +165,8 @@ def _trolley(recording: Recording, paths: list[Path]) -> Log:
 
 
 def _dated(path: Path) -> Array:
-    """Rows of a date and numbers, as seconds of the day and numbers; others are NaN."""
+    """Read a CSV file whose rows have a date and numbers. Returns rows of the seconds of the day and the numbers, NaN for empty
+    cells."""
     out = []
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.reader(file):

@@ -1,4 +1,5 @@
-"""Results of the estimators on the recordings: position RMSE of causal and final estimates, or why there is none."""
+"""Results of all estimators on public recordings: position RMSE of causal and final estimates, or the reason for a missing
+result."""
 
 from __future__ import annotations
 
@@ -16,19 +17,19 @@ from recordings_benchmark.listed import RECORDINGS, Recording
 from recordings_benchmark.prepare import prepare
 
 ESTIMATORS = ("dead_reckoning", "ekf", "particle_filter", "switching", "smoother", "batch")
-ALONE = ("dead_reckoning", "particle_filter")  # all others are equal to dead reckoning if there is nothing but odometry
+ALONE = ("dead_reckoning", "particle_filter")  # with odometry alone, all other estimators are equal to dead reckoning
 
 
-Scores = dict[str, dict[str, Any] | str]  # by estimator, or a line with the reason for their absence
+Scores = dict[str, dict[str, Any] | str]  # by estimator: the scores, or the reason why there are none
 
 
 def section(options: Options) -> Report:
-    """The tables."""
+    """Return the tables of all recordings."""
     report = Report("recordings", options)
     folder = find_data_root(options.data_root, "recordings")
     jobs = {recording.name: (recording, folder, options.out / "logs") for recording in RECORDINGS}
     found: Mapping[str, Scores] = report.collect(measured, jobs)
-    # of scored logs with other sensors than odometry, and of the others
+    # rows of two tables: logs with a reference and other sensors than odometry, and all other logs
     rows: dict[tuple[str, ...], list[tuple[str, ...]]] = {ESTIMATORS: [], ALONE: []}
     for recording in (recording for recording in RECORDINGS if recording.name in found):
         result = found[recording.name]
@@ -46,7 +47,7 @@ def section(options: Options) -> Report:
 
 
 def measured(recording: Recording, folder: Path, out: Path) -> Scores:
-    """Every estimator on one recording."""
+    """Run all estimators on one recording. Returns the scores, or the reason why there are none, by estimator."""
     try:
         log = prepare(recording, folder, out)
     except FglocError as error:

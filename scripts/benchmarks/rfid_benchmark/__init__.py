@@ -1,4 +1,4 @@
-"""Localization by RFID: the sections of docs/rfid-results.md."""
+"""Benchmark of localization by RFID: the sections of docs/rfid-results.md."""
 
 from rfid_benchmark import aisle, blind, faults, hall, maps, office, optimum, speed, starts, wrong
 

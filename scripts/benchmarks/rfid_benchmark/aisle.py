@@ -1,4 +1,4 @@
-"""Real reads: each run localized with a model learnt from the other run."""
+"""Recorded reads: each of two recordings is localized with a detection model learnt from the other recording."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
 
 RUNS = (13, 16)
 SEEDS = 3
-LEARNING_SEED = 100  # of the odometry of the log used for learning
+LEARNING_SEED = 100  # seed of the simulated odometry of the log that is used for learning
 PLACES = Path(__file__).parents[3] / "datasets" / "rfid-aisle-places.rig.toml"
 DETECTIONS = ("odometry", "rfid")
 SENSORS = {"detections": DETECTIONS, "+ RSSI": (*DETECTIONS, "rssi"), "+ phase": (*DETECTIONS, "phase")}
@@ -31,12 +31,13 @@ RUN = (
     ("smoother", "+ RSSI"),
 )
 SHIPPED = ", shipped rig"
-START_SPAN = 90.0  # s of a run for evaluating an unknown start
+START_SPAN = 90.0  # s: length of the part of a recording that is used for an unknown start
 
 
 @dataclass(frozen=True)
 class Tested:
-    """``runs``: errors by estimator and sensors; ``starts``: seconds of each estimator until an unknown start is correct."""
+    """The results on one recording. ``runs``: errors by estimator and sensors. ``starts``: by estimator, the time [s] until the
+    estimate is correct after an unknown start."""
 
     runs: dict[tuple[str, str], RunErrors]
     starts: dict[str, float]
@@ -86,12 +87,12 @@ def unknown_starts(report: Report, outcomes: dict[tuple[int, int], Tested]) -> N
 
 
 def aisle(number: int, seed: int, data_root: Path | None) -> Log:
-    """The recording with one odometry seed."""
+    """Return the log of a recording. ``seed``: that of its simulated odometry."""
     return recorded_log(f"rfid-aisle-run{number}", data_root, seed)
 
 
 def learnt_on(number: int, data_root: Path | None, out: Path) -> Rig:
-    """The rig learnt from one recording with surveyed antennas, and with the tempering of the shipped rig."""
+    """Learn a rig from one recording, starting at the surveyed antennas. Its tempering is that of the shipped rig."""
     log = aisle(number, LEARNING_SEED, data_root)
     assert log.rig.rfid is not None
     out.mkdir(parents=True, exist_ok=True)
@@ -105,7 +106,7 @@ def learnt_on(number: int, data_root: Path | None, out: Path) -> Rig:
 
 
 def tested(number: int, seed: int, rig: Rig, data_root: Path | None) -> Tested:
-    """All estimators on one recording with one odometry seed."""
+    """Run all estimators on one recording with one seed of the odometry."""
     log = aisle(number, seed, data_root)
     shipped = log.rig
     log = replace(log, rig=rig)
@@ -120,7 +121,7 @@ def tested(number: int, seed: int, rig: Rig, data_root: Path | None) -> Tested:
 
 
 def seconds_to_right(log: Log, estimator: str, seed: int) -> float:
-    """Seconds from the first scan until the estimate stays within half a metre, whatever its status."""
+    """Return the time [s] from the first scan until the error remains below half a metre. The status of the estimate is ignored."""
     start = cut(log, 0.0, START_SPAN)
     result = run(start, RunConfig(estimator, sensors=DETECTIONS, prior="unknown", seed=seed))
     errors = series(Trajectory(result.t, result.poses, result.covariances), start)

@@ -1,4 +1,4 @@
-"""Calibration without a reference: what is learnt on some offices, and how the smoother does with it in others."""
+"""Calibration without a reference: a rig is learnt on some simulated offices, and the smoother is run with this rig in others."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.simulation import preset, simulate
 
-LEARNT_ON, TRIED_ON = range(1, 6), range(6, 16)  # seeds
+LEARNT_ON, TRIED_ON = range(1, 6), range(6, 16)  # seeds of the offices for learning, and for the runs
 DURATION = 300.0  # s
 
 
 @dataclass(frozen=True)
 class Case:
-    """A key of the antennas' beam: its value in the simulation, and in the rig at hand."""
+    """A parameter of the detection model that is wrong in the rig before calibration. ``key``: its name. ``true``: its value in the
+    simulation. ``given``: its value in the rig."""
 
     what: str
     key: str
@@ -92,14 +93,14 @@ def office(case: Case, seed: int) -> Log:
 
 
 def with_beam(rig: Rig, **changes: float) -> Rig:
-    """The rig with other values of the antennas' beam."""
+    """Return the rig with other parameters of the detection model."""
     assert rig.rfid is not None
     models = {"default": rig.rfid.models["default"].model_copy(update=changes)}
     return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
 
 def learnt(case: Case, out: Path) -> Learnt:
-    """What the logs without their references teach."""
+    """Calibrate a wrong rig on logs without references."""
     logs = [replace(office(case, seed), reference=None) for seed in LEARNT_ON]
     out.mkdir(parents=True, exist_ok=True)
     rig = with_beam(logs[0].rig, **{case.key: case.given})
@@ -109,6 +110,6 @@ def learnt(case: Case, out: Path) -> Learnt:
 
 
 def tried(case: Case, seed: int, rig: Rig | None) -> RunErrors:
-    """The errors with a rig, None for that of the simulation."""
+    """Run the smoother on an office with a rig, and return its errors. ``rig``: None uses the rig of the simulation."""
     log = office(case, seed)
     return run_errors(run(replace(log, rig=rig or log.rig), RunConfig("smoother")), log)

@@ -1,4 +1,4 @@
-"""One fault at a time: its effect on the errors, and whether the status shows it."""
+"""Faults of RFID installations, one at a time: their effect on the errors and on the status of the estimates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ ELSEWHERE = (3.0, math.radians(60.0))  # m, rad
 
 
 def start_elsewhere(log: Log, seed: int) -> Log:
-    """The stated start has an error of 3 m and 60 degrees, in a random direction, with unchanged covariance."""
+    """Return the log with an error of 3 m and 60 degrees in its stated start, in a direction that depends on ``seed``. The
+    covariance of the start is unchanged."""
     assert log.start is not None
     distance, turn = ELSEWHERE
     direction, sign = 2.4 * seed, 1.0 if seed % 2 else -1.0

@@ -1,9 +1,10 @@
-"""The optimal filter of a pose up to the resolution of a grid, as a reference for other filters. Slow, for small rooms.
+"""A histogram filter of the pose. Up to the resolution of its grid it is optimal, and serves as a reference for other filters.
 
-Histogram filter (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, section 8.2). To avoid the diffusion by motions of less
-than a cell, each layer of one heading has its own offset: the reported motion moves the grids, which is exact. The noise of the
-motion, far smaller than a cell, is a kernel with its mean and covariance; mass that moves to a layer with another offset is
-distributed over four cells per axis by Lagrange weights, which preserve its moments up to the third.
+It is slow and suitable for small rooms only (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, section 8.2). The grid has a
+layer per heading. Motions of less than a cell would diffuse the density. Therefore each layer has its own offset, and the
+reported motion moves the layers exactly. The noise of the motion is much smaller than a cell and is applied by a kernel with the
+same mean and covariance. Probability mass that moves to a layer with another offset is distributed over four cells per axis by
+Lagrange weights. These preserve its moments up to the third.
 """
 
 from __future__ import annotations
@@ -22,14 +23,17 @@ from factors.se2 import Array
 
 CELL = 0.05  # m
 HEADINGS = 120  # layers, of 3 degrees
-NEGLIGIBLE = 1e-13  # relative to the largest cell: smaller values are dropped
-LARGEST_SHARE = 0.25  # largest fraction of a cell's mass that leaves it in one pass of the noise
+NEGLIGIBLE = 1e-13  # relative to the largest cell: smaller values are set to zero
+LARGEST_SHARE = (
+    0.25  # largest fraction of a cell's mass that leaves the cell in one step; larger noise needs several steps
+)
 
 
 class GridFilter:
-    """The density of a pose in the rectangle from ``low`` (2,) to ``high`` (2,) [m]; mass outside is lost.
+    """The probability density of a pose on a grid, in the rectangle from ``low`` (2,) to ``high`` (2,) [m]. Mass outside is lost.
 
-    Cells are points of a lattice; variances are accurate to 0.3 % for standard deviations above 0.7 of a cell.
+    ``cell`` [m]: the distance of the points of the grid. ``headings``: their number of headings. Variances are accurate to 0.3 % if
+    standard deviations are above 0.7 of a cell.
     """
 
     def __init__(
@@ -39,7 +43,7 @@ class GridFilter:
         self._step = 2.0 * math.pi / headings
         self._first = 0.0  # heading of the first layer
         shape = np.ceil((np.asarray(high) - self._low) / cell).astype(int) + 1
-        self._offsets = np.zeros((headings, 2))  # of each layer, in cells
+        self._offsets = np.zeros((headings, 2))  # offset of each layer, in cells
         self._mass = np.ones((headings, *shape))
         precision = np.linalg.inv(prior.covariance)
 
@@ -51,7 +55,7 @@ class GridFilter:
         self.update(density)
 
     def predict(self, increment: Increment) -> None:
-        """Apply the increment of the odometry."""
+        """Predict the density by a motion of the odometry."""
         headings = self._headings()
         c, s = np.cos(headings), np.sin(headings)
         dx, dy, turn = increment.delta
@@ -64,7 +68,7 @@ class GridFilter:
             self._spread(covariance / passes)
 
     def update(self, log_likelihood: Callable[[Array], Array]) -> None:
-        """Multiply by a likelihood, given its logarithm (N,) at poses (N, 3)."""
+        """Multiply the density by a likelihood. ``log_likelihood``: a function that returns its logarithm (N,) at poses (N, 3)."""
         rows = np.nonzero(self._mass)
         values = log_likelihood(self._poses(rows))
         mass = self._mass[rows] * np.exp(values - np.max(values))
@@ -72,7 +76,7 @@ class GridFilter:
         self._mass[rows] = mass / mass.sum()
 
     def moments(self) -> tuple[Array, Array]:
-        """Mean (3,) and covariance (3, 3) of x, y, heading, in the world frame."""
+        """Return the mean (3,) and the covariance (3, 3) of x, y and heading in the world frame."""
         rows = np.nonzero(self._mass)
         poses, mass = self._poses(rows), self._mass[rows]
         heading = math.atan2(float(mass @ np.sin(poses[:, 2])), float(mass @ np.cos(poses[:, 2])))
@@ -93,7 +97,7 @@ class GridFilter:
         return np.asarray(np.column_stack((x, y, se2.wrap(self._headings()[layer]))), dtype=float)
 
     def _spread(self, covariance: Array) -> None:
-        """Add noise with a body-frame covariance (3, 3)."""
+        """Add noise with a body-frame ``covariance`` (3, 3) to the pose."""
         variance = float(covariance[2, 2])
         share = variance / (2.0 * self._step**2)
         # regression of the position on the heading, and the remaining noise
@@ -107,15 +111,19 @@ class GridFilter:
         whole = np.rint(self._offsets)
         self._offsets -= whole
         self._mass = _spread(self._mass, whole.astype(np.int64), self._offsets, share, aside, within)
-        # negative values are kept: weights of both signs preserve the moments
+        # small negative values are kept, because only weights of both signs preserve the moments
         self._mass[np.abs(self._mass) < NEGLIGIBLE * self._mass.max()] = 0.0
         self._mass /= self._mass.sum()
 
 
 @compiled
 def _spread(mass: Array, whole: Array, offsets: Array, share: float, aside: Array, within: Array) -> Array:
-    """All mass moved by ``whole`` cells (K, 2), the fraction ``share`` of it to either adjacent layer, ``aside`` (K, 2) cells
-    away, and then distributed over neighbouring cells with covariance ``within`` (K, 2, 2) cells^2."""
+    """Return the mass (K, X, Y) of K layers after motion and noise.
+
+    The mass of a layer moves by ``whole`` (K, 2) cells. The fraction ``share`` of it moves to each adjacent layer, and there by
+    ``aside`` (K, 2) cells. Finally it is distributed over neighbouring cells with the covariance ``within`` (K, 2, 2) [cells^2].
+    ``offsets`` (K, 2): the offsets of the layers in cells.
+    """
     layers, nx, ny = mass.shape
     turned = np.zeros_like(mass)
     for k in range(layers):
@@ -153,7 +161,7 @@ def _spread(mass: Array, whole: Array, offsets: Array, share: float, aside: Arra
 
 @compiled
 def _divide(layer: Array, x: float, y: float, value: float) -> None:
-    """Add ``value`` at a position (x, y) between cells."""
+    """Add ``value`` to a layer at the position (x, y) between cells. It is distributed over the 4 x 4 nearest cells."""
     nx, ny = layer.shape
     i, j = math.floor(x), math.floor(y)
     wx, wy = np.empty(4), np.empty(4)
@@ -167,7 +175,7 @@ def _divide(layer: Array, x: float, y: float, value: float) -> None:
 
 @compiled
 def _lagrange(f: float, out: Array) -> None:
-    """Lagrange weights (4,) of the points -1, 0, 1, 2 for a position ``f`` between 0 and 1."""
+    """Write the Lagrange weights (4,) of the points -1, 0, 1, 2 for a position ``f`` between 0 and 1 to ``out``."""
     out[0] = -f * (f - 1.0) * (f - 2.0) / 6.0
     out[1] = (f + 1.0) * (f - 1.0) * (f - 2.0) / 2.0
     out[2] = -(f + 1.0) * f * (f - 2.0) / 2.0

@@ -1,4 +1,4 @@
-"""A hall of 100 x 60 m: unknown starts, two kidnappings in one run, and what a scan costs in maps of all sizes."""
+"""A hall of 100 x 60 m: unknown starts, two kidnappings in one run, and the computing time of a scan by the size of the map."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ SEEDS = 5
 FIRST = 3000  # first seed, not used by other sections
 ESTIMATORS = ("smoother", "particle_filter")
 TAGS = (500, 10_000)
-START, RETURN = 15.0, 20.0  # s
-DENSITY, SIZES = 500 / 6000, (100, 1000, 10_000)  # tags per m^2, and in all
-RATIO = 0.6  # depth over width
-SCANS = 30.0  # s of a drive on which scans are timed
+START, RETURN = 15.0, 20.0  # s: deadlines after a start, and after a kidnapping
+DENSITY, SIZES = 500 / 6000, (100, 1000, 10_000)  # tags per m^2, and numbers of tags
+RATIO = 0.6  # depth over width of the hall
+SCANS = 30.0  # s: duration of a drive on which scans are timed
 
 
 @dataclass(frozen=True)
 class Job:
-    """One log, for all estimators: ``what`` is a start, two kidnappings, or the time of scans."""
+    """A log on which all estimators are run. ``what``: "start" (unknown start), "return" (two kidnappings) or "scan" (computing
+    time).
+    ``tags``: number of tags."""
 
     what: str
     tags: int
@@ -37,8 +39,12 @@ class Job:
 
 @dataclass(frozen=True)
 class Returns:
-    """Seconds until the estimate was right after each of two kidnappings, NaN if never; ``false``: localized at a deadline without
-    being right; ``worst`` [m]: largest error of the final trajectory; ``busy_ms``: see :class:`.SimulatedTrial`."""
+    """The result of a run with two kidnappings.
+
+    ``seconds``: the time from each kidnapping until the estimate was correct, NaN if it never was. ``false``: True if the status
+    was localized at a deadline although the estimate was wrong. ``worst`` [m]: the largest error of the final trajectory.
+    ``busy_ms``: see :class:`.SimulatedTrial`.
+    """
 
     seconds: tuple[float, ...]
     false: bool
@@ -47,8 +53,8 @@ class Returns:
 
 
 def hall(tags: int, width: float = 100.0) -> SimulationSettings:
-    """Shelves with tags in a hall."""
-    # with a short drive, as all looks of a long one at 10,000 tags are more than a simulation may have
+    """Return the settings of a simulated hall with ``tags`` tags on shelves. ``width`` [m]."""
+    # the drive is short, because a long drive among 10,000 tags exceeds the limit of simulated observations
     world = {"width": width, "depth": RATIO * width, "tags": tags}
     return preset("warehouse", {"world": world, "drive": {"duration": SCANS}})
 
@@ -101,7 +107,8 @@ def row(found: list[SimulatedTrial | Returns]) -> tuple[str, ...]:
 
 
 def measured(job: Job) -> dict[str, SimulatedTrial | Returns | float]:
-    """The outcome of a job by estimator; the time of a scan for jobs of that kind."""
+    """Run all estimators on a job. Returns the results by estimator; for a job of the kind "scan" the computing time of a scan
+    [ms]."""
     log, moved = moved_log(job) if job.what == "return" else (drive(job), [])
     found: dict[str, SimulatedTrial | Returns | float] = {}
     for name in ESTIMATORS:
@@ -114,13 +121,13 @@ def measured(job: Job) -> dict[str, SimulatedTrial | Returns | float]:
 
 
 def rehearse(estimator: str) -> None:
-    """Exclude compilation: a start and a kidnapping in a small world."""
+    """Run an estimator with an unknown start and a kidnapping in a small world, so that later runs measure no compilation."""
     settings = lasting(preset("office", {"drive": {"duration": 20.0}}).model_copy(update={"world_seed": 1}), 20.0)
     run(join(simulate(settings, 1), simulate(settings, 2), gap=JUMP), RunConfig(estimator, prior="unknown"))
 
 
 def drive(job: Job) -> Log:
-    """The drive of a start, or of scans."""
+    """Return the log of a job of the kind "start" or "scan"."""
     if job.what == "start":
         return simulate(lasting(hall(job.tags), START + HOLD + 1.0), job.seed)
     width = math.sqrt(job.tags / DENSITY / RATIO)
@@ -128,7 +135,7 @@ def drive(job: Job) -> Log:
 
 
 def moved_log(job: Job) -> tuple[Log, list[float]]:
-    """A drive with two kidnappings to random places of the same hall, and their times."""
+    """Return a log with two kidnappings to random places of the same hall, and the times of the kidnappings."""
     after = RETURN + HOLD + 1.0
     world = hall(job.tags).model_copy(update={"world_seed": job.seed})
     log, moved = cut(simulate(lasting(world, BEFORE), 3 * job.seed), 0.0, BEFORE), []
@@ -139,7 +146,7 @@ def moved_log(job: Job) -> tuple[Log, list[float]]:
 
 
 def returns(log: Log, moved: list[float], estimator: str, seed: int) -> Returns:
-    """How an estimator with a known start returns after kidnappings."""
+    """Run an estimator with a known start on a log with kidnappings at the times ``moved`` [s], and return how it recovered."""
     clock = Clock()
     result = run(log, RunConfig(estimator, prior="reference", seed=seed), watch=clock)
     good, localized = is_right(result, log), np.array(result.status) == "localized"
@@ -156,7 +163,7 @@ def returns(log: Log, moved: list[float], estimator: str, seed: int) -> Returns:
 
 
 def scan_ms(log: Log, estimator: str, seed: int) -> float:
-    """Median processor time [ms] of the tenths of a second that hold a scan."""
+    """Return the median processor time [ms] of a scan, measured over the tenth of a second of the log that contains the scan."""
     clock = Clock()
     run(log, RunConfig(estimator, prior="reference", seed=seed), watch=clock)
     scans = len(np.unique(log.streams["rfid"].t))

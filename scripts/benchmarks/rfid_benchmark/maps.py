@@ -1,4 +1,4 @@
-"""Maps of the tags of the aisle's recordings, with and without the phases of their reads, against the survey."""
+"""Maps of tags made from the rfid-aisle recordings, with and without the phases of reads, compared with the surveyed positions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def section(options: Options) -> Report:
 
 
 def made(run: int, phases: bool, data_root: Path | None) -> tuple[np.ndarray, int]:
-    """The distances of the located tags, and the number of those in the survey."""
+    """Make a map of tags from a recording. Returns the distances [m] of located tags from their surveyed positions, and the
+    number of surveyed tags."""
     log = recorded_log(f"rfid-aisle-run{run}", data_root)
     if not phases:
         assert log.rig.rfid is not None

@@ -1,4 +1,4 @@
-"""Simulated offices: accuracy, and whether the covariances are right, over many worlds."""
+"""Simulated offices: accuracy, and consistency of the covariances, over many worlds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BOTH = STATES | {
     label + NOISE: RunConfig(config.estimator, {"self_calibration": False}) for label, config in STATES.items()
 }
 PRESETS = {"office": (5, BOTH), "sparse": (5, BOTH), "bursty": (3, STATES)}  # number of worlds, runs in each
-Found = dict[str, list[RunErrors]]  # of each configuration, one a seed
+Found = dict[str, list[RunErrors]]  # for each configuration, the errors of each seed
 
 
 def section(options: Options) -> Report:

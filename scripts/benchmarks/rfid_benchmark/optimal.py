@@ -1,4 +1,4 @@
-"""The optimal filter on a simulated log whose odometry has white noise alone, so that the pose is all there is to know."""
+"""The optimal filter on simulated logs whose odometry has white noise only, so that the state consists of the pose alone."""
 
 from __future__ import annotations
 
@@ -29,10 +29,12 @@ SENSORS = ("odometry", "rfid")
 
 
 def without_constants(log: Log, seed: int) -> Log:
-    """The log with new odometry from its reference, and a rig that knows of no constant errors, of wheels or antennas: it has only
-    the white noise of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`."""
+    """Return the log with odometry that has white noise only (:func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`).
+
+    The rig of the result has no uncertainty of the constants of wheels and antennas. Raises InputError if the log has no reference.
+    """
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference, expected one to make odometry from")
+        raise InputError(f"{log.name}: has no reference, from which odometry could be simulated")
     with patch.multiple(simulation, SCALE_SIGMA=0.0, DRIFT_SIGMA=0.0):
         wheels = simulation.wheel_odometry(log.reference, seed)
     odometry = log.rig.odometry.model_copy(update={"uncertainty": OdometryUncertainty()})
@@ -44,7 +46,7 @@ def without_constants(log: Log, seed: int) -> Log:
 
 
 def exact(settings: RfidSettings) -> RfidSettings:
-    """The same with detection models that are known exactly."""
+    """Return the settings with detection models that have no uncertainty."""
     models = {
         name: m.model_copy(update={"prior": PriorSettings(range_scale=0.0, read_rate=0.0)})
         for name, m in settings.models.items()
@@ -53,7 +55,7 @@ def exact(settings: RfidSettings) -> RfidSettings:
 
 
 def optimal_filter(log: Log) -> Trajectory:
-    """Means and covariances of the optimal filter at the scans of a log, from the start that it states."""
+    """Run the optimal filter from the stated start of a log. Returns mean and covariance of the pose at each scan."""
     prior, _ = resolve_prior(log, "log")
     assert prior is not None
     diagnostics = Diagnostics()
@@ -85,5 +87,5 @@ def optimal_filter(log: Log) -> Trajectory:
 
 
 def _log_likelihood(likelihood: RfidLikelihood, looks: TagReadCounts, poses: Array) -> Array:
-    # exact, not from tables: what is optimal must not have their error
+    # compute the exact likelihood: tables, as in the particle filter, would have errors
     return -likelihood.score(poses, looks).nll

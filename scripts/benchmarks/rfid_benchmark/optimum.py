@@ -1,4 +1,4 @@
-"""How near the optimum: a grid filter on a small room, and backward simulation through many particles in the office."""
+"""Estimators compared with nearly optimal ones: a grid filter in a small room, and a particle smoother in an office."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def table(report: Report, found: dict[str, list[Series]], optimal: str) -> None:
 
 
 def in_room(seed: int) -> dict[str, Series]:
-    """Causal errors of all filters at the scans."""
+    """Run all filters in a small room. Returns their causal errors at the scans, by label."""
     log = without_constants(simulate(preset("office", ROOM), seed), seed)
     best = series(optimal_filter(log), log)
     found = {"grid filter": best}

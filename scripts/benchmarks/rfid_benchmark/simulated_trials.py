@@ -1,4 +1,4 @@
-"""Trials of an unknown start and of kidnapping on simulated logs, each in a new world, evaluated over time."""
+"""Trials of an unknown start and of kidnapping on simulated logs. Each trial is in a new world."""
 
 from __future__ import annotations
 
@@ -20,19 +20,24 @@ from factorgraph_loc.model.result import RunResult
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import SimulationSettings
 
-AWAY = 3.0  # m, least displacement of a kidnapping
-APART = 60.0  # s between the parts of a log that a kidnapping joins
+AWAY = 3.0  # m: least displacement of a kidnapping
+APART = 60.0  # s between the two parts of a log that are joined to simulate a kidnapping
 
 Kind = Literal["unknown start", "kidnapping"]
 
 
 @dataclass(frozen=True)
 class SimulatedTrial:
-    """One trial. ``seconds``: from the first scan (at the new place) until the estimate is correct and stays so for 10 s,
-    whatever its status; ``claimed``: until it first is ``localized`` (correct and localized again, after a kidnapping); NaN if
-    never. ``false``: the first claim is wrong; after a kidnapping: it is localized at the deadline without being correct.
-    ``doubt``: the probability by its covariance, at the first claim, that its position is farther off than is right.
-    ``busy_ms``: processor time of each tenth of a second of the log, which holds at most one scan of the presets."""
+    """The result of one trial. Times begin at the first scan; after a kidnapping, at the first scan at the new place.
+
+    ``seconds`` [s]: the time until the estimate is correct for 10 s, whatever its status. NaN if it never is.
+    ``claimed`` [s]: the time until the first estimate with the status localized. After a kidnapping, until the estimate is
+    correct and localized again. NaN if this never happens.
+    ``false``: True if the first localized estimate is wrong. After a kidnapping: True if the estimate is localized at the
+    deadline, but not correct.
+    ``doubt``: the probability that the first localized estimate is wrong, according to its covariance.
+    ``busy_ms``: the processor time of each tenth of a second of the log. It contains at most one scan.
+    """
 
     seed: int
     seconds: float
@@ -43,7 +48,7 @@ class SimulatedTrial:
 
 
 class Clock:
-    """Processor time between the ticks of a run."""
+    """Measures the processor time between the ticks of a run. It is passed to the run as ``watch``."""
 
     def __init__(self) -> None:
         self._last = process_time()
@@ -58,18 +63,19 @@ class Clock:
 def run_simulated_trials(
     kind: Kind, simulation: SimulationSettings, estimator: str, deadline: float, seeds: Sequence[int]
 ) -> list[SimulatedTrial]:
-    """Trials of a kind, one with each of the seeds; ``deadline`` [s]."""
+    """Run a trial with each of the ``seeds``. ``deadline`` [s]: for a correct estimate."""
     trial = start_trial if kind == "unknown start" else kidnapping_trial
     return [trial(simulation, estimator, deadline, seed) for seed in seeds]
 
 
 def start_trial(simulation: SimulationSettings, estimator: str, deadline: float, seed: int) -> SimulatedTrial:
-    """The beginning of a drive, from an unknown start, long enough to hold a correct estimate at three deadlines."""
+    """Simulate the beginning of a drive, and run an estimator with an unknown start. The log lasts three times the ``deadline``
+    [s]."""
     return started(simulate(lasting(simulation, 3.0 * deadline + HOLD + 1.0), seed), estimator, seed)
 
 
 def started(log: Log, estimator: str, seed: int) -> SimulatedTrial:
-    """The trial on the log of such a drive."""
+    """Run an estimator with an unknown start on a log, and return the result of the trial."""
     clock = Clock()
     result = run(log, RunConfig(estimator, prior="unknown", seed=seed), watch=clock)
     first = float(log.streams["rfid"].t[0])
@@ -78,13 +84,13 @@ def started(log: Log, estimator: str, seed: int) -> SimulatedTrial:
     claimed = float(result.t[claims[0]]) - first if len(claims) else math.nan
     false = bool(len(claims)) and not bool(good[claims[0]])
     doubt = beyond(result.covariances[claims[0]], POSITION) if len(claims) else math.nan
-    # without the first, which begins before the run
+    # without the first time, which includes the time before the run
     return SimulatedTrial(seed, held(result, good, first), claimed, false, doubt, tuple(clock.busy_ms[1:]))
 
 
 def kidnapping_trial(simulation: SimulationSettings, estimator: str, deadline: float, seed: int) -> SimulatedTrial:
-    """A robot that drives from a known start and is then moved to its position a minute later, or the first one after that which
-    is 3 m away."""
+    """Simulate a kidnapping, and run an estimator with a known start. The robot is moved to the first later pose of the drive
+    that is at least a minute later and 3 m away."""
     after = 3.0 * deadline + HOLD + 1.0
     log = simulate(lasting(simulation, BEFORE + 2.0 * APART + after), seed)
     assert log.reference is not None
@@ -107,7 +113,7 @@ def kidnapping_trial(simulation: SimulationSettings, estimator: str, deadline: f
 
 
 def held(result: RunResult, good: np.typing.NDArray[np.bool_], first: float) -> float:
-    """Seconds from ``first`` until ``good`` (N,) holds."""
+    """Return the time [s] from ``first`` [s] until the estimates are ``good`` (N,) for 10 s, or NaN if they never are."""
     later = result.t >= first - 1e-9
     return first_held(result.t[later], good[later], HOLD) - first
 

@@ -1,4 +1,4 @@
-"""Times of estimators among tags, and of a calibration."""
+"""Computing times of estimators with RFID reads, and of a calibration."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from factorgraph_loc.experiments.run import RunConfig
 from factorgraph_loc.simulation import simulate
 from factorgraph_loc.simulation.settings import preset
 
-SCANS, RATE = 5000, 10.0  # with all eight antennas; Hz
+SCANS, RATE = 5000, 10.0  # number of scans of all eight antennas, and their rate [Hz]
 WORLD = {"world": {"tags": 20}, "rounds_per_second": RATE, "drive": {"duration": SCANS / RATE}}
-CALIBRATED = 400.0  # s of a log
+CALIBRATED = 400.0  # s: duration of the log for the calibration
 RUNS = {
     "smoother, lag 10 s": RunConfig("smoother", {"lag": 10.0}),
     "smoother": RunConfig("smoother"),

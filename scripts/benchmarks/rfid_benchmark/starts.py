@@ -1,4 +1,4 @@
-"""Unknown starts and kidnappings, a new world in each trial."""
+"""Unknown starts and kidnappings in simulated offices, with a new world in each trial."""
 
 from __future__ import annotations
 
@@ -66,6 +66,6 @@ def row(key: tuple[str, str, str, float], trials: list[SimulatedTrial]) -> tuple
 
 
 def middle(seconds: list[float]) -> str:
-    """The median, with infinite times for trials that never succeeded."""
+    """Return the median of times as a text. Failed trials (NaN) have infinite times. Returns "never" for an infinite median."""
     median = np.median(np.where(np.isnan(seconds), np.inf, seconds))
     return f"{median:.1f}" if np.isfinite(median) else "never"

@@ -1,4 +1,4 @@
-"""Rigs and maps that are wrong, of which nobody tells: causal errors against those of an estimator that knows."""
+"""Wrong rigs and maps: causal errors of estimators, compared with the errors with the correct rig and map."""
 
 from __future__ import annotations
 
@@ -21,13 +21,16 @@ FIRST = 4000  # first seed, not used by other sections
 DURATION = 300.0  # s
 CONFIGS = {"particle filter": RunConfig("particle_filter"), "smoother": RunConfig("smoother")}
 BURSTS = {"duration": 5.0, "share": 0.4}
-TOGETHER = 4.5  # rounds that such bursts make worth one
+TOGETHER = 4.5  # with such bursts, so many rounds contain as much information as one independent round
 
 
 @dataclass(frozen=True)
 class Case:
-    """``true``: keys of the antennas' beam in the simulation; ``given``: in the rig at hand. ``misplaced``: share of the tags that
-    are 1 m off; ``bursts``: whether reads and misses come in bursts."""
+    """A case of a wrong rig or map.
+
+    ``given``, ``true``: parameters of the detection model in the rig, and in the simulation. ``misplaced``: the fraction of tags
+    that are 1 m away from their position in the map. ``bursts``: True if reads and misses come in bursts.
+    """
 
     what: str
     given: Mapping[str, float] = field(default_factory=dict)
@@ -78,7 +81,7 @@ def section(options: Options) -> Report:
 
 
 def job(case: Case, knows: bool, seed: int) -> tuple[Any, ...]:
-    """The arguments of :func:`~benchmarking.ensemble.run_ensemble`."""
+    """Return the arguments of :func:`~benchmarking.ensemble.run_ensemble`. ``knows``: True for the correct rig and map."""
     faults: dict[str, Any] = {"fading": BURSTS} if case.bursts else {}
     if not knows:
         faults["misplaced"] = case.misplaced
@@ -90,5 +93,5 @@ def job(case: Case, knows: bool, seed: int) -> tuple[Any, ...]:
 
 
 def told(log: Log, _: int, given: Mapping[str, float]) -> Log:
-    """The log with the rig at hand."""
+    """Return the log with the parameters ``given`` in its rig."""
     return replace(log, rig=with_beam(log.rig, **given))

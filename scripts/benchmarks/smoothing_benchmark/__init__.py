@@ -1,4 +1,4 @@
-"""Smoother or filter: the sections of docs/smoother-or-filter.md, from the experiments in scripts/experiments/smoothing."""
+"""Comparison of a smoother with filters: the sections of docs/smoother-or-filter.md, from scripts/experiments/smoothing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from smoothing_benchmark.tables import accuracy, ratios, times
 
 FILES = Path(__file__).parents[2] / "experiments/smoothing"
 MINUTE = 60.0  # s
-# the experiments of each section: file, and the name of each list of sensors
+# for each section the files of its experiments, and for each file the title of each list of sensors
 EXPERIMENTS = {
     "known-map": {
         "sensors": {
@@ -37,11 +37,11 @@ EXPERIMENTS = {
 
 
 def tables(section: str, options: Options) -> Report:
-    """The tables of the experiments of a section, whose missing runs are made."""
+    """Run the experiments of a section, and return their tables. Stored runs are not repeated."""
     report = Report(section, options)
     cases = cases_of_section(section, report)
     if section == "ranges":
-        accuracy(report, [one for case in cases for one in case.of_logs()])  # too few for ratios with intervals
+        accuracy(report, [one for case in cases for one in case.of_logs()])  # too few logs for ratios with intervals
     else:
         accuracy(report, cases)
         ratios(report, cases)
@@ -49,7 +49,7 @@ def tables(section: str, options: Options) -> Report:
 
 
 def cases_of_section(section: str, report: Report) -> list[Case]:
-    """The runs of a section's experiments."""
+    """Run the experiments of a section, and return their cases."""
     cases: list[Case] = []
     for name, names in EXPERIMENTS[section].items():
         _, prepared = prepare(FILES / f"{name}.toml", out=report.options.out / name)
@@ -60,10 +60,11 @@ def cases_of_section(section: str, report: Report) -> list[Case]:
 
 
 def processor_time(options: Options) -> Report:
-    """Processor time [s] per minute of drive, on the first log of each experiment, and the picture of all experiments.
+    """Measure the processor time [s] per minute of drive on the first log of each experiment, and draw the picture of all
+    experiments.
 
-    That of the second run of two, as the first one compiles: causal estimates and final trajectory, without simulation and
-    scoring.
+    Each run is repeated, and the second one is measured, because the first one compiles functions. The time includes causal
+    estimates and final trajectory, but neither simulation nor scoring.
     """
     report, found = Report("processor-time", options), dict[tuple[str, str], float]()
     cases = [case for section in EXPERIMENTS for case in cases_of_section(section, report)]

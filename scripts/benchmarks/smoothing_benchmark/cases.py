@@ -1,4 +1,4 @@
-"""What is compared: the runs of a smoother and of filters, with the same measurements of the same logs."""
+"""Cases of the comparison: runs of a smoother and of filters with the same sensors on the same logs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ RMSE = {"causal": "causal.position_rmse", "final": "final.position_rmse", "align
 
 @dataclass(frozen=True)
 class Case:
-    """Successful runs with one set of sensors. ``name``: of the sensors on the page; ``rows``: the scores of a run each."""
+    """The successful runs with one set of sensors. ``name``: the title of the sensors on the page. ``rows``: the scores of each
+    run."""
 
     name: str
     rows: Sequence[Mapping[str, Any]]
@@ -40,11 +41,11 @@ class Case:
         return list(dict.fromkeys(str(row["log"]) for row in self.rows))
 
     def of_logs(self) -> list[Case]:
-        """A case for each log, named by it."""
+        """Return a case for each log, with the name of the log."""
         return [Case(log, [row for row in self.rows if row["log"] == log]) for log in self.logs]
 
     def scores(self, label: str, score: str) -> dict[str, float]:
-        """A score of an estimator by log, where there is one."""
+        """Return a score of the estimator ``label`` by log. Logs without this score are left out."""
         return {
             str(row["log"]): float(row[score])
             for row in self.rows
@@ -52,24 +53,25 @@ class Case:
         }
 
     def error(self, label: str, kind: str) -> float | None:
-        """Position RMSE [m], pooled over logs; ``kind`` is causal, final or aligned. None without scores."""
+        """Return the position RMSE [m], pooled over logs, or None without scores. ``kind``: "causal", "final" or "aligned"."""
         scores = self.scores(label, RMSE[kind])
         return pooled_rms(list(scores.values())) if scores else None
 
     def anees(self, label: str, kind: str) -> float | None:
-        """ANEES, the mean over logs; None without scores."""
+        """Return the mean ANEES over logs, or None without scores."""
         scores = self.scores(label, f"{kind}.anees")
         return float(np.mean(list(scores.values()))) if scores else None
 
     def ratio(self, above: tuple[str, str], below: tuple[str, str]) -> Ratio | None:
-        """The ratio of position RMSEs, each of a label and a kind, paired by log. None without a log that has both."""
+        """Return the ratio of two position RMSEs, paired by log, or None if no log has both. ``above``, ``below``: label and
+        kind."""
         a, b = (self.scores(label, RMSE[kind]) for label, kind in (above, below))
         logs = [log for log in a if log in b]
         return rmse_ratio(_of(a, logs), _of(b, logs)) if logs else None
 
 
 def cases_of(rows: Sequence[Mapping[str, Any]], names: Mapping[str, str]) -> list[Case]:
-    """The cases of an experiment; ``names`` by list of sensors, or by "" where the runs have those of the rig."""
+    """Return the cases of an experiment. ``names``: the title of each list of sensors. The list "" means the sensors of the rig."""
     done = [row for row in rows if row["status"] == "ok"]
     return [
         Case(name, found)

@@ -1,4 +1,4 @@
-"""The picture of the page: by which factor the smoother's error differs from that of each filter."""
+"""The picture of docs/smoother-or-filter.md: the error of the smoother, divided by that of each filter."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 TITLES = {"causal": "causal: on the way", "final": "final: once all is known (without a map: aligned)"}
 MARKS = ("o", "s", "D")
-APART = 0.22  # between the filters of a case, whose lines are 1 apart
+APART = 0.22  # vertical distance between the filters of a case; the distance between cases is 1
 TICKS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5, 2.0)
 
 
 def picture(cases: Sequence[Case]) -> Figure:
-    """Ratios of position errors, smoother over filter, with 95 % intervals where there are enough logs.
+    """Draw the ratios of position errors, smoother over filter, with 95 % intervals if there are enough logs.
 
-    Final trajectories whose map was estimated are aligned with the reference first, as their frame is that of the start.
+    If the map was estimated, final trajectories are aligned with the reference first, because their frame is that of the start.
     """
     figure = empty(
         2.2 + 0.55 * len(cases),

@@ -1,4 +1,4 @@
-"""Tables of cases, and of their processor times."""
+"""Tables of errors of cases, and of processor times."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from factorgraph_loc.evaluation.statistics import ENOUGH_LOGS
 from smoothing_benchmark.cases import SMOOTHER, Case
 
 ALIGNED = "aligned"
-SHOWN = {"ekf": "EKF", "particle_filter": "particle filter"}  # as they are called in the text
+SHOWN = {"ekf": "EKF", "particle_filter": "particle filter"}  # names of estimators on the page
 
 
 def shown(label: str) -> str:
-    """The name of an estimator on the page."""
+    """Return the name of an estimator on the page."""
     return SHOWN.get(label, label)
 
 
 def accuracy(report: Report, cases: Sequence[Case]) -> None:
-    """Errors and ANEES of each estimator, pooled over logs."""
+    """Add a table of errors and ANEES of each estimator, pooled over logs, to a report."""
     aligned = any(case.error(label, ALIGNED) is not None for case in cases for label in case.labels)
     rows = [
         [
@@ -41,7 +41,7 @@ def accuracy(report: Report, cases: Sequence[Case]) -> None:
 
 
 def ratios(report: Report, cases: Sequence[Case]) -> None:
-    """The error of the smoother over that of each filter, paired by log."""
+    """Add a table of the error of the smoother, divided by that of each filter, to a report. Runs are paired by log."""
     kinds = [kind for kind in (*KINDS, ALIGNED) if any(c.error(SMOOTHER, kind) is not None for c in cases)]
     rows = [
         [
@@ -57,7 +57,8 @@ def ratios(report: Report, cases: Sequence[Case]) -> None:
 
 
 def times(report: Report, seconds: Mapping[tuple[str, str], float]) -> None:
-    """Processor time [s per minute of drive] by name of the case and estimator."""
+    """Add a table of processor times to a report. ``seconds``: the time per minute of drive [s], by name of the case and
+    estimator."""
     names = list(dict.fromkeys(name for name, _ in seconds))
     labels = list(dict.fromkeys(label for _, label in seconds))
     labels.sort(key=lambda label: label == SMOOTHER)
@@ -66,7 +67,7 @@ def times(report: Report, seconds: Mapping[tuple[str, str], float]) -> None:
 
 
 def ratio_cell(ratio: Ratio | None, logs: int) -> str:
-    """A ratio, with its interval where there are enough logs for one."""
+    """Return the cell of a ratio, with its interval if there are enough logs."""
     if ratio is None:
         return NOTHING
     return ratio_text(ratio)[0] if logs >= ENOUGH_LOGS else f"{ratio.value:.3f}"

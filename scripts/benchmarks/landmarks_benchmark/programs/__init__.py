@@ -1,1 +1,1 @@
-"""Programs that localize by other means, as a user of these would write them: each knows only :mod:`.plain` and its package."""
+"""Programs that localize by numpy, filterpy or GTSAM, without this project. They use only :mod:`.plain` and their package."""

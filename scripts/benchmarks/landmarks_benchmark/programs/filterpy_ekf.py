@@ -1,4 +1,4 @@
-"""The extended Kalman filter of filterpy."""
+"""Localization by the extended Kalman filter of the package filterpy."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from landmarks_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, turned, wrapped
 
-GATE = 9.21  # 99 % of chi-square with two degrees of freedom: beyond it the noise is widened
+GATE = 9.21  # 99 % of chi-square with two degrees of freedom; for larger innovations the noise is increased
 
 
 class Ekf(ExtendedKalmanFilter):
-    """The state is the pose."""
+    """A Kalman filter whose state is the pose (3,)."""
 
     def move(self, dx: float, dy: float, dh: float, q: Any) -> None:
         x, y, h = self.x
@@ -49,12 +49,12 @@ def residual(a: Any, b: Any) -> Any:
 
 
 def composed(problem: Problem) -> Found:
-    """Predicted at stamps with landmarks and at ticks."""
+    """Run the filter, with a prediction to each measurement of landmarks and each tick."""
     return _run(problem, each_row=False)
 
 
 def rows(problem: Problem) -> Found:
-    """Predicted at each row of odometry."""
+    """Run the filter, with a prediction for each row of odometry."""
     return _run(problem, each_row=True)
 
 

@@ -1,8 +1,8 @@
-"""Plain loops around GTSAM, with a keyframe at each stamp with landmarks, whose places are known.
+"""Localization by GTSAM in plain loops. There is a keyframe at each measurement of landmarks, whose positions are known.
 
-``lag`` and ``full`` estimate the constants that the project does, the gyro's bias and four of the landmark sensor, by factors of
-their own in numpy; ``batch`` has GTSAM's own factors: Levenberg and Marquardt's algorithm from dead reckoning, with Huber's loss
-and then with that of Geman and McClure, and the marginals.
+``lag`` and ``full`` estimate the same constants as this project: the bias of the gyro, and four constants of the landmark sensor.
+Their factors are written in numpy. ``batch`` uses GTSAM's own factors. It starts from dead reckoning and runs Levenberg-Marquardt
+with a Huber loss, then again with a Geman-McClure loss. At the end it computes marginal covariances.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ ROBUST = gtsam.noiseModel.Robust.Create(
 
 
 def lag(problem: Problem) -> Found:
-    """A fixed-lag smoother."""
+    """Run GTSAM's fixed-lag smoother."""
     return _incremental(problem, gtsam.IncrementalFixedLagSmoother(LAG, _parameters()))
 
 
 def full(problem: Problem) -> Found:
-    """iSAM2, which keeps everything."""
+    """Run iSAM2 with the full history."""
     return _incremental(problem, gtsam.ISAM2(_parameters()))
 
 
@@ -98,7 +98,10 @@ def _start(problem: Problem, graph: Any, values: Any) -> None:
 
 
 def _odometry(i: int, j: int, move: tuple[float, float, float], duration: float, q: Any) -> Any:
-    """Motion between two poses, whose turn rate has an unknown bias."""
+    """Return the factor of the motion between two poses. The bias of the turn rate is a variable.
+
+    ``i``, ``j``: keys of the poses. ``move``: the measured motion. ``duration`` [s]. ``q`` (3, 3): its covariance.
+    """
     arc = gtsam.Pose2.Logmap(gtsam.Pose2(*move))
 
     def error(_: Any, values: Any, jacobians: Any) -> Any:
@@ -108,7 +111,7 @@ def _odometry(i: int, j: int, move: tuple[float, float, float], duration: float,
         if jacobians is not None:
             jacobians[0] = -between.inverse().AdjointMap()
             jacobians[1] = np.eye(3)
-            # the last column of the right Jacobian of the arc, to first order
+            # last column of the right Jacobian of the exponential map, to first order
             jacobians[2] = np.array(((0.5 * bent[1] * duration,), (-0.5 * bent[0] * duration,), (duration,)))
         return gtsam.Pose2.Logmap(gtsam.Pose2.Expmap(bent).between(between))
 
@@ -116,7 +119,8 @@ def _odometry(i: int, j: int, move: tuple[float, float, float], duration: float,
 
 
 def _sighting(key: int, row: tuple[float, ...], sensor: list[float]) -> Any:
-    """Depth and bearing of a landmark, by a sensor whose place, bearing bias, scale and depth axis are uncertain."""
+    """Return the factor of depth and bearing of a landmark. Position, bearing bias, scale and depth axis of the sensor are
+    variables."""
     lx, ly, depth, bearing, s_depth, s_bearing = row
     place, scale = sensor
     ir, ib = 1.0 / s_depth, 1.0 / s_bearing
@@ -140,7 +144,7 @@ def _sighting(key: int, row: tuple[float, ...], sensor: list[float]) -> Any:
 
 
 def batch(problem: Problem) -> Found:
-    """The whole trajectory at once."""
+    """Estimate the whole trajectory by Levenberg-Marquardt."""
     graph, values, motion, found = gtsam.NonlinearFactorGraph(), gtsam.Values(), Motion(problem.growth), Found()
     _start(problem, graph, values)
     k, pose, asked = 0, gtsam.Pose2(*problem.pose), []
@@ -183,7 +187,7 @@ def batch(problem: Problem) -> Found:
 
 
 def _levelled(graph: Any) -> Any:
-    """The graph with a loss that levels off in place of Huber's."""
+    """Return the graph with a Geman-McClure loss, which is bounded, in place of the Huber loss."""
     loss, made = gtsam.noiseModel.mEstimator.GemanMcClure.Create(GEMAN_MCCLURE), gtsam.NonlinearFactorGraph()
     for i in range(graph.size()):
         factor = graph.at(i)

@@ -1,4 +1,4 @@
-"""An extended Kalman filter and a particle filter in plain numpy."""
+"""Localization by an extended Kalman filter and by a particle filter in plain numpy."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from landmarks_benchmark.programs.plain import MOTION, SIGHTING, Found, Motion, Problem, turned, wrapped
 
-GATE = 9.21  # 99 % of chi-square with two degrees of freedom: beyond it the noise is widened
+GATE = 9.21  # 99 % of chi-square with two degrees of freedom; for larger innovations the noise is increased
 PARTICLES, SEED, ROBUST = 5000, 0, 4.0
 
 
 def ekf(problem: Problem) -> Found:
-    """The state is the pose; a motion is composed between stamps."""
+    """Run an extended Kalman filter of the pose. The rows of odometry between two stamps are composed to one motion."""
     motion, found = Motion(problem.growth), Found()
     x, p = problem.pose.copy(), problem.covariance.copy()
     for kind, t, what in problem.events():
@@ -64,7 +64,8 @@ def _corrected(x: Any, p: Any, row: Any) -> tuple[Any, Any]:
 
 
 def particles(problem: Problem) -> Found:
-    """Bootstrap filter: moved, weighed by each landmark with the loss of Geman and McClure, resampled when half are left."""
+    """Run a bootstrap particle filter with a Geman-McClure loss. It resamples if the effective number of particles is below one
+    half."""
     rng, motion, found = np.random.default_rng(SEED), Motion(problem.growth), Found()
     x = rng.multivariate_normal(problem.pose, problem.covariance, PARTICLES).T
     log_weights = np.zeros(PARTICLES)
