@@ -17,13 +17,13 @@ class PolicySettings(FileModel):
     horizon: Annotated[float, Field(gt=0.0, le=100.0), InUnit("m")] = 3.0
     """length of proposed arcs and straight paths"""
     far: Metres = 25.0
-    """largest distance of places to which paths are proposed"""
+    """largest length of paths to places"""
     replan: Metres = 0.5
-    """least distance that the robot drives before it chooses again; half of a longer arc and a whole path to a place are driven"""
+    """least distance driven before the next choice; of a longer arc half is driven, of a path to a place all"""
     per_metre: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/m")] = 0.3
-    """cost of the length of an arc or a straight path, subtracted from its expected information"""
+    """cost of the length of an arc or straight path"""
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128
-    """number of particles by which the expected information is computed"""
+    """number of particles for the expected information"""
 
 
 class ActiveSettings(FileModel):
@@ -42,7 +42,7 @@ class ActiveSettings(FileModel):
     sight: Metres = 3.0
     """range of the proximity sensor"""
     start: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    """the true x, y and heading at the start, such as [4.0, 3.0, 0.5]; without it the start is random in free space"""
+    """true x, y, heading at the start, such as [4.0, 3.0, 0.5]; by default random in free space"""
     position_limit: Metres = 0.3
     """largest standard deviation and error of the position of a localized robot"""
     heading_limit: Annotated[float, Field(gt=0.0, le=math.pi), InUnit("rad")] = math.radians(10.0)

@@ -26,12 +26,11 @@ class WorldSettings(FileModel):
     """Settings of the building and its tags, landmarks and points. Either ``tags`` or ``density`` must be given."""
 
     plan: Literal["office", "hall", "warehouse", "corridors"] = "office"
-    """floor plan; office: rooms at a corridor. hall: one empty room. warehouse: rows of shelves. corridors: an H with a half-turn
-    symmetry, whose ends differ only by three hanging tags"""
+    """hall: one empty room; corridors: an H with a half-turn symmetry, whose ends differ only by three hanging tags"""
     width: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 20.0
-    """size of the building along x"""
+    """size along x"""
     depth: Annotated[float, Field(ge=2.0, le=500.0), InUnit("m")] = 12.0
-    """size of the building along y"""
+    """size along y"""
     tags: Annotated[int, Field(ge=0, le=MOST_TAGS)] | None = None
     """number of tags"""
     density: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("tags per m^2")] | None = None
@@ -71,9 +70,9 @@ class DriveSettings(FileModel):
     turn_rate: Annotated[float, Field(ge=0.01, le=6.0), InUnit("rad/s")] = 1.0
     """highest turn rate"""
     rate: Annotated[float, Field(ge=10.0, le=50.0), InUnit("1/s")] = 10.0
-    """rate of the poses of the reference trajectory"""
+    """rate of reference poses"""
     clearance: Annotated[float, Field(ge=0.25, le=2.0), InUnit("m")] = 0.3
-    """least distance of the robot's path from walls"""
+    """least distance of the path from walls"""
 
 
 class ImageSettings(FileModel):
@@ -83,13 +82,13 @@ class ImageSettings(FileModel):
     rate: Hertz = 5.0
     """images per second"""
     exposure: Annotated[float, Field(ge=0.0, le=0.2), InUnit("s")] = 0.005
-    """exposure time, which causes motion blur; the stamp of an image is the middle of its exposure"""
+    """exposure time, which causes motion blur; stamps are in its middle"""
     read_noise: Annotated[float, Field(ge=0.0, le=50.0), InUnit("of 255")] = 1.5
-    """standard deviation of the noise of a black pixel"""
+    """standard deviation of a black pixel"""
     shot_noise: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """additional variance of the noise of a pixel, per unit of its value"""
+    """additional variance of a pixel per unit of its value"""
     vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.3
-    """relative loss of brightness in the corners of the image"""
+    """relative loss of brightness in the corners"""
 
 
 class SimulationSettings(FileModel):
@@ -103,8 +102,7 @@ class SimulationSettings(FileModel):
     """name of the log"""
     world: WorldSettings
     world_seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
-    """seed of the building, its textures and the surveyed positions of tags, for several drives in one world; without it the seed
-    of the log is used"""
+    """seed of the building, its textures and its survey, for several drives in one building; by default that of the log"""
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
     """inventory rounds of each RFID antenna per second"""

@@ -128,14 +128,14 @@ class MonoslamSettings(FilterSettings):
     tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.005
     """standard deviation of roll and pitch of a robot on a floor"""
     landmarks: MapUse = "known"
-    """known uses the map's points and ignores other points. extended also estimates the other points. unknown estimates all
-    points and ignores the map. Without a map, unknown is the default"""
+    """known: use only points of the map; extended: estimate other points too; unknown: estimate all points, the default without a
+    map"""
     self_calibration: bool = True
-    """whether the filter estimates the constants of the odometry that have an uncertainty in the rig"""
+    """whether constants of the odometry with an uncertainty in the rig are estimated"""
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
     """largest number of points in the state"""
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20
-    """number of points of the state that should be visible in each image; new points are added if fewer are visible"""
+    """new points are added if fewer estimated points than this should be visible"""
     iterations: Annotated[int, Field(ge=1, le=20)] = 3
     """largest number of linearizations of an update in a known map; 1 is the published update"""
 

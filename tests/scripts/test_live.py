@@ -200,7 +200,7 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run_script(script) == 0
     told = capsys.readouterr().out
-    assert re.search(r"plaza2, ekf: off by 0\.\d\d m", told)
+    assert re.search(r"plaza2, ekf: causal position RMSE 0\.\d\d m", told)
     assert "8 runs, 0 of them failed" in told
     assert (tmp_path / "out/example-experiment/errors.png").is_file()
     assert (tmp_path / "out/example-experiment/report.html").is_file()
