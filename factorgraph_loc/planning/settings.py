@@ -15,7 +15,7 @@ class PolicySettings(FileModel):
     """Settings of the policy that chooses the next path."""
 
     horizon: Annotated[float, Field(gt=0.0, le=100.0), InUnit("m")] = 3.0
-    """length of proposed arcs and straight paths"""
+    """length of arcs and straight paths"""
     far: Metres = 25.0
     """largest length of paths to places"""
     replan: Metres = 0.5
@@ -32,22 +32,22 @@ class ActiveSettings(FileModel):
 
     policy: PolicySettings = PolicySettings()
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000
-    """least number of particles of the estimator active_mcl"""
+    """least number of particles of active_mcl"""
     speed: Annotated[float, Field(ge=0.01, le=3.0), InUnit("m/s")] = 0.5
     """speed of the robot"""
     turn_rate: Annotated[float, Field(ge=0.01, le=6.0), InUnit("rad/s")] = 1.0
     """turn rate of the robot"""
     clearance: Annotated[float, Field(ge=0.05, le=2.0), InUnit("m")] = 0.35
-    """least distance of the robot from walls"""
+    """least distance from walls"""
     sight: Metres = 3.0
     """range of the proximity sensor"""
     start: tuple[Coordinate, Coordinate, Coordinate] | None = None
     """true x, y, heading at the start, such as [4.0, 3.0, 0.5]; by default random in free space"""
     position_limit: Metres = 0.3
-    """largest standard deviation and error of the position of a localized robot"""
+    """largest standard deviation and position error of a localized robot"""
     heading_limit: Annotated[float, Field(gt=0.0, le=math.pi), InUnit("rad")] = math.radians(10.0)
-    """largest standard deviation and error of the heading of a localized robot"""
+    """largest standard deviation and heading error of a localized robot"""
     max_metres: Metres = 100.0
-    """distance after which the robot gives up"""
+    """the robot gives up after this distance"""
     max_seconds: Annotated[float, Field(gt=0.0, le=36_000.0), InUnit("s")] = 600.0
-    """time after which the robot gives up"""
+    """the robot gives up after this time"""

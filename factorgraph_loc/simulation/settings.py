@@ -36,7 +36,7 @@ class WorldSettings(FileModel):
     density: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("tags per m^2")] | None = None
     """density of tags, instead of their number"""
     surfaces: Annotated[tuple[Surface, ...], Field(min_length=1)] = ("wall", "shelf")
-    """surfaces that tags are placed on; shelf includes furniture"""
+    """places of tags; shelf includes furniture"""
     tag_height: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 1.2
     """height of the tags that are not on the floor"""
     even: bool = False
@@ -44,7 +44,7 @@ class WorldSettings(FileModel):
     landmarks: Annotated[int, Field(ge=0, le=10_000)] = 0
     """number of landmarks on the walls"""
     points: Annotated[int, Field(ge=0, le=10_000)] = 0
-    """number of named points on walls and furniture, which a camera observes"""
+    """number of named points for a camera on walls and furniture"""
 
     @model_validator(mode="after")
     def _has_one_number(self) -> WorldSettings:
@@ -105,7 +105,7 @@ class SimulationSettings(FileModel):
     """seed of the building, its textures and its survey, for several drives in one building; by default that of the log"""
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
-    """inventory rounds of each RFID antenna per second"""
+    """inventory rounds of each antenna"""
     images: ImageSettings = ImageSettings()
     rig: Rig
 

@@ -137,7 +137,7 @@ class MonoslamSettings(FilterSettings):
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20
     """new points are added if fewer estimated points than this should be visible"""
     iterations: Annotated[int, Field(ge=1, le=20)] = 3
-    """largest number of linearizations of an update in a known map; 1 is the published update"""
+    """largest number of linearizations of an update in a known map"""
 
 
 class Monoslam(Filter):
