@@ -1,6 +1,7 @@
-"""Single rows of odometry whose speed or turn rate no robot can reach between the rows around them.
+"""Finds and removes jumps of odometry: single rows with a speed or turn rate that no robot can reach between its neighbouring
+rows.
 
-Their cause is mostly an angle that wraps inside of the robot's software.
+The usual cause is an angle that wraps inside the robot's software.
 """
 
 from typing import NamedTuple
@@ -13,13 +14,18 @@ from factorgraph_loc.sensors.odometry.measurement import IncrementStream, Veloci
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
-LEAST_TURN, LEAST_SPEED = 6.0, 5.0  # rad/s, m/s: from the rows around
-FACTOR = 5.0  # to the rows around
-AROUND = (-2, -1, 1, 2)  # rows that a row is compared with
+# a jump differs from the median of its neighbours by LEAST_TURN [rad/s] or LEAST_SPEED [m/s], and is FACTOR times as large
+LEAST_TURN, LEAST_SPEED = 6.0, 5.0
+FACTOR = 5.0
+AROUND = (-2, -1, 1, 2)  # neighbours of a row, relative to its number
 
 
 class Jump(NamedTuple):
-    """A row of odometry that jumps: its number from 0, ``what`` jumps, its rate, and those of the rows ``before`` and ``after``."""
+    """A jump in one row of odometry.
+
+    ``row``: the number of the row, from 0. ``what``: "speed" or "turn rate". ``unit``: the unit of the rates. ``rate``: the
+    speed or turn rate of the row. ``before``, ``after``: the rates of the previous row and of the next row.
+    """
 
     row: int
     what: str
@@ -30,14 +36,15 @@ class Jump(NamedTuple):
 
 
 def jumps(stream: VelocityStream | IncrementStream) -> list[Jump]:
-    """The rows whose speed or turn rate differs from that of the two rows before and after by more than a robot can accelerate."""
+    """Return the jumps of an odometry stream in order of its rows. In a jump the speed or turn rate differs from that of the
+    two rows before and after by more than a robot can accelerate."""
     if len(stream.t) < len(AROUND) + 1:
         return []
     if isinstance(stream, VelocityStream):
         speeds, turns = stream.v, stream.w
     else:
         steps = np.diff(stream.t, prepend=2.0 * stream.t[0] - stream.t[1])
-        steps = np.maximum(steps, np.median(steps))  # stamps may be near each other by chance
+        steps = np.maximum(steps, np.median(steps))  # two timestamps may be close by chance, which is no high speed
         speeds, turns = np.hypot(stream.dx, stream.dy) / steps, stream.dtheta / steps
     kinds = (("turn rate", "rad/s", turns, LEAST_TURN), ("speed", "m/s", speeds, LEAST_SPEED))
     out = [
@@ -49,14 +56,16 @@ def jumps(stream: VelocityStream | IncrementStream) -> list[Jump]:
 
 
 def _outliers(rates: Array, least: float) -> Integers:
-    """The indices of the rates (N,) that are far from the median of the rows around them."""
+    """Return the indices of ``rates`` (N,) that differ from the median of their neighbours by more than ``least``, and by a
+    factor."""
     padded = np.pad(rates, 2, mode="edge")
     usual = np.median([padded[2 + k : len(padded) - 2 + k] for k in AROUND], axis=0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 
 
 def jump_warning(kind: str, found: list[Jump], stream: VelocityStream | IncrementStream, end: str) -> Notice:
-    """The warning of a ``kind`` about jumps, with the ``end`` of its sentence."""
+    """Return a warning about the jumps ``found`` in a stream. ``kind``: the kind of the warning. ``end``: text that is appended
+    to it."""
     first = found[0]
     sentence = (
         "the {what} of the odometry jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {before:.2f} and {after:.2f} "
@@ -70,9 +79,9 @@ def jump_warning(kind: str, found: list[Jump], stream: VelocityStream | Incremen
 def without_jumps(
     stream: VelocityStream | IncrementStream, rules: RowRules, warnings: list[Notice]
 ) -> VelocityStream | IncrementStream:
-    """The odometry without the rows that jump, if the ``rules`` skip bad rows; a warning counts them.
+    """Return the odometry without jumps if ``rules`` skip bad rows, and append a warning. Otherwise return it unchanged.
 
-    The velocity before such a row is held. The motion of a skipped increment is unknown.
+    The velocity before a removed row is valid until the next row. The motion of a removed increment is marked as unknown.
     """
     if rules.bad_rows == "refuse" or not (found := jumps(stream)):
         return stream
