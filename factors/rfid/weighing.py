@@ -51,7 +51,7 @@ def log_likelihood(
             widest[i] = max(widest[i], parameters[n, i])
     reach = reach_of(adjusted(packed, widest), measured[0])
     if len(parameters) > 1:
-        poses = delayed(poses, counts[8], parameters[:, -1] - parameters[0, -1])
+        poses = delayed(poses, counts[8][:1], parameters[:, -1] - parameters[0, -1])
     near = near_tags(of_map, counts, poses, reach)
     tags, odds, elsewhere = tags_of_tables(tables, near), near.odds, near.elsewhere
     near_enough = np.empty(len(odds), np.bool_)
