@@ -78,7 +78,7 @@ def never_localized(
     if "localized" in kinds_of_status or (len(final) and status[-1] == "unlocalized"):  # the latter: a batch estimator
         return ()
     kinds = detecting(log.world, sensors)
-    names = " and ".join(kind.detects for kind in kinds)
+    names = " and ".join(kind.detects or kind.name for kind in kinds)
     if not kinds:
         why = "the map has nothing that its sensors can detect"
     elif "ambiguous" in kinds_of_status:
@@ -86,5 +86,5 @@ def never_localized(
     elif len(kinds) > 1:  # an estimator may use only some of these kinds
         why = f"its {names} did not determine the pose"
     else:
-        why = f"no {names} of the map were detected"
+        why = f"no {names} of the map were detected" if kinds[0].detects else f"the log has no {names}"
     return (notice("never_localized", "{log}: never localized: {why}", log.name, why),)

@@ -7,7 +7,7 @@ define the functions ``assemble`` and ``disassemble``.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -36,12 +36,14 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """The context in which rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list to append
-    to."""
+    """The context in which the rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list to append
+    to. ``shared``: what several sensors of the log have in common, such as the origin of latitudes, by name.
+    """
 
     rig: Rig
     t0_ns: int
     warnings: list[Notice]
+    shared: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from picture import SMALL
 
 from factorgraph_loc import CameraFrame, FeatureStream, InputError, PointMap, Rig, SightingStream, Trajectory, World
 from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
+from factorgraph_loc.experiments.doubts import never_localized
 from factorgraph_loc.experiments.run import RunConfig, run
 
 NO_POINTS = "straight: the map has no points for the camera: give --world"
@@ -122,3 +123,13 @@ def test_a_reference_shorter_than_the_log_is_scored_where_it_is(log):
     (warning,) = result.warnings
     assert str(warning) == "straight: scored over 1.0 s of 2.0 s: the reference covers 0.5 s to 1.5 s"
     assert score(result, short)["causal.scored"] == 11
+
+
+@pytest.mark.parametrize(
+    ("status", "why"),
+    [("unlocalized", "the log has no positions"), ("ambiguous", "its positions match several poses")],
+)
+def test_a_robot_without_positions_is_never_localized(log, status, why):
+    nothing = Trajectory(np.zeros(0), np.zeros((0, 3)))
+    (warning,) = never_localized(replace(log, world=World()), ("odometry", "position"), (status,), nothing)
+    assert str(warning) == f"straight: never localized: {why}"

@@ -210,21 +210,35 @@ def test_positions_of_a_bag_with_their_covariances(maker, read_drive):
     assert proposed(maker.path).options["position"] == {"topic": "/uwb"}
 
 
-def test_fixes_of_a_bag_are_metres_from_the_first(maker, read_drive):
-    for i in range(3):
+def add_fixes(maker, topic, latitudes):
+    for i, latitude in enumerate(latitudes):
         status = maker.make("sensor_msgs/msg/NavSatStatus", status=0, service=1)
         maker.stamped(
-            "/fix",
+            topic,
             T0 + 100 * MS * i,
             "sensor_msgs/msg/NavSatFix",
             status=status,
-            latitude=60.0 + i / 3600.0,
+            latitude=latitude,
             longitude=10.0,
             altitude=5.0,
             position_covariance=np.zeros(9),
             position_covariance_type=0,
         )
+
+
+def test_fixes_of_a_bag_are_metres_from_the_first(maker, read_drive):
+    add_fixes(maker, "/fix", [60.0 + i / 3600.0 for i in range(3)])
     log = read_drive(maker, position={"topic": "/fix"})
     np.testing.assert_allclose(log.streams["position"].y, (0.0, 30.9, 61.9), atol=0.1)
     assert "origin" in [warning.kind for warning in log.warnings]
     assert proposed(maker.path).options["position"] == {"topic": "/fix"}
+
+
+def test_two_receivers_have_one_origin(maker, read_drive):
+    for name, shift in (("front", 0.0), ("rear", -1.0)):
+        add_fixes(maker, f"/{name}", [60.0 + (shift + i) / 3600.0 for i in range(3)])
+    log = read_drive(maker, position={name: {"topic": f"/{name}"} for name in ("front", "rear")})
+    front, rear = (log.streams[f"position.{name}"].y for name in ("front", "rear"))
+    np.testing.assert_allclose(front, (0.0, 30.9, 61.9), atol=0.1)
+    np.testing.assert_allclose(rear, front - 30.95, atol=0.02)
+    assert [warning.kind for warning in log.warnings].count("origin") == 1

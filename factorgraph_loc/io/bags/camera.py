@@ -22,7 +22,8 @@ from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.topics import Stamper, TopicSettings, as_nanoseconds
 from factorgraph_loc.sensors.camera.measurement import ImageStream
 from factorgraph_loc.sensors.camera.settings import COUNTS, CameraSettings
-from factorgraph_loc.text import Notice, quoted
+from factorgraph_loc.sensors.tables import Reading
+from factorgraph_loc.text import quoted
 from factorgraph_loc.vision.feature_cache import cache_folder
 from factors.se2 import Array
 
@@ -102,8 +103,8 @@ class Images:
         self._rows.append((item.row, header, item.received, file))
         self._t_ns.append(t_ns)
 
-    def stream(self, t0_ns: int, warnings: list[Notice]) -> ImageStream:
-        """Return the stream of images, with times in seconds after ``t0_ns`` [ns]. Newly extracted images are moved to the cache
+    def stream(self, reading: Reading) -> ImageStream:
+        """Return the stream of images, with times in seconds after t = 0. Newly extracted images are moved to the cache
         folder."""
         if self._written is not None:
             with writing(self._folder), locked(self._folder.parent / LOCK):
@@ -113,8 +114,10 @@ class Images:
                         self._folder.rename(self._written.with_name("damaged"))
                     self._written.rename(self._folder)
         rows, t_ns = np.array([row[0] for row in self._rows], dtype=np.int64), np.array(self._t_ns, dtype=np.int64)
-        keep = checks.last_in_order(self._source, rows, t_ns, warnings)
-        return ImageStream(checks.seconds(t_ns[keep], t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()])
+        keep = checks.last_in_order(self._source, rows, t_ns, reading.warnings)
+        return ImageStream(
+            checks.seconds(t_ns[keep], reading.t0_ns), [self._folder / self._rows[i][-1] for i in keep.tolist()]
+        )
 
 
 class Info:

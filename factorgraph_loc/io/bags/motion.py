@@ -22,6 +22,7 @@ from factorgraph_loc.io.bags.poses import POSES, PoseTopic, StaticFrames, poses_
 from factorgraph_loc.io.bags.topics import LIST, TF, Listeners, RowTopic, TopicRows, check_path
 from factorgraph_loc.model.planar import NEGLIGIBLE, Turned, about_z, are_null, null_poses
 from factorgraph_loc.sensors.odometry.measurement import YawRateStream
+from factorgraph_loc.sensors.tables import Reading
 from factorgraph_loc.text import Notice, notice, quoted
 from factors.se2 import Array, Integers
 
@@ -152,7 +153,7 @@ class YawRates:
         self._rows = TopicRows(f"{bag.path} {options.topic}", 3, paths, options)
         self.add = self._rows.add
 
-    def stream(self, t0_ns: int, warnings: list[Notice]) -> YawRateStream:
+    def stream(self, reading: Reading) -> YawRateStream:
         """Return the turn rates about the robot's z axis. Only the axes of the IMU that contribute must be finite."""
         turned = self._options.turned()
         if self._options.frame is not None:
@@ -160,9 +161,9 @@ class YawRates:
         needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
         names = [f"turn rate about {axis}" for axis in "xyz"]
         values = self._rows.values
-        keep = self._rows.kept([checks.not_finite(names, values)[i] for i in needed.tolist()], warnings)
+        keep = self._rows.kept([checks.not_finite(names, values)[i] for i in needed.tolist()], reading.warnings)
         w = about_z(self._rows.source, self._rows.rows[keep], values[keep], turned)
-        return YawRateStream(checks.seconds(self._rows.t_ns[keep], t0_ns), w)
+        return YawRateStream(checks.seconds(self._rows.t_ns[keep], reading.t0_ns), w)
 
 
 def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:

@@ -35,7 +35,7 @@ from factorgraph_loc.io.bags.poses import (
 from factorgraph_loc.io.bags.tables import Landmarks, LandmarkTopic, Reads, RfidTopic, TableTopic, rows_of_table
 from factorgraph_loc.io.bags.topics import TF, Clock, Listeners, report
 from factorgraph_loc.io.motions import odometry_stream
-from factorgraph_loc.io.native.rig_file import default_rig
+from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, default_rig
 from factorgraph_loc.model.log import NOT_READ, RIG_NOTES, Log
 from factorgraph_loc.model.measurement import Stream, of_sensor
 from factorgraph_loc.model.pose_path import PosePath
@@ -46,7 +46,7 @@ from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.rfid.settings import AntennaSettings, RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidStream
-from factorgraph_loc.sensors.tables import native_tables
+from factorgraph_loc.sensors.tables import Reading, native_tables
 from factorgraph_loc.text import Notice, listed, notice, plain
 from factors.camera.model import angles_of_camera
 from factors.se2 import Array
@@ -150,7 +150,8 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
     t_ns, moves = motion(warnings)
     t0_ns = int(t_ns[0])
     streams: dict[str, Stream] = {"odometry": odometry_stream(t_ns, moves, t0_ns, options.odometry, warnings)}
-    streams |= {name: of_sensor(sensor.stream(t0_ns, warnings), name) for name, sensor in sensors.items()}
+    reading = Reading(DEFAULT_RIG, t0_ns, warnings)
+    streams |= {name: of_sensor(sensor.stream(reading), name) for name, sensor in sensors.items()}
     reference = None
     if poses and of_reference:
         path = poses(warnings)

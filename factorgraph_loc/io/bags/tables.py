@@ -24,7 +24,6 @@ from factorgraph_loc.files.tables import TableRows
 from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import StaticFrames
 from factorgraph_loc.io.bags.topics import LIST, Fields, RowTopic, TopicRows, as_nanoseconds, as_text, leaves
-from factorgraph_loc.io.native.rig_file import DEFAULT_RIG
 from factorgraph_loc.maps.markers import corner_names
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Axes, Turned
@@ -140,13 +139,13 @@ class RowsOfTopic:
         read = read.usable(columns, warnings, more=faults)
         return TableRows.of(read, self._columns, read.nanoseconds()), np.asarray(read.columns[INDEX])
 
-    def stream(self, t0_ns: int, warnings: list[Notice]) -> Stream:
-        """Return the rows as a stream, with times after ``t0_ns`` [ns]. An invalid row raises InputError or adds a warning."""
+    def stream(self, reading: Reading) -> Stream:
+        """Return the rows as a stream, with times after t = 0. An invalid row raises InputError or adds a warning."""
         channel, _ = native_tables()[self._table.name]
         if channel.assemble:
-            rows = {self._table.name: self.rows_of(warnings)[0]}
-            return assemble(channel, rows, Reading(DEFAULT_RIG, t0_ns, warnings))
-        return stream_of(self._table, self.rows_of(warnings)[0], t0_ns, warnings)
+            rows = {self._table.name: self.rows_of(reading.warnings)[0]}
+            return assemble(channel, rows, reading)
+        return stream_of(self._table, self.rows_of(reading.warnings)[0], reading.t0_ns, reading.warnings)
 
 
 class RfidTopic(RowTopic, ReadNames):
@@ -207,20 +206,20 @@ class Reads(RowsOfTopic):
         self._number += [numbers[name] for name in of_reads]
         self._rounds += [(t_ns, reads, name) for name in antennas]
 
-    def stream(self, t0_ns: int, warnings: list[Notice]) -> RfidStream:
+    def stream(self, reading: Reading) -> RfidStream:
         """Return all reads, grouped into inventory rounds. Raises InputError with the number of an invalid message."""
         all_ns = self._rows.t_ns
-        table, which = self.rows_of(warnings)
+        table, which = self.rows_of(reading.warnings)
         table = replace(table, names=table.names | {"epc": in_case(table.names["epc"], self._options.epc_case)})
         if self._options.rounds == "gaps":
-            return native_rfid.read_rounds(table, None, self._options.round_gap, warnings).stream(t0_ns)
+            return native_rfid.read_rounds(table, None, self._options.round_gap, reading.warnings).stream(reading.t0_ns)
         ends = [max([t_ns, *all_ns[reads].tolist()]) for t_ns, reads, _ in self._rounds]
         number, end_ns = (np.array(column, dtype=np.int64) for column in (self._number, ends))
         number = number[which]
         signals = (table.numbers["rssi"], table.numbers["phase"], table.numbers["frequency"])
         antennas = [antenna for *_, antenna in self._rounds]
         reads = native_rfid.ReadsByRound(table.t_ns, number, table.names["epc"], signals, end_ns, antennas)
-        return reads.stream(t0_ns)
+        return reads.stream(reading.t0_ns)
 
     def _stamp(self, values: Mapping[Any, Any], t_ns: int, row: int) -> int:
         if "stamp" not in values:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 AREA, DEGREES = {"m^2": 1.0}, {"deg": 1.0}
 LARGEST = 1e308  # m^2; some systems report such a variance as a placeholder
+ORIGIN = "origin of latitudes and longitudes"
 VARIANCES = ("var_x", "cov_xy", "var_y")
 _POINT = {axis: f"pose.position.{axis}" for axis in "xy"}
 _COVARIANCE = dict(zip(VARIANCES, ("covariance[0]", "covariance[1]", "covariance[7]"), strict=True))
@@ -131,16 +132,21 @@ class PositionSettings(SensorSettings):
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of positions of a log. Missing covariances become NaN. Latitudes and longitudes become metres to the
-    east and north of the first position."""
+    """Return the stream of positions of a log. Missing covariances become NaN.
+
+    Latitudes and longitudes become metres to the east and north of the first position. All sensors of a log share this origin.
+    """
     (table,) = rows.values()
     columns = {name: np.full(len(table.rows), np.nan) for name in VARIANCES} | dict(table.numbers)
     if "latitude" in columns:
         for column in POSITIONS_ON_EARTH.columns[1:3]:
             column.require(table.path, table.rows, columns[column.name])
         degrees = np.column_stack((columns.pop("latitude"), columns.pop("longitude")))
-        columns |= dict(zip("xy", on_map(degrees, degrees[:1]).T, strict=True))
-        if len(degrees):
+        is_first = len(degrees) > 0 and ORIGIN not in reading.shared
+        if is_first:
+            reading.shared[ORIGIN] = degrees[:1]
+        columns |= dict(zip("xy", on_map(degrees, reading.shared.get(ORIGIN, degrees)).T, strict=True))
+        if is_first:
             sentence = (
                 "position: x points east and y north; the origin is the first position, latitude {latitude}, "
                 "longitude {longitude}"
