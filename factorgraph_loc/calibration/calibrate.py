@@ -106,11 +106,11 @@ def check(logs: Sequence[Log], *, blind: bool = False) -> None:
             more = "; calibrate logs without a reference separately" if len(logs) > 1 else ""
             raise InputError(f"{log.name}: has no reference, expected one to calibrate against{more}")
         if not any(_has(log, name) for name in moving(log.streams)):
-            raise InputError(f"{log.name}: has no odometry, expected one in every log to calibrate from")
+            raise InputError(f"{log.name}: has no odometry, expected odometry in every log to calibrate from")
         if not any(_has(log, sensor) for sensor in senses(log.rig)) and not has_heading(log):
             lacking = " and ".join(f"no {sensor}" for sensor in senses(log.rig))
             raise InputError(
-                f"{log.name}: has {lacking}, expected one of them, or headings in the reference, to calibrate wheels alone"
+                f"{log.name}: has {lacking}, expected one of these, or headings in the reference to calibrate only the wheels"
             )
         _check_alike(logs[0], log)
     names = [log.name for log in logs]
@@ -123,14 +123,16 @@ def _check_alike(first: Log, log: Log) -> None:
     for sensor in senses(first.rig):
         for one_log, other_log in ((first, log), (log, first)):
             if _has(one_log, sensor) and not _has(other_log, sensor):
-                raise InputError(f"{other_log.name}: has no {sensor}, expected one in every log to calibrate from")
+                raise InputError(
+                    f"{other_log.name}: has no {sensor}, expected it in every log, because {one_log.name} has it"
+                )
     for name, stream in log.streams.items():
         if name in first.streams and not are_alike(first.streams[name], stream):
-            kinds = f"{type(stream).__name__}, that of {first.name} {type(first.streams[name]).__name__}"
-            raise InputError(f"{log.name}: its {name} has the form {kinds}; calibrate them separately")
+            kinds = f"{type(stream).__name__}, but in {first.name} it is {type(first.streams[name]).__name__}"
+            raise InputError(f"{log.name}: the type of {name} is {kinds}: calibrate these logs separately")
     if has_heading(log) != has_heading(first):
         raise InputError(
-            f"{log.name} and {first.name}: only one has headings in its reference; calibrate them separately"
+            f"{log.name} and {first.name}: only one has headings in its reference: calibrate these logs separately"
         )
 
 

@@ -38,7 +38,7 @@ DIFFERENCES: dict[str, type] = {
 }
 
 Seeds = Mapping[int, float | None]  # by seed, the score of the run, None if it has no score
-ByLog = Mapping[str, Seeds]  # by log
+ByLog = Mapping[str, Seeds]  # by log, the scores of its runs by seed
 Units = Literal["logs", "seeds"]
 
 

@@ -46,7 +46,7 @@ def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> 
     by_seed = (a, b)
     seeds = sorted(set(a) | set(b))
     both = [[s.get(seed, next(iter(s.values())) if len(s) == 1 else None) for s in by_seed] for seed in seeds]
-    if any(len(s) == 1 for s in by_seed):  # only seeds of the longer one count
+    if any(len(s) == 1 for s in by_seed):  # a single run is paired with the seeds of the other method only
         longer = max(by_seed, key=len)
         both = [pair for seed, pair in zip(seeds, both, strict=True) if seed in longer]
     complete = [pair for pair in both if None not in pair]

@@ -184,7 +184,7 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
         )
     require_mappable(log)
     if options.extend and not log.world.landmarks:
-        raise InputError(f"{log.name}: has no map that could be extended; leave --extend out")
+        raise InputError(f"{log.name}: has no map that --extend could extend: remove --extend")
     source = ""
     if options.extend:
         started, config = log, RunConfig(estimator, settings | {"landmarks": "extended"}, prior=options.prior)
@@ -206,7 +206,7 @@ def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
         raise InputError(f"--tag-height is {height:g}, expected metres, {HEIGHTS[0]:g} to {HEIGHTS[1]:g}")
     if options.extend and not log.world.tags:
-        raise InputError(f"{log.name}: has no map of tags that could be extended; leave --extend out")
+        raise InputError(f"{log.name}: has no map of tags that --extend could extend: remove --extend")
     prior, frame = (None, OF_REFERENCE) if uses_reference else _start_of_tags(log, options)
     poses: tag_mapping.Poses = "reference" if uses_reference else "odometry"
     made = tag_mapping.map_tags(log, poses, prior, extend=options.extend, height=height, progress=progress)
@@ -239,7 +239,7 @@ def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     if POINTS not in _mappable(log):
         raise InputError(f"{log.name}: has no images (camera), so that there are no points to map")
     if options.extend and log.world.points is None:
-        raise InputError(f"{log.name}: has no map of points that could be extended; leave --extend out")
+        raise InputError(f"{log.name}: has no map of points that --extend could extend: remove --extend")
     if options.poses not in (None, "reference"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference for points: {BY_RUN}")
     settings = parse_model(PointSettings, options.points, "--set points")

@@ -41,7 +41,7 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
         return None, prior
     if prior == "log":
         if log.start is None:
-            raise InputError(f"{log.name}: states no start, expected a prior {PRIORS}")
+            raise InputError(f"{log.name}: has no start pose, expected a prior {PRIORS}")
         return PosePrior(log.start.t, np.array(log.start.pose), np.diag(np.square(log.start.sigmas))), prior
     if prior == "reference":
         return _from_reference(log), prior
@@ -134,7 +134,7 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
     lacking = {s: section for s in log.streams if kind_of(s) in kinds and (section := lacking_section(log.rig, s))}
     for section in dict.fromkeys(lacking.values()):
         names = ", ".join(name for name, of in lacking.items() if of == section)
-        sentence = "{log}: {sensors} left out, as the rig {rig} has no [{section}]"
+        sentence = "{log}: {sensors} not used, because the rig {rig} has no [{section}]"
         doubts.append(notice("no_section", sentence, log.name, names, log.rig.name, section))
     if not moving(sensors):
         sentence = "{log}: run without odometry, the motion between measurements is unknown"

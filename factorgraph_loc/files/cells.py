@@ -20,7 +20,7 @@ from factors.se2 import Array, Integers
 
 SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # units of time, as powers of ten of a nanosecond
 ISO = "iso"
-MOST_DIGITS = 20  # of a timestamp before its decimal point
+MOST_DIGITS = 20  # maximum number of digits of a timestamp before its decimal point
 NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
 T = TypeVar("T")
 
@@ -183,7 +183,9 @@ class Cells:
         unit = self.units.get(name)
         if unit not in {*SECONDS, ISO}:
             expected = f"one of {', '.join(SECONDS)} or {ISO}"
-            raise InputError(f"{self.path}: the unit of {name} is {quoted(unit)}, expected {expected}: units.{name}")
+            raise InputError(
+                f"{self.path}: the unit of {name} is {quoted(unit)}, expected {expected}: set units.{name}"
+            )
         power, shift = SECONDS.get(str(unit), 0), round(offset * 1e9)
         expected = f"a number of {unit} in {-LATEST / 10**power:g} to {LATEST / 10**power:g}"
         if unit == ISO:

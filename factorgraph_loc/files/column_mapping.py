@@ -239,7 +239,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         header = named if in_comment else first
         body = body if in_comment else body[1:]
     else:
-        # rows of other kinds may have other numbers of columns
+        # rows that ``where`` excludes may have other numbers of columns
         chosen = ((row, parts) for row, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
         first_row, first = next(chosen, body[0])
         header = _numbers(len(first))

@@ -35,13 +35,13 @@ PURE = {"1": 1.0}
 LEAST_UNIT = 1e-12  # minimum factor from a unit of a file to the unit of streams; the maximum is its reciprocal
 
 LATEST = 4_600_000_000_000_000_000  # ns, 145 years: differences of two timestamps fit into 64 bits
-MAX_SPAN = 30 * 86_400.0  # s between two timestamps of one log
+MAX_SPAN = 30 * 86_400.0  # s; maximum time between two timestamps of one log
 FASTEST = 100.0  # m/s; most speeds that are in mm/s by mistake exceed this bound
 FASTEST_TURN = 100.0  # rad/s: gyros measure up to 70
 LONGEST_WAY, MOST_TURNED = 1000.0, 100.0  # m and rad from one row of odometry to the next, also across a pause
-NEAREST, LONGEST_RANGE = 1e-3, 1e5  # m
+NEAREST, LONGEST_RANGE = 1e-3, 1e5  # m; bounds of measured ranges
 FULL_TURN = 2.0 * math.pi
-LARGEST_PIXEL = 1e5  # px
+LARGEST_PIXEL = 1e5  # px; bound of pixel coordinates
 
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries on and above the diagonal
 # columns of tables: entries of a covariance of (x, y, heading)

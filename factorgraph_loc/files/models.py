@@ -190,7 +190,8 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
             raise InputError(f"{source}: unknown key {key}{hint}{more}") from error
         if first["type"] == "missing":
             raise InputError(f"{source}: {key} is missing{more}") from error
-        if first["type"] == "value_error" and isinstance(first["input"], (Mapping, BaseModel)):  # too long for a line
+        # the message does not contain the value if it is a table, which is too long
+        if first["type"] == "value_error" and isinstance(first["input"], (Mapping, BaseModel)):
             table = f"{key}: " if key else ""
             raise InputError(f"{source}: {table}{first['ctx']['error']}{more}") from error
         expected = first["msg"][0].lower() + first["msg"][1:]

@@ -78,7 +78,7 @@ def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | N
             known = settings.get(setting.key)
             if known is None:
                 settings[setting.key] = setting
-            elif known.choices and setting.choices:  # the kinds of alternative models
+            elif known.choices and setting.choices:  # the field that selects one of several alternative models
                 choices = dict.fromkeys((*known.choices, *setting.choices))
                 settings[setting.key] = replace(known, choices=tuple(choices))
     return list(settings.values())

@@ -42,7 +42,7 @@ def numbers(where: str, field: str, value: object) -> Array:
             isinstance(item, NUMBER) and not isinstance(item, bool) for item in array.flat
         ):
             array = array.astype(float)
-    except (TypeError, ValueError, OverflowError):  # rows of different lengths, huge integers
+    except (TypeError, ValueError, OverflowError):  # raised for rows of different lengths and for huge integers
         raise bad_field(where, field, value, "numbers") from None
     if array.dtype.kind not in "iuf" and array.size:
         raise bad_field(where, field, value, "numbers")
@@ -78,7 +78,7 @@ def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
     """Return the items of a list as a tuple. Raises InputError if ``values`` cannot be iterated or is a text."""
     items = None
     if isinstance(values, Iterable) and not isinstance(values, str):
-        with contextlib.suppress(TypeError):  # a zero-dimensional array
+        with contextlib.suppress(TypeError):  # raised by a zero-dimensional array
             items = tuple(values)
     if items is None:
         raise bad_field(where, field, values, f"a list of {field}")

@@ -154,7 +154,7 @@ def test_logs_that_do_not_go_together_are_refused(simulate, headless):
     increments = IncrementStream(odometry.t, odometry.v, odometry.v, odometry.w)
     with pytest.raises(
         InputError,
-        match=r"simulated-2: its odometry has the form IncrementStream, that of simulated-1 VelocityStream; calib",
+        match=r"simulated-2: the type of odometry is IncrementStream, but in simulated-1 it is VelocityStream: calib",
     ):
         check([log, replace(second, streams={**second.streams, "odometry": increments})])
     with pytest.raises(InputError, match=r"simulated-1: odometry and reference overlap in 14 windows"):
@@ -210,6 +210,6 @@ def test_a_reference_without_headings_calibrates_no_wheels(simulate, tmp_path):
     log = replace(log, streams={"odometry": log.streams["odometry"]})
     log = replace(log, reference=replace(log.reference, has_heading=False))
     with pytest.raises(
-        fgloc.InputError, match="expected one of them, or headings in the reference, to calibrate wheels alone"
+        fgloc.InputError, match="expected one of these, or headings in the reference to calibrate only the wheels"
     ):
         fgloc.calibrate(log, tmp_path / "cart.rig.toml")

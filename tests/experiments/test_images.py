@@ -74,7 +74,7 @@ def test_a_rig_without_camera_leaves_images_out_unless_they_are_asked_for(seeing
     log = replace(seeing, rig=rig, streams=dict(seeing.streams) | {"sightings": pixels})
     result = run(log, RunConfig("fake"))
     assert sees.made.setup.sensors == ("odometry",)
-    assert "straight: camera, sightings left out, as the rig rig has no [camera]" in map(str, result.warnings)
+    assert "straight: camera, sightings not used, because the rig rig has no [camera]" in map(str, result.warnings)
     for sensor in ("camera", "sightings"):
         with pytest.raises(InputError, match=f"straight: {sensor} needs \\[camera\\] in the rig, and rig has none"):
             run(log, RunConfig("fake", sensors=("odometry", sensor)))

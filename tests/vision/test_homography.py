@@ -60,7 +60,7 @@ def test_text_and_xml_give_the_same(tmp_path, text):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 0 0 0 1 0 0 0", "has 8 numbers, expected the 3 x 3"),
+        ("1 0 0 0 1 0 0 0", "has 8 numbers, expected the 9"),
         ("1 0 0 0 one 0 0 0 1", "could not convert string to float: 'one', expected nine numbers"),
         ("1 2 3 2 4 6 0 0 1", "is singular"),
         ("1 0 0 0 1 0 -0.01 0 1", "maps a part of the first image to infinity"),

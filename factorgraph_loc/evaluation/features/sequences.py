@@ -95,7 +95,7 @@ def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
     ``matrix`` (3, 3). ``shape``: of the first image. Raises InputError with the file ``source`` if it is not a valid homography.
     """
     if matrix.shape != (3, 3):
-        raise InputError(f"{source}: has {matrix.size} numbers, expected the 3 x 3 of a homography")
+        raise InputError(f"{source}: has {matrix.size} numbers, expected the 9 numbers of a homography")
     if not np.isfinite(matrix).all():
         raise InputError(f"{source}: has numbers that are not finite, expected a homography")
     if not np.any(matrix) or np.linalg.cond(matrix) > _MAX_CONDITION:

@@ -56,7 +56,9 @@ def associate(
     if estimate.t_ns is None or reference.t_ns is None:
         if how != "nearest":
             without = estimate if estimate.t_ns is None else reference
-            raise InputError(f"{without.name}: has no stamps to interpolate at, expected a trajectory with stamps")
+            raise InputError(
+                f"{without.name}: has no timestamps, which associate interpolate requires: use associate nearest"
+            )
         if len(estimate) != len(reference):
             raise InputError(
                 f"{estimate.name}: has {len(estimate)} poses, expected {len(reference)} as {reference.name} has: without stamps, "

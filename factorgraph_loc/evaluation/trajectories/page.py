@@ -40,7 +40,7 @@ EXPLANATION = (
     "are plotted at the end of each piece. A rotation error is the angle between two orientations. 95 % of the errors are smaller "
     "than the value in the column 95 %. The column std has their standard deviation."
 )
-FILES = ("errors.csv", "report.html", "score.json")  # the last one is written last
+FILES = ("errors.csv", "report.html", "score.json")  # score.json is written last and marks a complete report
 
 
 def _trajectories(score: TrajectoryScore) -> Figure:

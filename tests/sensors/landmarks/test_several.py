@@ -157,7 +157,7 @@ def test_what_a_rig_lacks_is_left_out_with_a_warning(tmp_path):
     log = drive(RADIOS, seconds=10.0)
     rig = rig_of({"left": RADIOS["left"]})
     result = run(replace(log, rig=rig), RunConfig("ekf"))
-    assert f"{RIGHT} left out, as the rig r has no [{RIGHT}]" in " ".join(map(str, result.warnings))
+    assert f"{RIGHT} not used, because the rig r has no [{RIGHT}]" in " ".join(map(str, result.warnings))
     assert result.config["sensors"] == ["odometry", LEFT]
     refusal(
         lambda: run(replace(log, rig=rig), RunConfig("ekf", sensors=("odometry", RIGHT))),
