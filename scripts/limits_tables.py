@@ -65,5 +65,6 @@ def _columns() -> list[str]:
     for (name, *row), of in tables.items():
         names.setdefault((", ".join(of), *row), []).append(f"`{name}`")
     heads = ["column", "of", "unit", "least", "most", "may be empty", "what it is"]
-    rows = [heads, ["---"] * len(heads), *([", ".join(these), *row] for row, these in names.items())]
-    return [f"| {' | '.join(cells)} |" for cells in rows]
+    rows = [heads, *([", ".join(these), *row] for row, these in names.items())]
+    lines = [f"| {' | '.join(cells)} |" for cells in rows]
+    return [lines[0], "|" + "---|" * len(heads), *lines[1:]]

@@ -55,8 +55,10 @@ def _table(settings: Iterable[tuple[str, str, Setting]], *, owned: bool = False)
     for (key, *rest), of in owners.items():
         keys.setdefault((_names(filter(None, of)), *rest), []).append(key)
     heads = ["setting", "of", "default", "values", "what it is"]
-    rows = [heads, ["---"] * len(heads), *([_names(key), *rest] for rest, key in keys.items())]
-    return [f"| {' | '.join(cells if owned else [cells[0], *cells[2:]])} |" for cells in rows] + [""]
+    rows = [heads, *([_names(key), *rest] for rest, key in keys.items())]
+    shown = [cells if owned else [cells[0], *cells[2:]] for cells in rows]
+    lines = [f"| {' | '.join(cells)} |" for cells in shown]
+    return [lines[0], "|" + "---|" * len(shown[0]), *lines[1:], ""]
 
 
 def _names(names: Iterable[str]) -> str:

@@ -132,7 +132,7 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the printed table of :func:`summaries`."""
     header = ["world", "policy", "estimator", "runs", "median [m]", "90 % [m]", "failed (95 %)", "claimed wrongly"]
-    header += ["error [m]", "[deg]", "time [s]", "planning [ms]"]
+    header += ["error [m]", "[rad]", "time [s]", "planning [ms]"]
     lines = []
     for summary in summaries(rows):
         low, high = 100.0 * summary["failures_low"], 100.0 * summary["failures_high"]
@@ -142,7 +142,7 @@ def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
                 *(metres_text(summary["median"]), metres_text(summary["p90"])),
                 f"{summary['failures']} ({low:.0f} % to {high:.0f} %)",
                 str(summary["claimed_wrong"]),
-                *(number(summary["error_position"], 2), number(np.degrees(summary["error_heading"]), 1)),
+                *(number(summary["error_position"], 2), number(summary["error_heading"], 3)),
                 *(number(summary["seconds"], 0), number(summary["planning_ms"], 1)),
             ]
         )

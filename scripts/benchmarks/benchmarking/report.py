@@ -23,9 +23,9 @@ NOTHING = "–"  # an empty cell
 KINDS = ("causal", "final")
 ACCURACY = (
     "causal [m]",
-    "[deg]",
+    "[rad]",
     "final [m]",
-    "[deg]",
+    "[rad]",
     "final p95 [m]",
     "ANEES causal / final",
     "inside causal / final",
@@ -71,7 +71,7 @@ class Report:
         self.lines += [text, ""]
 
     def table(self, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        self.lines += [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)]
+        self.lines += [_row(heads), "|" + "---|" * len(heads), *map(_row, rows)]
         self.lines.append("")
 
     def collect(
@@ -98,6 +98,10 @@ class Report:
         print(f"\r{self.name}: {done:.0f} of {total:.0f}", end=end, file=sys.stderr, flush=True)
 
 
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
 def _called(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     return function(*arguments)
 
@@ -108,8 +112,8 @@ def rmses(runs: Sequence[Series]) -> np.ndarray:
 
 
 def pooled(runs: Sequence[Series]) -> tuple[float, float]:
-    """Return the RMSE of position [m] and heading [degrees], pooled over runs."""
-    return pooled_rms(rmses(runs).tolist()), float(np.degrees(pooled_rms([one.heading_rmse() for one in runs])))
+    """Return the RMSE of position [m] and heading [rad], pooled over runs."""
+    return pooled_rms(rmses(runs).tolist()), pooled_rms([one.heading_rmse() for one in runs])
 
 
 def together(runs: Sequence[Series]) -> np.ndarray:
@@ -119,11 +123,11 @@ def together(runs: Sequence[Series]) -> np.ndarray:
 
 
 def spread_cell(runs: Sequence[Series]) -> str:
-    """Return a cell with position RMSE / median / 95th percentile [m] / heading RMSE [degrees] / ANEES, pooled over runs."""
+    """Return a cell with position RMSE / median / 95th percentile [m] / heading RMSE [rad] / ANEES, pooled over runs."""
     position, heading = pooled(runs)
     errors = together(runs)
     nees = np.mean([np.nanmean(one.nees) for one in runs])
-    return f"{position:.3f} / {np.median(errors):.3f} / {np.percentile(errors, 95):.3f} / {heading:.1f} / {nees:.1f}"
+    return f"{position:.3f} / {np.median(errors):.3f} / {np.percentile(errors, 95):.3f} / {heading:.3f} / {nees:.1f}"
 
 
 def accuracy_cells(runs: Sequence[RunErrors]) -> tuple[str, ...]:
@@ -139,7 +143,7 @@ def accuracy_cells(runs: Sequence[RunErrors]) -> tuple[str, ...]:
             inside.append(NOTHING)
             continue
         position, heading = pooled(members)
-        cells += [f"{position:.4f}", f"{heading:.3f}"]
+        cells += [f"{position:.4f}", f"{heading:.5f}"]
         nees.append(f"{np.nanmean(grid):.2f}")
         inside.append(f"{100 * share_in_band(grid):.0f} %" if len(runs) > 1 else NOTHING)
     p95 = np.percentile(together([one.final for one in runs]), 95)

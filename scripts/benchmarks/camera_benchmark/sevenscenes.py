@@ -45,17 +45,17 @@ NEAR, TURNED = 0.05, 5.0  # m, degrees: an image with smaller errors is located
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors of F located images. ``position`` (F,) [m]: of the camera's centre. ``angle`` (F,) [degrees]: of the rotation.
+    """The errors of F located images. ``position`` (F,) [m]: of the camera's centre. ``angle`` (F,) [rad]: of the rotation.
     Both are infinite if an image is not located."""
 
     position: Array
     angle: Array
 
     def cells(self) -> tuple[str, ...]:
-        success = np.mean((self.position < NEAR) & (self.angle < TURNED))
+        success = np.mean((self.position < NEAR) & (self.angle < np.radians(TURNED)))
         p90 = [np.percentile(errors, 90, method="higher") for errors in (self.position, self.angle)]
-        middle = f"{np.median(self.position):.4f}", f"{np.median(self.angle):.2f}"
-        return f"{100.0 * success:.0f} %", *middle, f"{p90[0]:.3f}", f"{p90[1]:.1f}"
+        middle = f"{np.median(self.position):.4f}", f"{np.median(self.angle):.4f}"
+        return f"{100.0 * success:.0f} %", *middle, f"{p90[0]:.3f}", f"{p90[1]:.3f}"
 
 
 def section(options: Options) -> Report:
@@ -74,7 +74,7 @@ def section(options: Options) -> Report:
     report.say(
         f"{COUNT} features an image. Medians and 90th percentiles. *Located*: within {NEAR} m and {TURNED:.0f} degrees."
     )
-    heads = ("located", "position [m]", "angle [degrees]", "p90 [m]", "p90 [degrees]")
+    heads = ("located", "position [m]", "angle [rad]", "p90 [m]", "p90 [rad]")
     report.table(("feature", "images", *heads), located_rows)
     report.say("The maps of images 0, 2, ... 198.")
     heads = ("points", "observations", "residual RMS [px]", "median [px]", "parallax [rad]", "sigma [m]")
@@ -109,7 +109,7 @@ def errors_of(made: MadePoints, frames: list[CameraFrame], truth: Cameras) -> Er
         found = camera_of(associator, made, frame)
         if found is not None:
             position[i] = np.linalg.norm(found[0] - truth.positions[i])
-            angle[i] = np.degrees(Rotation.from_matrix(found[1].T @ truth.rotations[i]).magnitude())
+            angle[i] = Rotation.from_matrix(found[1].T @ truth.rotations[i]).magnitude()
     return Errors(position, angle)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 from benchmarking.report import ACCURACY, NOTHING, Options, Report, accuracy_cells
 
 from camera_benchmark.drives import RATE, TAGS, Drive, log_of
@@ -71,16 +70,16 @@ def table(report: Report, found: Attempts) -> None:
         runs = succeeded(found, label)
         if runs:
             rows.append((label, *accuracy_cells(list(runs.values())), *aligned_cells(found, label)))
-    report.table(("estimator", *ACCURACY, "aligned final [m]", "[deg]"), rows)
+    report.table(("estimator", *ACCURACY, "aligned final [m]", "[rad]"), rows)
 
 
 def aligned_cells(found: Attempts, label: str) -> tuple[str, str]:
     runs: list[Attempt] = [runs[label] for runs in found.values() if label in runs and not runs[label].failure]
     cells = []
-    for what, unit in (("position", 1.0), ("rotation", 180.0 / np.pi)):
+    for what, digits in (("position", 4), ("rotation", 5)):
         values = [one.figures.get(f"final.aligned_{what}_rmse") for one in runs]
         known = [value for value in values if value is not None]
-        cells.append(f"{unit * pooled_rms(known):.4f}" if known else NOTHING)
+        cells.append(f"{pooled_rms(known):.{digits}f}" if known else NOTHING)
     return cells[0], cells[1]
 
 

@@ -68,13 +68,13 @@ def section(options: Options) -> Report:
             runs = [runs[estimator] for (name, _), runs in outcomes.items() if name == fault]
             if runs:
                 rows.append((fault, estimator, *cells(runs)))
-    report.table(("fault", "estimator", "causal [m] / [deg]", "worst [m]", "final [m] / [deg]", "status [%]"), rows)
+    report.table(("fault", "estimator", "causal [m] / [rad]", "worst [m]", "final [m] / [rad]", "status [%]"), rows)
     return report
 
 
 def cells(runs: list[RunErrors]) -> tuple[str, str, str, str]:
     causal, final = (
-        "{:.3f} / {:.1f}".format(*pooled([getattr(one, kind) for one in runs])) for kind in ("causal", "final")
+        "{:.3f} / {:.3f}".format(*pooled([getattr(one, kind) for one in runs])) for kind in ("causal", "final")
     )
     worst = max(one.causal.position_rmse() for one in runs)
     shares = (

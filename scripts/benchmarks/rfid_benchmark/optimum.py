@@ -51,8 +51,8 @@ def table(report: Report, found: dict[str, list[Series]], optimal: str) -> None:
             position, heading = pooled(runs)
             nees = np.mean([np.nanmean(one.nees) for one in runs])
             ratios = ("1", "–") if label == optimal else ratio_cells(runs, found[optimal])
-            rows.append((label, f"{position:.4f}", f"{heading:.2f}", f"{nees:.2f}", *ratios))
-    report.table(("estimator", "RMSE [m]", "heading [deg]", "ANEES", "ratio (95 %)", "largest"), rows)
+            rows.append((label, f"{position:.4f}", f"{heading:.4f}", f"{nees:.2f}", *ratios))
+    report.table(("estimator", "RMSE [m]", "heading [rad]", "ANEES", "ratio (95 %)", "largest"), rows)
 
 
 def in_room(seed: int) -> dict[str, Series]:
