@@ -22,9 +22,15 @@ SETTINGS = ActiveSettings()
 def policies(options: Options) -> Report:
     """Compare all policies in three worlds, with the estimator ActiveMCL."""
     report = Report("policies", options)
+    degrees = math.degrees(SETTINGS.heading_limit)
+    report.say(
+        f"A robot gives up after {SETTINGS.max_metres:.0f} m. *Failed*: standard deviations and errors are not below "
+        f"{SETTINGS.position_limit:g} m and {degrees:.0f} degrees by then. *Claimed wrongly*: standard deviations are below these "
+        "limits, but an error is above three times its limit. Errors are medians at the end. *Planning* is the time of one step."
+    )
     rows = compared(report, ("active_mcl",), POLICIES, WORLDS, options.count(200))
-    # the office is left out: with its many tags, robots are localized almost without driving
-    report.table(*difference_cells([row for row in rows if row["world"] != "office"]))
+    # in the dense office robots are localized almost without driving
+    table(report, *difference_cells([row for row in rows if row["world"] != "office"]))
     return report
 
 
@@ -55,13 +61,15 @@ def compared(
         )
         report.failed += done.failures
         rows += done.rows
-    degrees = math.degrees(SETTINGS.heading_limit)
-    report.say(
-        f"{count} robots in each world, the same for all policies. A robot gives up after {SETTINGS.max_metres:.0f} m. "
-        f"*Failed*: not localized by then, with standard deviations and errors below {SETTINGS.position_limit:g} m and "
-        f"{degrees:.0f} degrees. *Claimed wrongly*: localized with an error above three times that. Errors are medians at "
-        "the end. Planning is the time of a step."
-    )
-    report.table(*summary_cells(rows))
+    report.say(f"Each policy has the same {count} robots in each world.")
+    table(report, *summary_cells(rows))
     write_picture(comparison(rows), folder / "comparison.png")
     return rows
+
+
+def table(report: Report, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Add a table to the report, without the column ``estimator`` if all rows have the same."""
+    column = list(heads).index("estimator")
+    omitted = {column} if len({row[column] for row in rows}) == 1 else set[int]()
+    heads, *rows = ([cell for i, cell in enumerate(cells) if i not in omitted] for cells in (heads, *rows))
+    report.table(heads, rows)

@@ -51,8 +51,9 @@ def section(options: Options) -> Report:
     }
     outcomes = report.collect(faulty, jobs)
     report.say(
-        f"{len(ready)} rendered offices of {options.seconds(DURATION):.0f} s with a map from another drive, pooled. The cells are "
-        f"position RMSE [m] of causal and final estimates, and the causal one of the last {AFTERWARDS:.0f} s of the worst run."
+        f"Number of rendered offices: {len(ready)}, of {options.seconds(DURATION):.0f} s, with a map from another "
+        "drive. The cells are "
+        f"position RMSE [m]: causal / final / causal in the last {AFTERWARDS:.0f} s of the worst run."
     )
     runs = {fault: [found for (name, _), found in outcomes.items() if name == fault] for fault in FAULTS}
     runs = {fault: found for fault, found in runs.items() if found}
@@ -65,8 +66,9 @@ def section(options: Options) -> Report:
     ]
     report.table(("fault", *CONFIGS), rows)
     report.say(
-        f"Warnings, events and changes of the diagnostics of the run *{REPORTED}* in the first office. NIS is that of the camera "
-        "per degree of freedom."
+        f"The next table has warnings, events and changed diagnostics of the run *{REPORTED}* in the first office. "
+        "*NIS*: normalised "
+        "innovation squared of the camera, per degree of freedom. *Rejected*: number of rejected features."
     )
     right = runs.get(RIGHT, [{}])[0].get(REPORTED)
     reports = [(fault, said(found[0][REPORTED], right or found[0][REPORTED])) for fault, found in runs.items()]

@@ -59,7 +59,7 @@ def sentence(known: Sequence[FrameKnown]) -> str:
     low, high = (chi2.ppf(tail, 3 * count) / count for tail in tails)
     least = np.sqrt(np.mean([one.least**2 for one in known]))
     return (
-        f"The starts have a mean NEES of {np.mean([one.nees for one in known]):.2f} (95 % of such draws: {low:.2f} to {high:.2f}), "
-        "and without tags all poses of a run have this error. With tags and the exact shape of the path the error would still be "
-        f"{least:.4f} m (Cramer-Rao bound)."
+        f"The errors of the start poses have a mean NEES of {np.mean([one.nees for one in known]):.2f} (in 95 % of random draws: "
+        f"{low:.2f} to {high:.2f}). Without tags all poses of a run contain this error. With tags, and with the exact shape of the "
+        f"path, the Cramer-Rao bound of the error is {least:.4f} m."
     )

@@ -31,7 +31,7 @@ CONFIGS = {
     "batch, rfid, camera": RunConfig("batch", sensors=BOTH),
 }
 SLOW = {"particle_filter, rfid, camera": RunConfig("particle_filter", sensors=BOTH)}
-TARGETS = "final of the smoother with all sensors 0.05 m, 0.5 degrees, p95 0.10 m or less; `switching` 3 times as far off or more"
+TARGETS = "at most 0.05 m, 0.5 degrees and p95 0.10 m for the smoother with all sensors, and 3 times its error for `switching`"
 
 
 def section(options: Options) -> Report:
@@ -51,9 +51,11 @@ def section(options: Options) -> Report:
     points = [count for _, count in outcomes.values()]
     if points:
         report.say(
-            f"{len(found)} rendered offices with {TAGS} tags, {duration:.0f} s each, {RATE:.0f} images/s. The map of each has "
-            f"{min(points)} to {max(points)} points. It is learnt from another drive of {MAP_DURATION:.0f} s with {MAP_RATE:.0f} "
-            f"images/s, whose poses are off by 0.02 m and 0.01 rad. Targets: {TARGETS}."
+            f"The {len(found)} rendered offices have {TAGS} tags. Drives have {duration:.0f} s with {RATE:.0f} "
+            "images/s. The maps have "
+            f"{min(points)} to {max(points)} points. They are learnt from another drive of {MAP_DURATION:.0f} s with "
+            f"{MAP_RATE:.0f} "
+            f"images/s, whose poses have errors of 0.02 m and 0.01 rad. Targets for final errors: {TARGETS}."
         )
     accuracy(report, found)
     comparisons(report, found)
@@ -72,7 +74,7 @@ def accuracy(report: Report, found: Attempts) -> None:
 
 def comparisons(report: Report, found: Attempts) -> None:
     report.say(
-        "Final position RMSE, divided by that of the smoother with all sensors. In brackets: 95 % interval over offices. "
+        "*Ratio*: final position RMSE, divided by that of the smoother with all sensors. In brackets: 95 % interval over offices. "
         "*Largest*: ratio of one office."
     )
     rows = []

@@ -72,11 +72,12 @@ def section(options: Options) -> Report:
             errors = errors_of(made, [frames[i] for i in numbers], cameras[numbers])
             located_rows.append((feature, query, *errors.cells()))
     report.say(
-        f"{COUNT} features an image. Medians and 90th percentiles. *Located*: within {NEAR} m and {TURNED:.0f} degrees."
+        f"Each image has {COUNT} features. Errors are medians and 90th percentiles (p90). *Located*: errors within {NEAR} m and "
+        f"{TURNED:.0f} degrees."
     )
     heads = ("located", "position [m]", "angle [rad]", "p90 [m]", "p90 [rad]")
     report.table(("feature", "images", *heads), located_rows)
-    report.say("The maps of images 0, 2, ... 198.")
+    report.say("The next table describes the maps, made of images 0, 2, ... 198.")
     heads = ("points", "observations", "residual RMS [px]", "median [px]", "parallax [rad]", "sigma [m]")
     report.table(("feature", *heads), map_rows)
     return report

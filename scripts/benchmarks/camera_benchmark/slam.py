@@ -39,8 +39,9 @@ def configs(seen: str) -> dict[str, RunConfig]:
 def section(options: Options) -> Report:
     report = Report("slam", options)
     report.say(
-        "The start is known to 0.1 m and 0.05 rad. Only tags reduce its error later. *Aligned*: the final trajectory is aligned "
-        f"with the reference, which removes the error of the start. Target: {TARGET} m."
+        "The start pose is known to 0.1 m and 0.05 rad. Only tags reduce its error later. *Aligned*: the final "
+        "trajectory is aligned "
+        f"with the reference, which removes the error of the start pose. Target: {TARGET} m."
     )
     for name, runs, usual, first, folder in (
         ("identified", RUNS, DURATION, FIRST, None),
@@ -58,7 +59,9 @@ def section(options: Options) -> Report:
             if folder is None
             else "The images are rendered."
         )
-        report.say(f"Drives of {duration:.0f} s in {len(found)} offices, with {RATE:.0f} images per second. {what}")
+        report.say(
+            f"The next table is for drives of {duration:.0f} s in {len(found)} offices, with {RATE:.0f} images per second. {what}"
+        )
         report.say(sentence(list(known.values())))
         table(report, found)
     return report

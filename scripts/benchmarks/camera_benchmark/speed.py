@@ -88,14 +88,15 @@ def chain(report: Report, options: Options) -> None:
     """Report the times of all steps from images to poses, and the speed of the renderer."""
     for links in report.collect(chained, {"chain": (options.drives,)}, workers=1).values():
         report.say(
-            f"{links.images} files of 640 x 480 px, at most {COUNT} features (`{links.feature}`) in each, in a map of "
-            f"{links.points} points. {os.cpu_count()} threads find features, the rest has one. *Smooth*: the smoother "
-            "without the association of features with points of the map. Targets: 15 images/s, 10 % of the time to smooth."
+            f"The log has {links.images} images of 640 x 480 px with at most {COUNT} features (`{links.feature}`) each, "
+            "and a map of "
+            f"{links.points} points. {os.cpu_count()} threads detect features, the other steps use one thread. *Smooth*: the "
+            "smoother without *associate*. Targets: 15 images/s, 10 % of the time for *smooth*."
         )
         whole = links.find + links.follow + links.associate + links.smooth
         parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}
         cells = (f"{1e3 * s / links.images:.1f} ({100 * s / whole:.0f} %)" for s in parts.values())
-        heads = (*(f"{name} [ms]" for name in parts), "images/s")
+        heads = (*(f"{name} [ms]" for name in ("detect", "track", "associate", "smooth")), "images/s")
         report.table(heads, [(*cells, f"{links.images / whole:.1f}")])
     for rate in report.collect(rendered, {"renderer": ()}, workers=1).values():
         report.say(f"The renderer makes {rate:.1f} images/s on one core; target: 20.")
@@ -104,8 +105,10 @@ def chain(report: Report, options: Options) -> None:
 def estimators(report: Report, duration: float) -> None:
     jobs = {(i, steps.what): (steps, duration) for i, steps in enumerate(STEPS)}
     report.say(
-        f"Steps of {duration:.0f} s in `office` with identified points. A step is an image with about 20 points, or also a round "
-        "of all eight antennas, and the estimate after it. *Second half*: of the run."
+        f"The next table has times of steps in {duration:.0f} s of `office` with identified points. A step processes an image with "
+        "about 20 points (and a round of all eight antennas), and computes the estimate. *Second half*: steps in the "
+        "second half of "
+        "the run. *Learnt*: estimated points."
     )
     rows = []
     for (i, _), (ms, points, learnt) in report.collect(timed, jobs, workers=1).items():

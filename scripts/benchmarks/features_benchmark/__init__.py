@@ -41,7 +41,7 @@ def sequences_section(options: Options) -> Report:
     features = [*(Feature(name, extractor(name, COUNT).detectAndCompute) for name in EXTRACTORS), *others]
     scores = evaluate_all(sequences, features, report.tell)
     write_scores(scores, options.out / "sequences")
-    report.say(f"Means over {sum(len(sequence.others) for sequence in sequences)} pairs of images.")
+    report.say(f"The scores are means over {sum(len(sequence.others) for sequence in sequences)} pairs of images.")
     report.table(*summary(scores))
     return report
 
@@ -102,7 +102,7 @@ def speed_section(options: Options) -> Report:
         cells = (f"{np.median(taken):.1f}", f"{taken.min():.1f}", f"{np.median(ratio):.2f}")
         rows.append([name, str(found[name]), *cells])
     head = ("feature", "points", "median [ms]", "least [ms]", f"median ratio to {STANDARD}")
-    report.say(f"{width} x {height} px in colour, {SPEED_COUNT} points, one thread, {ROUNDS} rounds.")
+    report.say(f"Colour images of {width} x {height} px, {SPEED_COUNT} points, one thread, {ROUNDS} repetitions.")
     report.table(head, rows)
     return report
 

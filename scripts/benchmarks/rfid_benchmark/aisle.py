@@ -61,7 +61,7 @@ def section(options: Options) -> Report:
 
 def accuracy(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
     report.say(
-        f"Both runs, each with the rig learnt on the other one, {len(outcomes) // len(RUNS)} odometry seeds each. *Shipped rig*: "
+        f"The cells combine both recordings, with {len(outcomes) // len(RUNS)} odometry seeds each. *Shipped rig*: "
         "`datasets/rfid-aisle.rig.toml`, learnt on both. The cells are RMSE / median / p95 [m] / heading RMSE [rad] / ANEES."
     )
     rows = []
@@ -73,8 +73,8 @@ def accuracy(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
 
 def unknown_starts(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
     report.say(
-        "With an unknown start and detections, the error is below "
-        f"{POSITION} m for {HOLD:.0f} s after this time from the first scan, for each odometry seed."
+        "The next table is for an unknown start and detections. It has the time from the first scan until the error is below "
+        f"{POSITION} m for {HOLD:.0f} s, for each odometry seed."
     )
     rows = []
     for estimator in ESTIMATORS:

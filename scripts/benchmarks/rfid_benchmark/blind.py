@@ -68,14 +68,15 @@ def section(options: Options) -> Report:
         values = (f"`{case.key}` {case.given:g}", f"{case.true:g}", f"{one.value:.3f} ± {one.error:.3f}")
         rows.append((case.what, *values, *ratio_cells(mine, theirs), *anees))
     report.say(
-        f"`office`, {DURATION:.0f} s, learnt on seeds {LEARNT_ON[0]} to {LEARNT_ON[-1]}, tried on {seeds[0]} to {seeds[-1]}. "
+        f"Logs of `office` have {DURATION:.0f} s. The rig is learnt on seeds {LEARNT_ON[0]} to {LEARNT_ON[-1]} and "
+        f"tested on {seeds[0]} to {seeds[-1]}. "
         "*Ratio*: causal error of the smoother with the learnt rig, divided by its error with the rig of the simulation. In "
         "brackets: 95 % interval over worlds. *Worst*: the largest ratio of a single world."
     )
     heads = (
-        "rig at hand",
-        "given",
-        "in the simulation",
+        "error of the input rig",
+        "input rig",
+        "simulation",
         "learnt",
         "ratio",
         "worst",

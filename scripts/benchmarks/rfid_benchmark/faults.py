@@ -58,9 +58,9 @@ def section(options: Options) -> Report:
             jobs[fault, seed] = (settings, seed, CONFIGS, *([start_elsewhere] if fault == START else []))
     outcomes = report.collect(run_ensemble, jobs)
     report.say(
-        f"`office`, {count} worlds of {DURATION:.0f} s, pooled. "
-        "*Status*: share of the time at which it is localized / ambiguous / unlocalized. "
-        "Causal errors count from the first `localized`."
+        f"The table combines {count} worlds of `office`, {DURATION:.0f} s each. "
+        "*Status*: share of the time at which the status is localized / ambiguous / unlocalized. "
+        "Causal estimates are scored from the first `localized` on."
     )
     rows = []
     for estimator in CONFIGS:

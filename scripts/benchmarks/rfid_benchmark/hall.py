@@ -66,9 +66,10 @@ def section(options: Options) -> Report:
     jobs += [Job("scan", tags, FIRST) for tags in SIZES]
     outcomes = report.collect(measured, {(job.what, job.tags, job.seed): (job,) for job in jobs})
     report.say(
-        f"{len(seeds)} runs of each kind in a hall of 100 x 60 m, each in a new world. *Right in time*: within {START:.0f} s of an "
-        f"unknown start, or within {RETURN:.0f} s of a kidnapping, and for 10 s from then on. *Busy*: processor time of a "
-        "tenth of a second of the log with at most one scan, 99.9th percentile and largest."
+        f"Each row has {len(seeds)} runs in a hall of 100 x 60 m, each in a new world. *Right in time*: the pose is "
+        "right for 10 s, "
+        f"beginning within {START:.0f} s of an unknown start (*start*), or within {RETURN:.0f} s after the robot is carried away "
+        "(*return*). *Busy*: processor time for a tenth of a second of the log, with at most one scan, 99.9th percentile / largest."
     )
     rows: list[tuple[str, ...]] = []
     groups: dict[tuple[str, int, str], list[Any]] = {}
@@ -81,7 +82,9 @@ def section(options: Options) -> Report:
     heads = ("", "tags", "estimator", "right in time", "median [s]", "false claims")
     report.table((*heads, "busy [ms]", "largest final error [m]"), rows)
     times = {(name, tags): found[0] for (what, tags, name), found in groups.items() if what == "scan"}
-    report.say(f"Processor time of a scan with its estimate, median [ms], at {DENSITY:.3f} tags per m^2.")
+    report.say(
+        f"The next table has the median processor time [ms] of a scan and its estimate, at {DENSITY:.3f} tags per m^2."
+    )
     cells = [
         (name, *(f"{times[name, tags]:.2f}" if (name, tags) in times else "–" for tags in SIZES)) for name in ESTIMATORS
     ]

@@ -23,7 +23,7 @@ def section(options: Options) -> Report:
         for run in RUNS
         for phases in (True, False)
     }
-    report.say("Distances [m] of the tags mapped along the reference from their survey.")
+    report.say("The table has distances [m] between mapped and surveyed positions of the tags.")
     rows = []
     for key, (distances, count) in report.collect(made, jobs).items():
         near = f"{np.mean(distances <= NEAR):.0%}"

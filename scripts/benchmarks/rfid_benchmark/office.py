@@ -27,12 +27,13 @@ def section(options: Options) -> Report:
             found[name] = {label: [outcome[label] for outcome in outcomes] for label in configs}
     worlds = ", ".join(f"{len(runs['smoother'])} worlds of {name}" for name, runs in found.items())
     report.say(
-        f"{worlds}, 10 min each, pooled. *Inside*: share of times at which ANEES over worlds is in its 95 % band."
+        f"The table combines {worlds}, 10 min each. *Inside*: share of times at which the ANEES over worlds is in its 95 % band."
     )
     cells = [(name, label, *accuracy_cells(one)) for name, runs in found.items() for label, one in runs.items()]
     report.table(("preset", "estimator", *ACCURACY), cells)
     report.say(
-        "Ratios of pooled position RMSE, with constants as states, a 95 % interval over worlds, and the largest of a single world."
+        "The next table has ratios of position RMSE, with constants as states. *Pooled*: over all worlds, with a 95 % interval. "
+        "*Largest*: the largest ratio of a single world."
     )
     rows = []
     for name, runs in found.items():

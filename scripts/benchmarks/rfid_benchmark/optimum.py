@@ -29,15 +29,15 @@ def section(options: Options) -> Report:
     rooms, offices = options.count(ROOMS), options.count(OFFICES)
     outcomes = report.collect(in_room, {("room", seed): (seed,) for seed in range(rooms)}).values()
     report.say(
-        f"A room of 6 x 4 m with 8 tags, 60 s, odometry without constant errors, {len(outcomes)} worlds. "
-        "Causal estimates at the scans, against the grid filter (5 cm, 3 degrees), which is optimal."
+        f"Each of {len(outcomes)} worlds is a room of 6 x 4 m with 8 tags, and a drive of 60 s. Causal estimates are scored at the "
+        "scans. *Ratio*: error divided by the error of the grid filter (cells of 5 cm and 3 degrees), which is optimal."
     )
     table(report, {label: [outcome[label] for outcome in outcomes] for label in FILTERS}, "grid filter")
     jobs = {("office", seed): (preset("office"), seed, SMOOTHERS) for seed in range(offices)}
     outcomes = report.collect(run_ensemble, jobs).values()
     report.say(
-        f"`office`, {len(outcomes)} worlds, final estimates, against a particle smoother of 5,000 particles "
-        "and 200 trajectories drawn backwards, with the same states."
+        f"The next table is for final estimates in {len(outcomes)} worlds of `office`. *Ratio*: error divided by the error of a "
+        "particle smoother with the same states, 5,000 particles and 200 trajectories that are drawn backwards."
     )
     finals = {label: [outcome[label].final for outcome in outcomes] for label in SMOOTHERS}
     table(report, finals, "particle smoother")

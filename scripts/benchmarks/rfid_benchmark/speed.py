@@ -30,14 +30,16 @@ RUNS = {
 def section(options: Options) -> Report:
     report = Report("speed", options)
     report.say(
-        f"{SCANS} scans at {RATE:.0f} Hz, each of 8 antennas that listen for 20 tags. "
-        "An update is a scan with the estimate after it."
+        f"The log has {SCANS} scans at {RATE:.0f} Hz, of 8 antennas with 20 tags in range. "
+        "An update processes a scan and computes the estimate after it."
     )
     times_table(report, partial(simulate, preset("office", WORLD), 0), RUNS)
     folder = options.out / "speed"
     folder.mkdir(parents=True, exist_ok=True)
     for seconds in report.collect(calibration_seconds, {"calibration": (folder / "learnt",)}, workers=1).values():
-        report.say(f"Calibration of one simulated log of {CALIBRATED:.0f} s (2 scans/s, 40 tags): {seconds:.0f} s.")
+        report.say(
+            f"Calibration from one simulated log of {CALIBRATED:.0f} s (2 scans/s, 40 tags) takes {seconds:.0f} s."
+        )
     return report
 
 

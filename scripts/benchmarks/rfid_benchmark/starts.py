@@ -34,13 +34,14 @@ def section(options: Options) -> Report:
     for (*key, _), trials in report.collect(run_simulated_trials, jobs).items():
         found.setdefault(tuple(key), []).extend(trials)
     report.say(
-        f"{len(seeds)} trials of each kind, with 95 % intervals. *Right in time*: from then on below 0.5 m and 15 degrees "
-        "for 10 s. *Called so in time*: the status is rightly `localized` by then (in brackets: the median time). "
-        "*False claims*: the first `localized` is wrong (in brackets: the share of errors above 0.5 m that the covariances state). "
-        "After a kidnapping: it is `localized` at the deadline, but wrong."
+        f"Each row has {len(seeds)} trials, with 95 % intervals of shares. *Right in time*: after at most the time "
+        "*within*, the error "
+        "stays below 0.5 m and 15 degrees for 10 s. *Localized in time*: by then the status is `localized` and right (in brackets: "
+        "the median time). *False claims*: the first pose with status `localized` is wrong (in brackets: the share of errors above "
+        "0.5 m that the covariances predict). After a kidnapping: the status is `localized` at the deadline, but the pose is wrong."
     )
     report.table(
-        ("", "preset", "estimator", "within", "right in time", "median [s]", "called so in time", "false claims"),
+        ("", "preset", "estimator", "within", "right in time", "median [s]", "localized in time", "false claims"),
         [row(key, trials) for key, trials in found.items()],
     )
     late = [
@@ -48,7 +49,7 @@ def section(options: Options) -> Report:
         for (kind, name, estimator, deadline), trials in found.items()
         if any(not t.seconds <= deadline for t in trials)
     ]
-    report.say("Seeds of late runs: " + ("; ".join(late) or "none") + ".")
+    report.say("These seeds were not right in time: " + ("; ".join(late) or "none") + ".")
     return report
 
 

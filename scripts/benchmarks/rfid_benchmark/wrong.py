@@ -71,11 +71,12 @@ def section(options: Options) -> Report:
                 unsure = np.mean([1.0 - run.share("localized") for run in mine])
                 rows.append((case.what, name, *causal, *anees, f"{100 * unsure:.0f} %"))
     report.say(
-        f"`office`, {len(seeds)} worlds of {DURATION:.0f} s. *Ratio*: causal error, divided by that of a knowing estimator. It "
-        "has the right range, read probability and tags, and a tempering for bursts. In brackets: 95 % interval over worlds. "
-        "*Worst*: the largest ratio of a single world. *ANEES, knowing*: of the knowing estimator."
+        f"The table combines {len(seeds)} worlds of `office`, {DURATION:.0f} s each. *Ratio*: causal error, divided by "
+        "the error with "
+        "the right range, read probability and tags, and with a tempering for bursts. In brackets: 95 % interval over worlds. "
+        "*Worst*: the largest ratio of a single world. *ANEES, right*: with these right values."
     )
-    heads = ("wrong", "estimator", "ratio", "worst", "ANEES", "ANEES, knowing", "not localized")
+    heads = ("wrong", "estimator", "ratio", "worst", "ANEES", "ANEES, right", "not localized")
     report.table(heads, rows)
     return report
 
