@@ -128,17 +128,17 @@ def new_rig(
     imu: bool = False,
     landmarks: float | Mapping[str, float] | None = None,
     antennas: int | Sequence[str] = 0,
-    camera: tuple[int, int] | None = None,
+    camera: tuple[int, int] | str | None = None,
     position: float | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Rig:
     """Return a first rig of a robot with some sensors. If ``out`` is given, the rig is also written to this file, with comments.
 
-    ``odometry``: the drive. ``imu``: True if the robot has a gyro. ``landmarks``: standard deviation of ranges to landmarks [m], or
-    that of each of several sensors by name. ``antennas``: number or names of RFID antennas. ``camera``: width and height of its
-    images [px]. ``position``: standard deviation of measured positions [m]. Raises InputError if a value is out of bounds, or if
-    the file exists and ``overwrite`` is false.
+    ``odometry``: the drive. ``imu``: True if the robot has a gyro. ``landmarks``: standard deviation of ranges to landmarks
+    [m], or that of each of several sensors by name. ``antennas``: number or names of RFID antennas. ``camera``: width and
+    height of its images [px], or the file of a camera chain of Kalibr. ``position``: standard deviation of measured positions
+    [m]. Raises InputError if a value is out of bounds, or if the file exists and ``overwrite`` is false.
     """
     names = tuple(map(str, range(1, antennas + 1))) if isinstance(antennas, int) else tuple(antennas)
     rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, names, camera, position))

@@ -78,7 +78,12 @@ def new(
     antennas: Annotated[
         str | None, typer.Option(metavar="NUMBER|A,B", help="RFID antennas around the body: how many, or their names.")
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="WxH", help="Image size, 640x480, or none.")] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH|FILE", help="Image size, 640x480; or a camera chain of Kalibr, FILE.yaml[:CAMERA]; or none."
+        ),
+    ] = None,
     position: Annotated[
         str | None, typer.Option(metavar="METRES", help="Standard deviation of measured positions, or none.")
     ] = None,
@@ -99,7 +104,7 @@ def new(
         _value("--imu", None if imu is None else "yes" if imu else "no", "no", "yes or no", YES.__getitem__, asks),
         _value("--landmarks", landmarks, "none", "the noise of a range in m, A=M,B=M, or none", _ranges, asks),
         _value("--antennas", antennas, "0", f"a number from 0 to {MOST_ANTENNAS}, or names", _antennas, asks),
-        _value("--camera", camera, "none", "a size such as 640x480, or none", _size, asks),
+        _value("--camera", camera, "none", "a size such as 640x480, a file of Kalibr, or none", _size, asks),
         _value("--position", position, "none", "the noise of a position in m, or none", _metres, asks),
     )
     given, name = None if out is None else str(out), "robot.rig.toml" if asks else ""
@@ -156,9 +161,13 @@ def _ranges(text: str) -> float | dict[str, float] | None:
     return sigmas
 
 
-def _size(text: str) -> tuple[int, int] | None:
+def _size(text: str) -> tuple[int, int] | str | None:
+    from factorgraph_loc.io.native.kalibr import is_chain
+
     if text == "none":
         return None
+    if is_chain(text):
+        return text
     if not (size := re.fullmatch("([0-9]{1,6})x([0-9]{1,6})", text)):
         raise ValueError
     return int(size[1]), int(size[2])

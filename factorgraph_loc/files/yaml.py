@@ -29,7 +29,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
     what = "is not YAML that can be read"
     with foreign(path, what):
         try:
-            content = yaml.load(read_text(path, YAML), _Loader) or {}
+            text = read_text(path, YAML)
+            if text.startswith("%YAML:"):  # OpenCV writes the directive so
+                text = f"#{text}"
+            content = yaml.load(text, _Loader) or {}
         except yaml.MarkedYAMLError as error:
             mark = error.context_mark or error.problem_mark
             problem = ", ".join(part for part in (error.context, error.problem) if part)

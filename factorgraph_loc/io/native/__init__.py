@@ -1,3 +1,3 @@
 """The native format: run folders, rigs and worlds."""
 
-__all__ = ["native", "rig_file", "world_file"]
+__all__ = ["kalibr", "native", "rig_file", "world_file"]

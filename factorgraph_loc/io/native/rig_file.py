@@ -14,6 +14,7 @@ from typing import Any, Literal
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.models import parse_model, read_toml, write_toml
 from factorgraph_loc.files.settings import Setting, settings_in
+from factorgraph_loc.io.native.kalibr import read_camera
 from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.sections import kind_of, several
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeSettings
@@ -117,14 +118,14 @@ class RobotOptions:
     ``landmarks``: standard deviation of a measured range [m]; for several sensors of landmarks, that of each by name.
     ``position``: standard deviation of a measured x or y [m].
     ``antennas``: names of RFID antennas.
-    ``camera``: width and height of the images [px].
+    ``camera``: width and height of the images [px], or a camera chain of Kalibr, as ``FILE`` or ``FILE:NAME``.
     """
 
     odometry: Drive = "differential"
     imu: bool = False
     landmarks: float | Mapping[str, float] | None = None
     antennas: tuple[str, ...] = ()
-    camera: tuple[int, int] | None = None
+    camera: tuple[int, int] | str | None = None
     position: float | None = None
 
 
@@ -161,7 +162,10 @@ def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
             "rfid: the positions and directions of the antennas are guesses: measure them; `fgloc calibrate` estimates the "
             "detection model"
         )
-    if robot.camera is not None:
+    if isinstance(robot.camera, str):
+        sections["camera"], notes = read_camera(robot.camera)
+        remarks += notes
+    elif robot.camera is not None:
         sections["camera"] = _camera(*robot.camera)
         remarks.append(
             "camera: the lens (60 degrees wide) and the mounting (facing forward) are guesses; calibrate the lens with OpenCV"

@@ -9,6 +9,7 @@ from factorgraph_loc.files.models import FileModel, inside, parse_model, read_to
 from factorgraph_loc.maps.markers import Marker, corner_points
 from factorgraph_loc.maps.occupancy import read_walls
 from factorgraph_loc.maps.points import POINTS_SUFFIX, read_points, write_points
+from factorgraph_loc.maps.tag_file import read_tag_file
 from factorgraph_loc.model.sections import layers
 from factorgraph_loc.model.world import World
 from factorgraph_loc.plugins import load
@@ -28,8 +29,9 @@ def read_world(path: str | Path) -> World:
 def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> World:
     """Return a map from the ``content`` of a world file.
 
-    ``source``: the file to name in errors. ``folder``: the folder of the tables. ``walls`` may name an occupancy map, and a layer
-    such as ``tags`` may name a table. The corners of ``markers`` become points. Raises InputError as :func:`read_world`.
+    ``source``: the file to name in errors. ``folder``: the folder of the tables. ``walls`` may name an occupancy map,
+    ``markers`` a file of apriltag_ros, and a layer such as ``tags`` a table. The corners of ``markers`` become points. Raises
+    InputError as :func:`read_world`.
     """
     for name, layer in layers().items():
         if layer.read and name in content:
@@ -45,6 +47,8 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
             raise InputError(f"{source}: points names {quoted(points)}, which is missing")
         content = {**content, "points": read_points(path)}
     if "markers" in content:
+        if isinstance(named := content["markers"], dict) and isinstance(named.get("file"), str):
+            content = {**content, "markers": read_tag_file(named, source, folder)}
         markers = parse_model(_Markers, {"markers": content["markers"]}, source).markers
         known = content.get("points")
         points = corner_points(markers) if known is None else known.with_points(corner_points(markers), source)

@@ -1,0 +1,136 @@
+"""The lens and the mounting of a camera from a camera chain of Kalibr (``camchain.yaml`` or ``camchain-imucam.yaml``)."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from factorgraph_loc.errors import InputError, bad_field
+from factorgraph_loc.files.models import FileModel, nearest, parse_model
+from factorgraph_loc.files.yaml import read_yaml
+from factorgraph_loc.text import listed, quoted
+from factors.camera.model import angles_of_camera
+from factors.se2 import Array
+
+SUFFIXES = (".yaml", ".yml")
+MODEL = "pinhole"
+LENSES = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
+ORTHONORMAL = 1e-3  # tolerance of rotations
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+Row = tuple[Number, Number, Number, Number]
+Matrix = tuple[Row, Row, Row, Row]
+WITHOUT = "camera: {name} of {file} has no mounting on the robot: set x, y, z, roll, pitch and yaw in [camera]"
+ON_IMU = (
+    "camera: the mounting is that on the IMU of {file}: it holds if the IMU is at the robot's centre and its axes point forward, "
+    "left and up; otherwise set x, y, z, roll, pitch and yaw"
+)
+
+
+class ChainCamera(FileModel):
+    """A camera of the chain. ``T_cam_imu``, ``T_imu_cam``, ``T_cn_cnm1``: transforms from the IMU to the camera, back, and from the
+    camera before in the chain."""
+
+    camera_model: str
+    distortion_model: str = "none"
+    intrinsics: tuple[Number, ...]
+    distortion_coeffs: tuple[Number, ...] = ()
+    resolution: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+    T_cam_imu: Matrix | None = None
+    T_imu_cam: Matrix | None = None
+    T_cn_cnm1: Matrix | None = None
+    timeshift_cam_imu: Number | None = None
+    rostopic: str = ""
+
+
+def is_chain(text: str) -> bool:
+    """True if a text names a YAML file, perhaps with the name of a camera behind a colon."""
+    return text.endswith(SUFFIXES) or text.rpartition(":")[0].endswith(SUFFIXES)
+
+
+def read_camera(text: str) -> tuple[dict[str, Any], list[str]]:
+    """Return the section ``[camera]`` of a rig, and remarks on what the user has to check.
+
+    ``text``: the file of the chain, as ``FILE:cam1`` with the name of one of several cameras. Raises InputError with file and key
+    if the file is invalid, or if the rig has no such lens.
+    """
+    file, _, name = (text, "", "") if text.endswith(SUFFIXES) else text.rpartition(":")
+    path = Path(file)
+    stated = {
+        key: value for key, value in read_yaml(path).items() if isinstance(value, Mapping) and "intrinsics" in value
+    }
+    if not stated:
+        raise InputError(f"{path}: has no camera with intrinsics, expected a camera chain of Kalibr")
+    if not name and len(stated) > 1:
+        raise InputError(
+            f"{path}: has the cameras {listed(stated)}: name one of them, such as {path}:{next(iter(stated))}"
+        )
+    name = name or next(iter(stated))
+    if name not in stated:
+        raise InputError(f"{path}: has no camera {quoted(name)}{nearest(name, list(stated))}")
+    chain = {key: _camera(path, key, value) for key, value in stated.items()}
+    camera = chain[name]
+    section = _lens(path, name, camera)
+    mounting = _on_imu(path, chain, name)
+    remarks = [(WITHOUT if mounting is None else ON_IMU).format(name=name, file=path.name)]
+    if mounting is not None:
+        roll, pitch, yaw = angles_of_camera(mounting[:3, :3])
+        x, y, z = mounting[:3, 3].tolist()
+        section |= {"x": x, "y": y, "z": z, "roll": roll, "pitch": pitch, "yaw": yaw}
+    if shift := camera.timeshift_cam_imu:
+        remarks.append(f"camera: set time_offset = {shift:g} if the odometry has the clock of Kalibr's IMU")
+    if camera.rostopic:
+        remarks.append(f"camera: the calibrated images were on the topic {camera.rostopic}")
+    return section, remarks
+
+
+def _camera(path: Path, name: str, content: Mapping[str, Any]) -> ChainCamera:
+    """Return the camera with a ``name`` and the ``content`` of a chain; keys that are not needed are ignored."""
+    known = {key: value for key, value in content.items() if key in ChainCamera.model_fields and value is not None}
+    return parse_model(ChainCamera, known, f"{path}: {name}")
+
+
+def _lens(path: Path, name: str, camera: ChainCamera) -> dict[str, Any]:
+    """Return the keys of the lens. Raises InputError if the rig has no lens of its model."""
+    if camera.camera_model != MODEL:
+        raise bad_field(path, f"{name}.camera_model", camera.camera_model, MODEL)
+    if camera.distortion_model not in LENSES:
+        raise bad_field(path, f"{name}.distortion_model", camera.distortion_model, f"one of {', '.join(LENSES)}")
+    count = 0 if camera.distortion_model == "none" else 4
+    for key, values, expected in (
+        ("intrinsics", camera.intrinsics, 4),
+        ("distortion_coeffs", camera.distortion_coeffs[: None if count else 0], count),
+    ):
+        if len(values) != expected:
+            raise bad_field(path, f"{name}.{key}", list(values), f"{expected} numbers")
+    width, height = camera.resolution
+    lens = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True))
+    distortion = camera.distortion_coeffs if count else (0.0, 0.0, 0.0, 0.0)
+    model = LENSES[camera.distortion_model]
+    return {"width": width, "height": height, **lens, "distortion_model": model, "distortion": distortion}
+
+
+def _on_imu(path: Path, chain: Mapping[str, ChainCamera], name: str) -> Array | None:
+    """Return the pose (4, 4) of a camera on the IMU, directly or by the cameras before it in the chain; None if it is unknown."""
+    names = list(chain)
+    from_later = np.eye(4)
+    for known in reversed(names[: names.index(name) + 1]):
+        camera = chain[known]
+        if camera.T_imu_cam is not None:
+            return _transform(path, f"{known}.T_imu_cam", camera.T_imu_cam) @ from_later
+        if camera.T_cam_imu is not None:
+            return np.asarray(np.linalg.inv(_transform(path, f"{known}.T_cam_imu", camera.T_cam_imu)) @ from_later)
+        if camera.T_cn_cnm1 is None:
+            return None
+        from_later = np.linalg.inv(_transform(path, f"{known}.T_cn_cnm1", camera.T_cn_cnm1)) @ from_later
+    return None
+
+
+def _transform(path: Path, key: str, rows: Matrix) -> Array:
+    """Return a transform (4, 4). Raises InputError if it is not rigid."""
+    matrix = np.array(rows)
+    off = np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max()
+    if off > ORTHONORMAL or np.linalg.det(matrix[:3, :3]) < 0.0 or np.any(matrix[3] != (0.0, 0.0, 0.0, 1.0)):
+        raise bad_field(path, key, matrix.tolist(), "a rotation and a translation")
+    return matrix
