@@ -33,7 +33,7 @@ from factors.camera import model as reprojection
 from factors.se2 import Array
 
 TIMELINE = "log_time"
-WORLD, CAMERA = "/world", "/camera"  # CAMERA is used if there is no pose of the robot
+WORLD, CAMERA = "/world", "/camera"  # entity paths in Rerun: the scene, and the camera of a robot without poses
 FRUSTUM = 0.4  # m from the drawn camera to its image
 BATCH = 16  # images per message
 NEAREST = 300  # maximum number of map points that are drawn into an image
@@ -227,7 +227,7 @@ def _pixels_over_time(
 
 
 def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
-    """Return the pixels (K, 2) of the nearest ``points`` (P, 3) in the image from ``pose`` (3,). None are visible if it is NaN."""
+    """Return the pixels (K, 2) of the nearest ``points`` (P, 3) in the image from ``pose`` (3,). K is 0 if the pose is NaN."""
     if not np.isfinite(pose).all():
         return np.empty((0, 2))
     pixels, depths = reprojection.predict(model, pose, points)

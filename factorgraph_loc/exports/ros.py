@@ -204,7 +204,7 @@ class _Maker:
         text: str = "",
         at: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> dict[str, Any]:
-        """Return the fields of a marker in which markers differ.
+        """Return the fields of a ``visualization_msgs/Marker`` that describe its shape, for :meth:`markers`.
 
         ``name``: namespace. ``kind``: type of the marker. ``size``: diameter, width or height [m]. ``points``: its points [m].
         ``text``: its text, at the position ``at`` [m].

@@ -68,7 +68,7 @@ def require_one_span(log: Log) -> None:
     if outlier := farthest(list(filled.values()), MAX_SPAN):
         table, i, middle = outlier
         name, t = list(filled.items())[table]
-        where = f"{log.name}: {name} has a timestamp {t[i] - middle:+.0f} s from most others in row {i + 1}"
+        where = f"{log.name}: row {i + 1} of {name} has a timestamp {t[i] - middle:+.0f} s from most others"
         raise InputError(f"{where}, expected {expected}: do their clocks agree?")
     if log.start is not None and not last - MAX_SPAN <= log.start.t <= first + MAX_SPAN:
         raise InputError(
@@ -117,7 +117,10 @@ def without_false_headings(log: Log) -> Log:
 
 
 def look_over(log: Log) -> list[Notice]:
-    """Return warnings about a whole log. Raises InputError if the log has measurements but no odometry."""
+    """Return warnings about gaps in the odometry, rows before the odometry, and landmarks that the map lacks.
+
+    Raises InputError if the log has measurements but no odometry.
+    """
     odometry = log.streams.get("odometry")
     if odometry is None and log.reference is not None and not log.streams:
         return []

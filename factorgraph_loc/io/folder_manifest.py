@@ -46,7 +46,7 @@ MAPS = ("tags", "landmarks")
 WINDOW = 1.0  # s: the resolution in time at which distances are summed
 TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m per encoder count, m, m: examples of sizes that no file states
 SIGMA = 0.1  # m: an example of the noise of a range or a position
-APART = 5.0  # s: a clock offset is proposed for a table that begins later after the end of the others, or ends earlier before them
+APART = 5.0  # s: maximum gap between the time spans of two tables; at a larger gap, a clock offset is proposed
 
 
 @dataclass
@@ -245,7 +245,7 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
         if sides[0] in ("left_angle", "left_rate"):
             settings["radius"] = RADIUS
         roles.remarks.append(
-            f"{table.name}: measure the distance between the wheels, and their radius: track, radius [m]"
+            f"{table.name}: measure the distance between the wheels and the radius of a wheel, and set track and radius [m]"
         )
         return
     left, right = _counted(table, sides)
@@ -259,17 +259,18 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
         length, travelled = _lengths(table.times(), left + right, replace(reference, t=reference.t + offset))
         tick = float(f"{2.0 * length / max(travelled, 1e-9):.3g}") if travelled > 0.0 and length > 0.0 else TICK
         roles.remarks.append(
-            f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])}, because the reference travels {length:.1f} m "
-            f"while the wheels count {travelled / 2.0:.0f}; replace it by the size of your wheels"
+            f"{table.name}: units.left = {tick:g} m per count of {quoted(table.fields['left'])}, because the reference travels "
+            f"{length:.1f} m while the wheels count {travelled / 2.0:.0f}; replace it by the distance per count of your wheels"
         )
         if turned is not None and turned.ratio > 0.0:
             track = float(f"{tick * turned.ratio:.3g}")
     else:
         roles.remarks.append(
-            f"{table.name}: {tick:g} m per unit of {quoted(table.fields['left'])} is an example: replace it"
+            f"{table.name}: units.left = {tick:g} m per count of {quoted(table.fields['left'])} is an example: replace it by the"
+            " distance per count of your wheels"
         )
     if track is None:
-        roles.remarks.append(f"{table.name}: measure the distance between the wheels: track [m]")
+        roles.remarks.append(f"{table.name}: measure the distance between the wheels, and set track [m]")
     else:
         settings["track"] = track
         roles.remarks.append(
@@ -307,7 +308,7 @@ def _each_second(t: Array, values: Array) -> Array:
 
 
 def _counted(table: Guess, sides: Sequence[str]) -> tuple[Array, Array]:
-    """Return the counts (N,) of the left wheels and of the right wheels since the first row. Counters that wrap are continued."""
+    """Return the counts (N,) of the left wheels and of the right wheels since the first row. Wrapped counters are unwrapped."""
     steps = {name: wheel_steps(table.values(name), 1.0) for name in sides}
     left, right = (np.mean([steps[name] for name in sides if side in name], axis=0) for side in ("left", "right"))
     return np.append(0.0, np.nancumsum(left)), np.append(0.0, np.nancumsum(right))

@@ -59,7 +59,7 @@ OTHERS = {
     "facing": ("facing", "faces", "direction", "facingdirection"),
 }
 NAMES: dict[str, Sequence[str]] = {**{k: v for k, v in READ.items() if k != "stamp"}, **POSE, **MOTION, **OTHERS}
-# by the end of a column's name: the unit that it means, for each kind of field
+# for each kind of field: endings of column names that state a unit, such as "sec", and the unit that they mean
 SECONDS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "millis": "ms", "micros": "us", "nanos": "ns"}
 LENGTHS = {unit: unit for unit in LENGTH}
 ANGLES = {"deg": "deg", "degrees": "deg", "rad": "rad", "radians": "rad"}
@@ -97,7 +97,7 @@ class Guess:
     ``header``: True if the first row has the names of the columns.
     ``columns``: the texts of each column by its name, or by its number from 1 if the table has no header.
     ``fields``: the guessed column of each field. ``units``: the guessed unit of each field.
-    ``reasons``: the reasons of guesses by values.
+    ``reasons``: sentences for the user that explain each guess that follows from values instead of names.
     """
 
     path: Path
@@ -163,7 +163,7 @@ def plain(name: str) -> str:
 
 
 def rank(name: str, known: Sequence[str]) -> int | None:
-    """Return the index of ``name`` in ``known``, also without a unit at its end. Returns None if the name is unknown.
+    """Return the index of ``name`` in ``known``. A unit at the end of the name is ignored. Returns None if the name is unknown.
 
     ``name`` is in lower case and without separators, see :func:`plain`.
     """

@@ -91,8 +91,9 @@ def between_poses(
 ) -> Array:
     """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
-    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause or after a null
-    pose. At a reset, the previous motion is continued, with a warning. ``lost_ns``: the timestamps of null poses.
+    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause or after null poses.
+    At a reset, the previous motion is continued, with a warning. ``lost_ns``: the timestamps of null poses, which a device reports
+    while it has lost its pose. ``source``: the file to name in the warning.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -108,12 +109,12 @@ def between_poses(
 
 
 def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Integers, Array]:
-    """Return timestamps (M,) and increments (M, 4) of odometry with null poses. The last column is the time [s] in which the motion
-    is unknown.
+    """Return timestamps (M,) [ns] and increments (M, 4) of odometry with null poses, which a device reports while it is lost.
 
-    ``moves`` (N - 1, 3): the motion between poses at N timestamps [ns]. ``lost_ns``: the timestamps of the null poses. The
-    previous motion is continued until the last null pose, and it is unknown until the next pose. Without null poses the
-    increments are (N, 3).
+    An increment is the motion x, y [m], heading [rad], and the part [s] of its duration in which the motion is unknown.
+    ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of null poses. The motion
+    is unknown from a valid pose, over null poses, to the next valid pose. Up to the last null pose the previous motion is
+    continued, for at most :data:`HOLD_TIME`. Without null poses the increments are (N, 3).
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):

@@ -76,7 +76,7 @@ def toml_of(content: Mapping[str, Any], name: str = "") -> str:
 
 
 def _sensors(key: str, value: Any) -> dict[str, Any]:
-    """Return the settings of each sensor, if ``value`` describes several sensors of the kind ``key``, else ``value`` by its key."""
+    """Return ``{key: value}``, or the settings of each sensor by its name if ``value`` has several sensors of the kind ``key``."""
     if key in several() and all(isinstance(settings, dict) for settings in value.values()):
         return by_name(key, value)
     return {key: value}
@@ -85,8 +85,8 @@ def _sensors(key: str, value: Any) -> dict[str, Any]:
 def distinct(names: Sequence[str]) -> list[str]:
     """Return short distinct names of several sensors.
 
-    A short name has those words of a topic or file in ``names`` that are not common to all. If that is ambiguous, sensors are
-    numbered.
+    ``names``: topics or files. A short name has the words that are not common to all: ``/uwb/left``, ``/uwb/right`` give ``left``,
+    ``right``. If a short name is empty or two are equal, all are numbered: ``sensor_1``, ``sensor_2``.
     """
     words = [re.findall(r"[^\W_]+", name) for name in names]
     common = set.intersection(*map(set, words))

@@ -19,9 +19,8 @@ from factors.se2 import Array
 Wall = tuple[float, float, float, float]
 Yaw = Annotated[float, Field(ge=-7.0, le=7.0), InUnit("rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-TOLERANCE = (
-    0.75  # cells: maximum distance of a wall from the centres of its cells, which is half a cell at an oblique line
-)
+# cells: tolerance for simplified outlines; the staircase of cells along an oblique wall deviates by half a cell from a line
+TOLERANCE = 0.75
 STRIP = 256  # rows of the image that are processed together, to limit memory
 MIN_EXTENT = 2.0  # cells: smaller groups of occupied cells are noise of the mapping sensor
 

@@ -70,7 +70,9 @@ def test_frames_are_proposed_where_nothing_else_is_odometry_or_a_reference(tmp_p
     }
     assert found.uses == {"/tf": "odometry, reference", "/tf_static": "sensor mounting"}
     (note,) = found.remarks
-    assert note.startswith("base_footprint in map, of /tf, is used as the reference: remove it if it is an estimate")
+    assert note.startswith(
+        "the pose of base_footprint in map, from /tf, is used as the reference: remove [options.reference]"
+    )
 
 
 def test_what_is_measured_comes_before_frames(maker, read_drive):

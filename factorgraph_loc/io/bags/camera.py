@@ -33,7 +33,7 @@ INFO = "sensor_msgs/msg/CameraInfo"
 MAGIC = {b"\xff\xd8\xff": ".jpg", b"\x89PNG": ".png", b"RIFF": ".webp", b"BM": ".bmp", b"P5": ".pgm", b"P6": ".ppm"}
 LOCK = ".lock"  # file that a process locks while it moves a folder of images into the cache
 Pixels = NDArray[Any]
-# number of a message, timestamp of its header [ns], time of receipt [ns], name of the image file
+# an extracted image: number of its message, timestamp of the header [ns], time of receipt [ns], name of the image file
 _Row = tuple[int, int, int, str]
 
 
@@ -56,7 +56,7 @@ ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
 
 
 class CameraTopic(TopicSettings):
-    """A topic of images."""
+    """The settings of a topic of images."""
 
     info: str | None = None
     """topic of the CameraInfo messages: lens, image size and frame of the camera"""
@@ -104,8 +104,10 @@ class Images:
         self._t_ns.append(t_ns)
 
     def stream(self, reading: Reading) -> ImageStream:
-        """Return the stream of images, with times in seconds after t = 0. Newly extracted images are moved to the cache
-        folder."""
+        """Return the stream of images. Newly extracted images are moved to the cache folder.
+
+        ``reading``: has the absolute time of t = 0, from which the times in the stream count, and a list for warnings.
+        """
         if self._written is not None:
             with writing(self._folder), locked(self._folder.parent / LOCK):
                 # keep a complete folder that another process wrote meanwhile: that process may use its files

@@ -186,7 +186,7 @@ class Bag:
             if connection.msgtype not in self._stores[name].fielddefs:
                 raise InputError(
                     f"{self.path}: topic {name} is of type {connection.msgtype}, which the bag does not define: "
-                    "convert it to mcap with the package of that type installed"
+                    "convert the bag to mcap on a machine that has the package of this type installed"
                 )
         return self._stores[name]
 

@@ -33,7 +33,8 @@ NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORE
 
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
-IF_UNSTATED = {"phase": "rad", "frequency": "Hz", "stamp": "us"}  # units of fields whose names imply none
+# by field of an RFID read: the unit that is assumed if the name of the message field implies none
+IF_UNSTATED = {"phase": "rad", "frequency": "Hz", "stamp": "us"}
 # by field of an RFID read: suffixes of names that imply a unit, of which the longest match is used
 UNITS = {"phase": ANGLES, "frequency": ENDS["frequency"], "stamp": {unit: unit for unit in ("us", "ms", "ns")}}
 
@@ -158,9 +159,8 @@ def propose(bag: Bag) -> Uses:
 
 
 def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Propose the topic of odometry. Odometry messages come first, then transforms of its frame, velocities, and wheel joints.
-
-    Topics of commands, plans and ground truth are excluded.
+    """Propose the topic of odometry. Types of messages in order of preference: Odometry, tf with an odometry frame, Twist,
+    JointState. Topics of commands, plans and ground truth are excluded.
     """
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
@@ -212,16 +212,16 @@ def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
     if len(rear) == len(front) == 2:
         sides |= {"rear_left": next(filter(LEFT.search, rear), ""), "rear_right": next(filter(RIGHT.search, rear), "")}
         remarks.append(
-            "there are four wheels: if they are mecanum wheels, set base [m], the distance between the axles, in wheels"
+            "there are four wheels: if they are mecanum wheels, set wheels.base [m], the distance between the axles"
         )
     values = getattr(first and first.message, "position", ())
     if len(values) and all(float(value).is_integer() for value in values) and any(values):
         remarks.append(
-            "positions of joints are whole numbers: if they are encoder counts, set unit in wheels to the radians per count"
+            "positions of joints are whole numbers: if they are encoder counts, set wheels.unit to the radians per count"
         )
     remarks.append(
-        f"wheels: {left} and {right} are used, of the joints {listed(names)}; measure radius and track [m] and set them here, "
-        "or in [odometry.wheels] of the rig, which has precedence"
+        f"wheels: of the joints {listed(names)}, {left} and {right} are used; measure the wheels and set their radius and "
+        "track [m] here, or in [odometry.wheels] of the rig, which has precedence"
     )
     return {"wheels": sides | WHEELS}
 
@@ -255,13 +255,13 @@ def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None
         out.options["reference"] = settings
         out.uses[tree.topic] = ", ".join(dict.fromkeys((*filter(None, [out.uses.get(tree.topic)]), "reference")))
         out.remarks.append(
-            f"{robot} in {world}, of {tree.topic}, is used as the reference: remove it if it is an estimate, such as that of amcl "
-            "or SLAM, not the truth"
+            f"the pose of {robot} in {world}, from {tree.topic}, is used as the reference: remove [options.reference] if it is an "
+            "estimate, such as that of amcl or SLAM, not the truth"
         )
 
 
 def _never_turns(bag: Bag, topic: Topic) -> bool:
-    """True if the orientations in the first messages of a topic of poses are all equal. Needs at least three messages."""
+    """True if a topic of poses has at least three messages, and the first messages all have the same orientation."""
     get = attrgetter(f"{POSES[topic.type]}.{'rotation' if topic.type.endswith('TransformStamped') else 'orientation'}")
     turned = [get(item.message) for item in islice(bag.messages([topic.name]), SAMPLE)]
     return len(turned) > 2 and len({(q.x, q.y, q.z, q.w) for q in turned}) == 1
@@ -300,7 +300,10 @@ def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, l
 
 
 def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
-    """Propose the topic of RFID reads: of the topics with a field for the EPC, the one with most fields of a read."""
+    """Add the topic of RFID reads to ``out``. Of the topics with a field for the EPC, it is the one with most fields of a read.
+
+    ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields.
+    """
     reads = [(topic, read_fields(paths)) for topic, paths in custom if not range_fields(paths)]
     candidates = [(topic, fields) for topic, fields in reads if "epc" in fields]
     if not candidates:
@@ -310,7 +313,7 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
         out.remarks.append(
-            f"{topic.name} does not distinguish antennas: all reads are assigned to one, whose name is set in antenna"
+            f"{topic.name} does not distinguish antennas: all reads get the antenna name that the setting antenna has"
         )
     if units := _units(fields):
         settings["units"] = units

@@ -40,7 +40,8 @@ Motion = Callable[[list[Notice]], tuple[Integers, Array]]
 
 
 class WheelSettings(motions.WheelSizes):
-    """Two or four wheels. ``radius`` and ``track`` of the rig ([odometry.wheels]) have precedence over these settings."""
+    """The joints and the sizes of two or four wheels. The ``radius`` and ``track`` in [odometry.wheels] of the rig have precedence
+    over these settings."""
 
     left: str
     """name of the left wheel's joint; if each wheel has a topic, the field with the wheel's value"""
@@ -94,7 +95,8 @@ class JointRows:
         if not len(self.rows):
             wrong = next((joint for joint in joints if joint not in self._seen), self._wheels.left)
             raise InputError(
-                f"{self.rows.source}: has no message with all wheels, {quoted(wrong)}{nearest(wrong, sorted(self._seen))}"
+                f"{self.rows.source}: has no message with all joints of the wheels: check {quoted(wrong)}"
+                f"{nearest(wrong, sorted(self._seen))}"
             )
         return self.rows.in_order(joints, warnings)
 
@@ -103,7 +105,7 @@ def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple
     """Pair the messages of the left and the right wheel that are nearest in time.
 
     Returns timestamps (N,) [ns] and the values (N, 2), left and right. A pair has the later one of the two timestamps.
-    Raises InputError if no messages are near in time.
+    Raises InputError if the time between the two messages of each pair exceeds :data:`MAX_OFFSET`.
     """
     l_ns, left = lefts.in_order(("wheel",), warnings)
     r_ns, right = rights.in_order(("wheel",), warnings)
@@ -114,7 +116,7 @@ def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple
     keep = np.flatnonzero(np.abs(r_ns[near] - l_ns) <= MAX_OFFSET * usual)
     t_ns = np.maximum(l_ns, r_ns[near])[keep]
     if not len(t_ns):
-        raise InputError(f"{lefts.source} and {rights.source}: no messages are near in time")
+        raise InputError(f"{lefts.source} and {rights.source}: no messages of the two wheels are near in time")
     if lost := len(l_ns) - len(keep):
         sentence = "{source}: {messages} messages are skipped: no message of the right wheel is near in time"
         warnings.append(notice("unpaired_wheels", sentence, lefts.source, lost))
@@ -123,7 +125,7 @@ def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple
 
 
 class OdometryTopic(PoseTopic):
-    """A topic of odometry, of tf with two frames, or of wheel joints."""
+    """The settings of the topic that gives the odometry: odometry messages, poses, velocities, tf, or wheel joints."""
 
     use: Literal["pose", "twist"] = "pose"
     """part of odometry messages to use: pose, for the motion between messages, or twist, for the velocity; for wheels, pose means
@@ -133,7 +135,7 @@ class OdometryTopic(PoseTopic):
 
 
 class ImuTopic(RowTopic, Turned):
-    """A topic of an IMU: its turn rate about the robot's z axis."""
+    """The settings of a topic of an IMU. Only the turn rate about the robot's z axis is used."""
 
     frame: str | None = None
     """frame of the IMU in tf_static, which gives its orientation; if tf_static lacks it, use axes and mounting instead"""
@@ -154,7 +156,10 @@ class YawRates:
         self.add = self._rows.add
 
     def stream(self, reading: Reading) -> YawRateStream:
-        """Return the turn rates about the robot's z axis. Only the axes of the IMU that contribute must be finite."""
+        """Return the turn rates about the robot's z axis. An IMU axis that is perpendicular to the robot's z axis may be NaN.
+
+        ``reading``: has the absolute time of t = 0, from which the times in the stream count, and a list for warnings.
+        """
         turned = self._options.turned()
         if self._options.frame is not None:
             turned = self._frames.known(self._rows.source, self._options.frame)[:3, :3]
@@ -200,9 +205,10 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 
 
 def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
-    """Return the timestamps (N,) and velocities (N, 2) of rows, which may also have a quaternion and two variances.
+    """Return the timestamps (N,) [ns] and the velocities (N, 2), forward [m/s] and about the vertical [rad/s].
 
-    If these show null poses, the motion is returned as increments (N, 4), and it is unknown at the null poses.
+    ``rows``: two velocities, then optionally a quaternion and the variances of x and y. These show null poses, which a device
+    reports while it has lost its pose. If there are any, the result is that of :func:`motions.through_losses`: increments (N, 4).
     """
     values = rows.values
     null = are_null(values[:, 2:6], values[:, 6:]) if values.shape[1] > 2 else np.zeros(len(rows), dtype=bool)

@@ -43,7 +43,7 @@ WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # frames of measured po
 
 
 class PoseTopic(RowTopic, Turned):
-    """A topic of poses, or of tf with two frames."""
+    """The settings of a topic of poses, or of tf. In tf, the poses are those of the frame ``child`` in the frame ``parent``."""
 
     parent: str | None = None
     """frame in which the poses are given, if the topic is tf"""
@@ -52,14 +52,14 @@ class PoseTopic(RowTopic, Turned):
 
 
 class ReferenceTopic(PoseTopic):
-    """The topic of the reference."""
+    """The settings of the topic of the reference trajectory."""
 
     has_heading: bool = True
     """true if the reference measures the heading; false if its headings are meaningless"""
 
 
 class StartTopic(TopicSettings, Turned):
-    """A topic whose first pose with covariance is the known start."""
+    """The settings of a topic whose first message (PoseWithCovarianceStamped) is the known start of the log."""
 
 
 class Start:
@@ -79,7 +79,7 @@ class Start:
             self._found = (t_ns, np.array([seven(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
-        """Return the start, at a time after ``t0_ns``. Raises InputError if a variance of x, y or heading is not positive."""
+        """Return the start, at its time [s] after ``t0_ns``. Raises InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
         t_ns, values, variances = self._found
         turns = checked_rotations(self._source, np.ones(1, dtype=np.int64), values)
@@ -106,10 +106,11 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
 
 
 def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
-    """Return the poses of collected rows: x, y, z and quaternion, or x, y, z if ``has_rotations`` is false.
+    """Return the poses of collected ``rows``.
 
-    Behind the quaternion a row may have the variances of x and y. Null poses are skipped with a warning. Of rows with equal
-    timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
+    A row has x, y, z, then a quaternion unless ``has_rotations`` is False, then optionally the variances of x and y. Null poses,
+    which a device reports while it has lost its pose, are skipped with a warning. Of rows with equal timestamps, the last is kept.
+    Raises InputError, with the number of the message, at an invalid row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:

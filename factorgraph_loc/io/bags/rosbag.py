@@ -96,7 +96,7 @@ def _antenna(name: str, pose: Array) -> AntennaSettings:
 
 
 class Options(FileModel):
-    """The topic of each sensor."""
+    """The options of the reader of bags: the settings of the topic of each sensor."""
 
     odometry: OdometryTopic
     imu: ImuTopic | None = None
@@ -235,8 +235,8 @@ def read_trajectory(path: Path, topic: str) -> PosePath:
     with open_bag(path) as bag:
         if not name:
             known = [candidate.name for candidate in bag.topics.values() if candidate.type in (*POSES, POINT, *TF)]
-            names = listed(known) or "none has poses"
-            raise InputError(f"{path}: is a bag, expected {path}:TOPIC with one of its topics of poses: {names}")
+            names = f": {listed(known)}" if known else ", but it has no such topic"
+            raise InputError(f"{path}: is a bag, expected {path}:TOPIC with one of its topics of poses{names}")
         listeners, warnings = Listeners(bag, "header"), list[Notice]()
         parent, _, child = frames.partition(WITHIN)
         if bag.topic(name).type in TF and not (parent and child):

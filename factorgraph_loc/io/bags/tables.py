@@ -57,7 +57,7 @@ STAMP_OF_READ = replace(STAMP, name="stamp")
 
 
 class TableTopic(RowTopic):
-    """A topic with the rows of a sensor's table."""
+    """The settings of a topic whose messages are the rows of a sensor's table."""
 
     fields: dict[str, str] = Field(default_factory=dict)
     """path of the message field for each column of the table; by default the field with the name of the column"""
@@ -149,7 +149,7 @@ class RowsOfTopic:
 
 
 class RfidTopic(RowTopic, ReadNames):
-    """A topic of RFID reads."""
+    """The settings of a topic of RFID reads."""
 
     fields: dict[ReadField, str]
     """paths of the EPC, the antenna and other values in a message"""
@@ -242,7 +242,7 @@ class Reads(RowsOfTopic):
 
 
 class LandmarkTopic(RowTopic, Turned):
-    """A topic of landmarks, such as the messages of a marker detector."""
+    """The settings of a topic with observations of landmarks, such as that of a marker detector."""
 
     fields: dict[LandmarkField, str] | None = None
     """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; not needed for
@@ -264,7 +264,7 @@ class Landmarks(RowsOfTopic):
             if topic.type not in DETECTIONS:
                 known = ", ".join(DETECTIONS)
                 raise InputError(
-                    f"{bag.path}: topic {topic.name} is of type {topic.type}: set fields; only these types need none: {known}"
+                    f"{bag.path}: topic {topic.name} is of type {topic.type}: set fields, which only these types need not: {known}"
                 )
             name, place = DETECTIONS[topic.type]
             fields = {"landmark": name} | {axis: f"{place}.{axis}" for axis in "xyz"}
@@ -323,8 +323,8 @@ class Corners(RowsOfTopic):
 def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> RowsOfTopic:
     """Return a collector for the topic of a table.
 
-    The table is the first of ``tables`` that has default fields for the message type, else the first of all. Corners of AprilTags
-    need no fields. Raises InputError if the fields do not fit the table.
+    The table is the first of ``tables`` that has default fields for the message type. If none has, it is ``tables[0]``. Corners of
+    AprilTags need no fields. Raises InputError if the fields do not fit the table.
     """
     kind = bag.topic(options.topic).type
     if tables[0].name == SIGHTINGS.name and not options.fields and kind == CORNERS:

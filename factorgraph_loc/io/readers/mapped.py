@@ -150,7 +150,10 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) -> TableRows:
-    """Read a file in ``folder`` as a table of the native format, the first of ``tables`` whose fields ``mapping`` maps."""
+    """Read the file in ``folder`` that ``mapping`` names, as a table of the native format.
+
+    The format of the table is the first of ``tables`` of which ``mapping`` maps all required fields.
+    """
     shapes = tuple(_fields(table, mapping) for table in tables)
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):

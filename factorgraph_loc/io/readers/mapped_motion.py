@@ -36,7 +36,7 @@ COLUMNS |= {f"rear_{name}": column for name, column in COLUMNS.items() if name.s
 
 
 class PosesFile(TimedMapping, Turned):
-    """A file with poses."""
+    """The settings of a file with poses: a table with mapped columns, or a file in TUM, KITTI or EuRoC format."""
 
     format: Literal["columns", "tum", "kitti", "euroc"] = "columns"
     """format of the file: columns for a table with a mapping of columns, or a common format of trajectories"""
@@ -59,7 +59,7 @@ class OdometryFile(PosesFile, motions.WheelSizes):
 
 
 class ReferenceFile(PosesFile):
-    """The reference."""
+    """The settings of the file with the reference trajectory."""
 
     has_heading: bool = True
     """true if the reference measures the heading; false if its headings are meaningless"""
@@ -159,7 +159,7 @@ def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array
         raise InputError(f"{path}: times is given, but format is {options.format}, not kitti: remove times")
     turned: Turned = options
     if options.times is not None and not options.refuse:
-        raise InputError(f"{path}: format kitti has its times in another file: remove bad_rows and order")
+        raise InputError(f"{path}: rows of format kitti cannot be skipped or sorted: remove bad_rows and order")
     if options.times is not None:
         poses = read_kitti(path, folder.file(options.times))
         if not options.axes:

@@ -34,7 +34,7 @@ from factorgraph_loc.sensors.rfid.tables import SIGNALS
 from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.se2 import Array
 
-NAME = "the * of "  # followed by the pattern: the label of what * stands for, in errors
+NAME = "the * of "  # with a pattern such as rssi_* behind it: the name of the text in place of *, in errors
 EPCS = ("epc", "epc_base64")
 OPTIONAL = (*SIGNALS, *EPCS, "channel", "last", "count")
 CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")
@@ -242,7 +242,7 @@ def _from_base64(text: str) -> str:
 
 
 def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
-    """Return the rows whose last read is not before the first one. Raises InputError at others, unless the mapping skips them."""
+    """Return the rows whose last read is not before the first one. Raises InputError at other rows, unless options skip them."""
     if "last" not in mapped.columns:
         return mapped
     wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)
