@@ -47,19 +47,19 @@ class Estimator(Protocol):
         predicted to ``t`` by odometry."""
 
     def belief(self, t: float | None = None) -> Belief:
-        """The whole probability distribution of the pose, at the time of :meth:`estimate`: its modes, and particles if there are
-        any."""
+        """The whole probability distribution of the pose, at the time of :meth:`estimate`. It has Gaussian modes, and particles if
+        the estimator uses them."""
 
     def learnt(self) -> Learnt:
         """The estimates of sensor constants and landmarks from all measurements, consistent with :meth:`trajectory`."""
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of all past poses, with covariances, at the times of the ticks, which the run requests."""
+        """The best estimate of all past poses, with covariances, at the ticks, the times at which a run records the pose."""
 
 
 @runtime_checkable
 class ConcludingEstimator(Protocol):
-    """An estimator that solves a separate problem for its final trajectory. The solution may produce additional diagnostics."""
+    """An estimator that computes its final trajectory separately, after the last measurement. This may add diagnostics."""
 
     def final_diagnostics(self) -> Diagnostics:
         """The diagnostics of the run and of the final solution."""

@@ -16,17 +16,17 @@ from factors import positive, se2
 from factors.motion import ChainState
 from factors.se2 import Array
 
-# Is added to the variances of poses, so that the covariance of identical particles is invertible.
+# This value is added to the variances of poses, so that the covariance of identical particles is invertible.
 MINIMUM_VARIANCE = 1e-10
-LEAST_VARIANCE = 1e-30  # is added to the variances of constants, so that identical particles do not make them exact
+LEAST_VARIANCE = 1e-30  # added to the variances of sensor constants, which identical particles would make zero
 NOWHERE = np.zeros(3)  # a motion of zero
 NO_ODOMETRY = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 MODES = 5  # maximum number of modes
-REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: half the size of a mode
-# Number of bisections to find the exponent of the next step of a correction, and its minimum relative to the remaining exponent.
+REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: largest distance of a particle from the centre of its mode
+# Number of bisections to find the exponent of a step of a correction; minimum exponent as a fraction of the remaining exponent.
 BISECTIONS, SMALLEST = 8, 0.01
 LEAST = 1e-3  # minimum exponent of a step, so that a correction ends even if no particle explains the measurement
-CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad: size of the cells, of which that with the largest weight begins a mode
+CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad: size of grid cells. The heaviest cell is the first guess of a mode.
 
 T = TypeVar("T")
 Steps = Generator[float, None, T]  # a computation in steps, which yields the cost of each step and returns the result
@@ -70,22 +70,22 @@ class Cloud:
         return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
-        """The cloud with one more block of constants, drawn from a Gaussian with ``mean`` (d,) and ``covariance`` (d, d)."""
+        """The cloud with one more block ``name`` of constants, drawn from a Gaussian with this mean (d,) and covariance (d, d)."""
         first = self.constants.shape[1]
         drawn = mean + positive.draws(covariance, len(self.poses), rng)
         parts = {**self.parts, name: slice(first, first + len(mean))}
         return replace(self, constants=np.concatenate((self.constants, drawn), axis=1), parts=parts)
 
     def weighed(self, likelihood: Array, share: float) -> tuple[Cloud, float]:
-        """Multiply the weights by a likelihood to the power of ``share``. ``likelihood`` (N,): its logarithm. Returns the new
-        cloud, and the logarithm of the mean of the factors."""
+        """Multiply the weights by a likelihood to the power of ``share``. ``likelihood`` (N,): the log-likelihood of each particle.
+        Returns the new cloud, and the logarithm of the weighted mean of likelihood to the power of ``share``."""
         weighed = self.log_weights + share * likelihood
         log_weights = normalised(weighed)
         heaviest = int(np.argmax(weighed))
         return replace(self, log_weights=log_weights), float(weighed[heaviest] - log_weights[heaviest])
 
     def thinned(self, count: int) -> Cloud:
-        """About ``count`` of the particles, evenly spaced in their order."""
+        """The cloud with only every k-th particle, so that about ``count`` particles remain."""
         some = slice(None, None, max(1, len(self.poses) // count))
         weights = normalised(self.log_weights[some])
         return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
@@ -94,11 +94,11 @@ class Cloud:
         """A kernel density with the same moments as the particles.
 
         The poses are shrunk towards their mean, and each gets a Gaussian kernel (Liu, West, in "Sequential Monte Carlo Methods in
-        Practice", 2001, eq. 10.3.8), whose width depends on the number of particles (:func:`silverman`). The constants given the
-        pose are modelled as Gaussian. Otherwise resampling would leave few distinct constants long before landmarks determine them.
+        Practice", 2001, eq. 10.3.8), whose width depends on the number of particles (:func:`silverman`). The sensor constants are
+        drawn from a Gaussian given the pose. Resampling of the constants themselves would soon leave only few distinct values.
 
         Returns the shrunk cloud, and the covariance (3+P, 3+P) of the kernel for the pose's body-frame perturbation and the
-        constants. If the cloud has several modes, the kernel does not change the poses.
+        constants. If the cloud has several modes, the poses are not shrunk and the kernel's covariance of the pose is zero.
         """
         weights = self.weights
         middle, _ = self.moments
@@ -114,7 +114,7 @@ class Cloud:
             return replace(self, constants=constants), _inflated(covariance, lost)
         covariance[range(3), range(3)] += MINIMUM_VARIANCE
         renewed = silverman(*errors.shape) ** 2
-        # regression (3, 3+P) of pose and constants on the pose, and the covariance that it explains
+        # linear regression (3, 3+P) of pose and constants on the pose, and the part of the covariance that it explains
         by_pose = positive.solve(covariance[:3, :3], covariance[:3])
         explained = covariance[:, :3] @ by_pose
         shrunk = mean + np.sqrt(1.0 - renewed) * (errors[:, :3] - mean[:3]) @ by_pose
@@ -155,8 +155,8 @@ class Cloud:
 
 
 class Corrected(NamedTuple):
-    """Particles after a correction. ``evidence``: the logarithm of the mean likelihood over the particles. ``left``: the exponent
-    of the likelihood that was not applied, 0 if it was applied completely."""
+    """Particles after a correction by a likelihood. ``evidence``: the logarithm of the mean likelihood over the particles.
+    ``left``: the exponent of the part of the likelihood that is not yet applied, 0 if all of it is applied."""
 
     cloud: Cloud
     evidence: float
@@ -185,7 +185,7 @@ def corrected(
     ``below``: after the last step, the particles are resampled only if the effective number is below this fraction of N.
     ``left``: the sum of the exponents to apply. ``to_end``: if False, the last step is left out.
 
-    Raises RunFailedError if the likelihood is not finite for all particles with a weight.
+    Raises RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """
     evidence = 0.0
     while left > 0.0:
@@ -201,7 +201,7 @@ def corrected(
 
 
 def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
-    """Convert a function of particles to a computation of one step, with cost 0."""
+    """Wrap a function of particles as a generator :data:`Steps` with one step. It yields the cost 0 and returns the result."""
 
     def steps(cloud: Cloud) -> Steps[T]:
         yield 0.0
@@ -211,7 +211,7 @@ def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
 
 
 def finished(steps: Steps[T]) -> T:
-    """Run a computation in steps to its end and return the result."""
+    """Run a generator :data:`Steps` to its end and return the result of the computation."""
     while True:
         try:
             next(steps)
@@ -237,7 +237,7 @@ def around(poses: Array, middle: Array) -> NDArray[np.bool_]:
 
 
 def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
-    """Numbers (N,) of the cells that contain poses (N, 3). ``cell`` (3,): the size of a cell [m, m, rad]."""
+    """Return for each of N poses (N, 3) the integer of its grid cell. ``cell`` (3,): the size of a cell [m, m, rad]."""
     places = np.floor(poses / cell).astype(np.int64)
     places -= places.min(axis=0)
     size = places.max(axis=0) + 1
@@ -245,10 +245,10 @@ def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
 
 
 def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
-    """The largest exponent of a likelihood, at most ``left``, that keeps ``enough`` effective particles.
+    """The largest exponent of a likelihood, at most ``left``, after which the effective number of particles is still ``enough``.
 
-    ``log_weights`` (N,): of the particles. ``likelihood`` (N,): the log-likelihood. The result is at least :data:`LEAST`, so that a
-    correction has at most a few hundred steps.
+    ``log_weights`` (N,): the particles' log-weights. ``likelihood`` (N,): their log-likelihoods. The result is at least
+    :data:`LEAST`, so that a correction has at most a few hundred steps.
     """
 
     def effective(share: float) -> float:
@@ -268,8 +268,8 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
     """Replace values of a log-likelihood (N,) that are not finite by ``-inf``, which gives these particles no weight.
 
-    ``log_weights`` (N,): of the particles. ``t`` [s]: the time of the measurement, for the message. Raises RunFailedError if no
-    particle with a weight has a finite value.
+    ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement, for the message. Raises RunFailedError
+    if no particle with a nonzero weight has a finite log-likelihood.
     """
     possible = np.isfinite(likelihood)
     if possible.all():
@@ -311,7 +311,7 @@ def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def _inflated(covariance: Array, lost: float) -> Array:
-    """Correct a covariance that is too small by the factor ``1 - lost``."""
+    """Divide a covariance by ``1 - lost``, because it is too small by this factor."""
     return covariance / max(1.0 - lost, 0.5)
 
 

@@ -20,7 +20,7 @@ class DeadReckoningSettings(FilterSettings):
 
 
 class _PoseRecord(NamedTuple):
-    """The estimate at time ``t`` [s]."""
+    """The estimated pose (3,) and its body-frame covariance (3, 3) at time ``t`` [s]."""
 
     t: float
     pose: Array
@@ -28,7 +28,7 @@ class _PoseRecord(NamedTuple):
 
 
 class DeadReckoning(Filter):
-    """Odometry only, with a covariance that grows with the distance."""
+    """An estimator that uses only odometry. Its covariance grows with the distance."""
 
     modalities = frozenset[str]()
     smoothed = False

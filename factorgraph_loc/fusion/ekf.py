@@ -35,9 +35,9 @@ NOWHERE = slice(POSE, POSE)  # the slice of a block that does not exist
 # Maximum number of components of the error state. When it is reached, uncertain landmarks of the map are no longer estimated; their
 # covariances are added to the noise instead.
 MOST = 150
-# A heading from the search is the prior of the filter, with its standard deviation multiplied by this factor. The filter processes
-# the same measurements again, so that 1/16 of their information counts twice. Without this prior the filter would be linearised far
-# from the true heading.
+# At an unknown heading, a search with particles finds the heading. The filter then starts with this heading as its prior, with the
+# standard deviation multiplied by this factor, and processes the measurements of the search again. So 1/16 of their information
+# counts twice. Without this prior the filter would be linearised far from the true heading.
 HEADING_WIDENED = 4.0
 
 
@@ -55,8 +55,8 @@ class EkfSettings(FilterSettings):
 
 
 class _State(NamedTuple):
-    """The state of the filter. ``pose`` (3,). ``rest`` (R,): the values of the blocks. ``covariance`` (3+R, 3+R): that of the error
-    state. ``layout``: the order of the blocks."""
+    """The state of the filter. ``pose`` (3,). ``rest`` (R,): the values of sensor constants and landmarks, in blocks.
+    ``covariance`` (3+R, 3+R): the covariance of the error state. ``layout``: the order of the blocks."""
 
     pose: Array
     rest: Array
@@ -64,7 +64,7 @@ class _State(NamedTuple):
     layout: Layout
 
     def plus(self, delta: Array, covariance: Array) -> _State:
-        """The state after a correction ``delta`` (3+R,), with a new ``covariance``."""
+        """The state after a correction ``delta`` (3+R,). ``covariance`` (3+R, 3+R): the covariance after the correction."""
         return _State(se2.moved(self.pose, delta), self.rest + delta[POSE:], covariance, self.layout)
 
     def first(self, size: int) -> _State:
@@ -74,7 +74,7 @@ class _State(NamedTuple):
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def with_block(self, new: NewVariable) -> _State:
-        """The state with one more variable, such as a landmark, which is correlated with the rest of the state."""
+        """The state with one more variable ``new``, such as a landmark, and its correlation with the rest of the state."""
         size, columns = len(self.covariance), self.layout.columns
         cross, own = new.joint(self.covariance, columns)
         end = size + len(new.mean)
@@ -86,8 +86,8 @@ class _State(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A prediction step, for the smoother. ``pose`` (3,): the predicted pose. ``transition`` (3, S): the first three rows of the
-    transition matrix; the rest are those of the identity. ``noise`` (3, 3): the covariance added to the pose."""
+    """A prediction step, for the smoother. ``pose`` (3,): the predicted pose. ``transition`` (3, 3+R): the rows of the transition
+    matrix for the pose; its other rows are those of an identity. ``noise`` (3, 3): the covariance added to the pose."""
 
     pose: Array
     transition: Array
@@ -103,7 +103,7 @@ class _Record(NamedTuple):
 
 
 class _View(FilterView):
-    """The EKF's state as sensors read it."""
+    """Read access to the EKF's state, for the sensors."""
 
     localized = True
     _filter: Ekf
@@ -128,7 +128,7 @@ class _View(FilterView):
 
 
 class Ekf(Filter):
-    """Extended Kalman filter on SE(2), with a smoother (RTS) at the end. See the module."""
+    """Extended Kalman filter on SE(2), with a Rauch-Tung-Striebel smoother at the end. See the module."""
 
     _state: _State
 
@@ -182,7 +182,7 @@ class Ekf(Filter):
     def trajectory(self) -> Trajectory:
         """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones if the setting ``smooth`` is false."""
         records: list[_Record] = self._records
-        if not records:  # an unknown start was never determined
+        if not records:  # the unknown start pose was never found
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         smoothed = records[-1].updated
         poses, covariances = [smoothed.pose], [smoothed.covariance[:3, :3]]
@@ -247,8 +247,8 @@ class Ekf(Filter):
         self._doubt(tick)
 
     def _doubt(self, m: Measurement) -> None:
-        """Check whether the observations contradict the estimated poses. If they do, continue at the pose that the search has
-        found."""
+        """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do, continue at the
+        pose that the search has found."""
         view = _View(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         best = self._search.best if refuted is not None else None
@@ -267,9 +267,9 @@ class Ekf(Filter):
         return self._start(self._search.brought(pose, self._odometry))
 
     def _jump(self, best: PosePrior, refuted: Refuted) -> None:
-        """Continue at the pose ``best``, which is not correlated with the rest of the state.
+        """Continue at the pose ``best``, without correlation with the rest of the state.
 
-        The constants return to their estimates from before the track became wrong, at ``refuted.since``.
+        The sensor constants are reset to their estimates from before ``refuted.since``, when the estimated pose became wrong.
         """
         self._search.begin_track(by_search=True)
         for sensor in self._sensors.values():
@@ -294,5 +294,5 @@ class Ekf(Filter):
         return _Record(self._t, step, self._state)
 
     def _standstill(self) -> _Step:
-        """The prediction step between two measurements of equal time: no motion and no noise."""
+        """The prediction step between two measurements of equal time. It has no motion and no noise."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))

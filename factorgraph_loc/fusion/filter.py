@@ -51,7 +51,8 @@ class _Checkpoint(NamedTuple):
 
 
 class FilterView:
-    """The interface through which sensors read a filter's state, at the time of the filter."""
+    """Read access to a filter's present state, for the sensors. ``offset`` is None and ``newest`` True, because a measurement
+    always belongs to the present pose."""
 
     offset = None
     newest = True
@@ -105,7 +106,7 @@ class Filter(Timeline):
         # the last requested prediction and the state it started from, so that the next tick can continue from the prediction
         self._ahead: tuple[Any, Filter] | None = None
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        # False until the first measurement after a start: until then rows of odometry from before the start may arrive
+        # False until the first measurement after a start: until then, odometry from before the start may still arrive
         self._moves = False
         self._ticks: list[float] = []
         self._records: list[Any] = []
@@ -118,7 +119,7 @@ class Filter(Timeline):
         self._taken.clear()
 
     def _wait(self, t: float) -> None:
-        """Begin at time ``t`` [s] without a state. :meth:`_begin` gets the measurements until there is one."""
+        """Begin at time ``t`` [s] without a state. :meth:`_begin` processes the measurements until the filter has a state."""
         self._t, self._begun, self._state = t, math.inf, None
         self._taken.clear()
 
@@ -145,7 +146,7 @@ class Filter(Timeline):
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
-        """The best estimate of all past poses, at the times of the ticks."""
+        """The best estimate of all past poses, at the ticks, the times at which a run records the pose."""
 
     @abstractmethod
     def _start(self, prior: PosePrior) -> Any:
@@ -160,7 +161,7 @@ class Filter(Timeline):
         """Update the state by a measurement. The state is already predicted to the measurement's time."""
 
     def _pass(self, tick: Tick) -> None:
-        """Continue a search, if there is one. This is called at each tick, after the prediction."""
+        """Continue the search for the pose, if one is running. Called at each tick (a time at which a run records the pose)."""
         return
 
     @abstractmethod
@@ -169,17 +170,17 @@ class Filter(Timeline):
 
     @abstractmethod
     def _record(self) -> Any:
-        """The data that :meth:`trajectory` needs of the present state. An attribute ``t`` is the time [s]."""
+        """The data of the present state that :meth:`trajectory` needs. The result has an attribute ``t``, the time [s]."""
 
     def _seek(self, m: Any) -> Any:
-        """A state from a measurement, at an unknown start. None if the pose is not yet determined."""
+        """Use a measurement to find the unknown start pose. Returns the first state, or None if the pose is not yet determined."""
         return None
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
         return self._at(t)._estimate()
 
     def _at(self, t: float | None) -> Self:
-        """The filter itself, or a copy that is predicted to ``t`` [s] if that is later. Use the copy for reading only."""
+        """The filter itself, or a copy predicted to ``t`` [s] if ``t`` is later than the filter. Only read from the copy."""
         if t is None or t <= self._t or self._state is None:
             return self
         self._ahead = None
@@ -191,7 +192,8 @@ class Filter(Timeline):
         return ahead
 
     def _anchor(self) -> None:
-        """Set the odometry at the start, at the first measurement after it. By then all earlier rows of odometry have arrived."""
+        """Store the integrated odometry at the start. This is called at the first measurement after the start, because then all
+        odometry from before the start has arrived."""
         if not self._moves:
             self._odometry, self._moves = self._motion.state(self._t), True
 

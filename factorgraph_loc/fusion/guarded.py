@@ -27,7 +27,7 @@ from factors.se2 import Array
 # The exceptions of numerical failures: singular matrices, overflows, divisions by zero, arguments out of range, all errors of
 # GTSAM.
 FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
-ROUNDING = 1e-6  # rounding explains eigenvalues of a correlation matrix down to minus this value
+ROUNDING = 1e-6  # an eigenvalue of a correlation matrix between minus this value and 0 counts as a rounding error
 LEAST = 1e-9  # smaller eigenvalues of a correlation matrix are raised to this value
 
 
@@ -49,8 +49,8 @@ class Guard:
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """A context that silences NumPy's warnings for a whole run. Switching warnings for each measurement takes as long as
-        processing one row of odometry."""
+        """A context that silences NumPy's warnings for a whole run. To silence them separately for each measurement takes as long
+        as processing one measurement of odometry."""
         with np.errstate(all="ignore"):
             self._is_quiet = True
             try:
@@ -59,7 +59,7 @@ class Guard:
                 self._is_quiet = False
 
     def process(self, estimator: Estimator, measurement: Measurement) -> None:
-        """Let the estimator process a measurement. Raises RunFailedError if that fails."""
+        """Call the estimator's ``process`` with a measurement. Raises RunFailedError if the estimator fails."""
         self._last, self._computing, self._of = measurement, "", None
         with self:
             estimator.process(measurement)
@@ -110,7 +110,7 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
 
 
 def sound_belief(belief: Belief) -> Belief:
-    """Check a belief as :func:`sound` checks an estimate: each mode, and that the particles are finite."""
+    """Check each mode of a belief as :func:`sound` checks an estimate, and check that the particles are finite."""
     for values in (belief.particles, belief.weights):
         if values is not None and not np.all(np.isfinite(values)):
             raise ValueError("the particles are not finite")
@@ -137,8 +137,8 @@ def sound_trajectory(trajectory: Trajectory) -> Trajectory:
 
 
 def _positive(covariance: Array, where: str = "") -> Array:
-    """The result of :func:`nearest_positive`. Raises ValueError instead of returning None. ``where``: is inserted in the
-    message."""
+    """Return the result of :func:`nearest_positive`, or raise ValueError if it is None. ``where``: a text such as the time of the
+    pose, which is inserted in the message."""
     repaired = nearest_positive(covariance)
     if repaired is None:
         why = "is not positive definite" if np.all(np.isfinite(covariance)) else "is not finite"

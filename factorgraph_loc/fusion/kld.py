@@ -7,25 +7,26 @@ from factorgraph_loc.fusion.cloud import cell_numbers
 from factors import se2
 from factors.se2 import Array
 
-# The largest Kullback-Leibler divergence, and the normal quantile of 99 %, the probability that the divergence is smaller.
+# The largest allowed Kullback-Leibler divergence, and the quantile of the normal distribution for the probability 99 % that the
+# divergence is smaller.
 ERROR, QUANTILE = 0.05, 2.326
 CELL = np.array((0.3, 0.3, 0.2))  # m, m, rad; size of the cells that are counted
 KERNEL = 0.25  # standard deviation of a kernel as a fraction of the distance between particles
 
 
 def enough(cells: Array | NDArray[np.int64]) -> Array:
-    """The number of particles that a distribution needs if it occupies this number of ``cells`` (Fox, 2003, eq. 7, with the
-    approximation of Wilson and Hilferty)."""
+    """The number of particles that represent a distribution well enough if they occupy this number of ``cells`` of a grid (Fox,
+    2003, eq. 7, with the approximation of Wilson and Hilferty)."""
     freedom = np.maximum(np.asarray(cells, dtype=float) - 1.0, 1.0)
     a = 2.0 / (9.0 * freedom)
     return np.asarray(freedom / (2.0 * ERROR) * (1.0 - a + np.sqrt(a) * QUANTILE) ** 3)
 
 
 def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int64]:
-    """Select as many of ``poses`` (N, 3), drawn from a distribution, as KLD sampling needs, and at least ``least``.
+    """Select a random subset of ``poses`` (N, 3) that is large enough by KLD sampling, and has at least ``least`` poses.
 
-    Poses are added in random order until their number is :func:`enough` for the cells that they occupy. Returns the indices of the
-    selected poses.
+    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy. If it never is, all
+    are selected. Returns the indices of the selected poses.
     """
     order = rng.permutation(len(poses))
     _, first = np.unique(cell_numbers(poses[order], CELL), return_index=True)
@@ -38,9 +39,9 @@ def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int
 def jittered(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator, room: Array | float = 0.0) -> Array:
     """Draw one particle from a Gaussian kernel around each of the particles ``rows`` (K,) of ``poses`` (N, 3). Returns (K, 3).
 
-    The kernel's width is proportional to the mean distance between the distinct particles in ``rows``, from the number of cells
-    that they occupy. ``room`` (K,): a lower limit of the volume per particle, in cells, for particles that are farther apart. The
-    kernel is much narrower than a mode, so several modes stay separate.
+    The kernel's width is proportional to the mean distance between particles. This distance is the cube root of the volume per
+    particle: the number of occupied grid cells, divided by the number of distinct particles. ``room`` (K,): a lower limit of the
+    volume around each particle, in cells. The kernel is much narrower than a mode, so several modes stay separate.
     """
     chosen = poses[rows]
     cells = len(np.unique(cell_numbers(chosen, CELL)))

@@ -18,18 +18,19 @@ from factorgraph_loc.sensors.base import Observation, Sensor, View
 from factorgraph_loc.sensors.motion import MOTION, Motion
 from factors.se2 import Array
 
-POSE = 3  # number of components of the pose, which are the first ones of the error state
+POSE = 3  # number of components of the pose, which are the first components of the error state
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of the blocks behind the pose. ``sizes``: the number of components of each block by name, in order."""
+    """The order of the blocks of an error state that follow the pose: sensor constants and landmarks. ``sizes``: the number of
+    components of each block, by name."""
 
     sizes: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def of(constants: Mapping[str, Estimated]) -> Layout:
-        """The layout of blocks of estimated constants. Blocks without constants are left out."""
+        """Make the layout for the estimated ``constants`` of sensors, one block per sensor. Empty blocks are left out."""
         return Layout({name: len(block.names) for name, block in constants.items() if block.names})
 
     @cached_property
@@ -42,7 +43,7 @@ class Layout:
         return columns
 
     def plus(self, name: str, size: int) -> Layout:
-        """The layout with one more block at the end."""
+        """The layout with one more block, with this name and number of components, at the end."""
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:
@@ -56,8 +57,8 @@ def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Est
 
 
 def on_pose(observation: Observation, view: View) -> Observation:
-    """Convert an observation to one that depends on the pose only. Its blocks are fixed at their estimates, and their covariances
-    are added to the noise."""
+    """Convert an observation to one that depends on the pose only. Sensor constants and landmarks are fixed at their estimates in
+    ``view``, and their covariances are added to the noise."""
     values = {name: np.asarray(view.value(name)) for name in observation.blocks}
     return observation.on_pose(values, {name: view.block_covariance(name) for name in observation.blocks})
 

@@ -54,12 +54,12 @@ from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
-# If weighing all particles costs more than HEAVY (units of `Observation.work`), FEW particles are weighed first.
+# If weighing all particles costs more than HEAVY (in the units of `Observation.work`), only FEW particles are weighed first.
 FEW, HEAVY = 500, 2_000_000
 
 
 class ParticleFilterSettings(FilterSettings):
-    """Settings of the particle filter. With ``kld`` their number is chosen by KLD sampling (Fox, IJRR 22(12), 2003)."""
+    """Settings of the particle filter. With ``kld``, KLD sampling chooses the number of particles (Fox, IJRR 22(12), 2003)."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     """number of particles; with kld the maximum number"""
@@ -79,7 +79,7 @@ class ParticleFilterSettings(FilterSettings):
 
 
 class _CloudView(FilterView):
-    """The particle filter's state as sensors read it."""
+    """Read access to the particle filter's state, for the sensors."""
 
     _filter: ParticleFilter
 
@@ -130,7 +130,7 @@ class ParticleFilter(Filter):
         self._search = Tracking(self._sensors, self._motion, setup.rng, self.diagnostics)
         self._search.remember()
         self._lost = False
-        # times [s] of rejections of the track, and when the robot was carried
+        # times [s] at which the estimated pose was rejected, each with the interval in which the robot was carried
         self._changes: list[tuple[float, Change]] = []
 
     def belief(self, t: float | None = None) -> Belief:
@@ -151,7 +151,7 @@ class ParticleFilter(Filter):
         return learnt_from(self._constants, ((name, *parts) for name, parts in moments.items()))
 
     def trajectory(self) -> Trajectory:
-        """Mean and covariance of trajectories drawn backwards, or the causal estimates if the setting ``smooth`` is false."""
+        """Means and covariances of trajectories drawn by backward simulation. The causal estimates if ``smooth`` is false."""
         last = {r.t: r for r in self._records}
         records = [last[t] for t in sorted(set(self._ticks))]
         if not self._smooth or not records:
@@ -173,7 +173,7 @@ class ParticleFilter(Filter):
         return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in moments]).reshape(-1, 3, 3))
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the last cloud for smoothing that is not later than ``until`` [s]."""
+        """Delete the trajectory before ``until`` [s], but keep the last particles before it that are stored for smoothing."""
         clouds = [r.t for r in self._records if r.cloud is not None and r.t <= until]
         super().forget(max(clouds, default=-math.inf) if self._smooth else until)
 
@@ -206,9 +206,9 @@ class ParticleFilter(Filter):
         return self._sampled_cloud(self._t) if self._search.look(m, self._odometry) else None
 
     def _sampled_cloud(self, since: float) -> Cloud | None:
-        """Draw particles from the posterior of the search; None if there is none yet. If the search has one clear pose, a track
-        begins, and sensors process measurements again from the time ``since`` [s]. The constants of the particles are those of the
-        previous track before ``since``, if there was one."""
+        """Draw particles from the posterior of the search, or return None if it has none yet. If the search has found one clear
+        pose, the filter is localized, and sensors restart at the time ``since`` [s]. If the filter was localized before ``since``,
+        the particles keep their sensor constants from then."""
         clouds = (r.cloud for r in reversed(self._records) if r.cloud is not None and r.t < since)
         previous = next((cloud for cloud in clouds if cloud.localized), None)
         sample = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
@@ -323,7 +323,7 @@ class ParticleFilter(Filter):
         view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:
-            # for the final trajectory, mark the records since the track became wrong
+            # mark the records since the estimated pose became wrong, for the final trajectory
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, "lost", LOST, why=refuted.why, since=refuted.since)
             self._lost = True
@@ -336,8 +336,8 @@ class ParticleFilter(Filter):
 
     def _weigh(self, observation: Observation) -> float:
         """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`). Returns the logarithm of the
-        mean likelihood. If weighing is costly, a few particles are corrected first, by most of the likelihood, and all particles
-        are drawn from these."""
+        mean likelihood. If weighing is costly, only a few particles are corrected by most of the likelihood. All particles are then
+        drawn from these few, and corrected by the rest."""
         cloud, count, enough = self._state, self._settings.particles, self._settings.resample_below
 
         @in_one_step
@@ -354,7 +354,7 @@ class ParticleFilter(Filter):
 
         evidence, left = 0.0, 1.0
         if count > FEW and observation.work * count > HEAVY:
-            doubted = self._search.doubts  # while the track is in doubt, a few particles are enough
+            doubted = self._search.doubts  # while a sensor doubts the estimated pose, a few particles are enough
             few, evidence, left = correct(cloud.thinned(FEW), FEW, enough, left, to_end=doubted)
             if doubted:
                 self._state = few
@@ -388,7 +388,7 @@ class ParticleFilter(Filter):
         return Record(self._t, self._odometry, estimate.pose, estimate.covariance, self._state if keep else None)
 
     def _is_due(self) -> bool:
-        """True if a cloud must be stored now for smoothing: after an interval, and after a jump of the particles."""
+        """True if the particles must be stored now for smoothing, because the interval is over or because they have jumped."""
         if self.diagnostics.events and self.diagnostics.events[-1].t == self._t:
             return True
         last = next((r.t for r in reversed(self._records) if r.cloud is not None), -math.inf)

@@ -46,7 +46,7 @@ class Record:
     cloud: Cloud | None
 
     def lost(self) -> Record:
-        """The record with its cloud marked as wrong."""
+        """The record with ``localized`` false in its cloud. This marks particles that turned out to be at a wrong pose."""
         return self if self.cloud is None else replace(self, cloud=replace(self.cloud, localized=False))
 
 
@@ -75,7 +75,7 @@ class BackwardSimulation:
         clouds = [r.cloud for r in kept if r.cloud is not None]
         cloud, kernel = clouds[-1].density()
         self._drawn = [cloud.drawn(systematic(cloud.weights, rng, count), kernel, rng)]
-        # the noise of the motion between consecutive clouds that each drawn trajectory implies
+        # for each pair of consecutive clouds, the noise of the motion that each drawn trajectory implies
         self._missed: list[Array] = []
         for k in range(len(clouds) - 2, -1, -1):
             drawn, missed = self._step(clouds[k], increment(kept[k], kept[k + 1]), self._drawn[0])
@@ -101,8 +101,8 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """Draw an ancestor for each of the states ``later`` from the earlier ``cloud``. Returns these, and the noise (M, 3) of the
-        motion in between that they imply. ``increment``: the odometry in between."""
+        """Draw an ancestor from ``cloud`` for each of the M later states ``later``. ``increment``: the odometry in between. Returns
+        the ancestors, and the noise (M, 3) of the odometry that they imply."""
         smooth, kernel = cloud.density()
         later = replace(
             later, constants=later.constants[:, : cloud.constants.shape[1]]
@@ -161,10 +161,9 @@ def draw_ancestors(
     """Draw an ancestor among N particles for each of M later states (Godsill et al., 2004, eq. 7). The probability of an ancestor
     is proportional to its weight times the transition density to the later state.
 
-    ``predicted`` (N, 3): the particles' poses after the motion, without noise. ``constants`` (N, P), ``log_weights`` (N,): of the
-    particles.
-    ``later`` (M, 3), ``later_constants`` (M, P): the later states.
-    ``covariance`` (3+P, 3+P): that of the transition, for the body-frame error of the pose and for the constants.
+    ``predicted`` (N, 3): the particles' poses after the motion, without noise. ``constants`` (N, P): the particles' sensor
+    constants. ``log_weights`` (N,): their log-weights. ``later`` (M, 3), ``later_constants`` (M, P): poses and constants of the
+    later states. ``covariance`` (3+P, 3+P): the covariance of the transition, of the body-frame pose error and of the constants.
     ``uniform`` (M,): random numbers from [0, 1).
 
     Returns the indices (M,) of the ancestors.

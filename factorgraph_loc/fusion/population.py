@@ -32,19 +32,20 @@ from factors.motion import ChainState
 from factors.se2 import Array
 
 DENSITY = 25.0  # initial number of particles per m^2 and rad
-# minimum of the initial number, maximum, and minimum of later numbers
+# numbers of particles: the minimum at the start of a search, the maximum, and the minimum after a resampling
 FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
 GROWTH = 4  # largest factor by which one resampling increases the number of particles
-# Effective sizes as fractions of the number of particles: the limit for resampling, and the minimum after a step of a correction.
+# Effective sample sizes as fractions of the number of particles: resampling starts below the first. Each step of a correction keeps
+# at least the second.
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2
 FRESH, ELSEWHERE = 2000, 1e-3  # number of additional particles at each resampling, and their total weight
-# number of these that are near existing particles, and their distance: m, m, rad
+# how many of the FRESH particles are drawn near existing particles, and their standard deviations from these: m, m, rad
 ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))
-NOISE = 2.0  # factor of the covariance of odometry, because its constants are not estimated here
+NOISE = 2.0  # factor on the covariance of odometry, because these particles do not estimate its constants
 OUTSIDE = -1.0  # change of the log-weight, at each motion, of a particle outside of free space
 
-# The particles reject a pose if less than this weight is within REACH standard deviations of the pose. Its covariance is increased
-# first, by standard deviations in m, m, rad.
+# The particles reject a pose of another sensor if those within REACH standard deviations of it have less total weight than
+# NEGLIGIBLE. The covariance of the pose is first increased by WIDENED (standard deviations in m, m, rad).
 NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2
 REACH = 5.0
 
@@ -56,10 +57,10 @@ CLEAR = ((0.95, 1.0), (0.85, 3.0))
 CLEAR_OBSERVATIONS, CLEAR_THINGS = 3, 2
 
 # Costs, in units of the cost of one tag for one particle, which is some nanoseconds.
-CHUNK = 500_000  # of one step of a computation
-PARTICLE = 25  # of a particle, in addition to the cost of the observation
-RESAMPLED = 60  # of a particle in each half of a resampling
-BEGUN = 80  # of an initial particle, including the preparation of the sensors for the search
+CHUNK = 500_000  # largest cost of one step of a computation
+PARTICLE = 25  # cost of weighing one particle, in addition to the cost of the observation
+RESAMPLED = 60  # cost per particle of each half of a resampling
+BEGUN = 80  # cost of drawing one initial particle, including the preparation of the sensors for the search
 
 
 class Evidence(Protocol):
@@ -75,8 +76,8 @@ class Evidence(Protocol):
 
 
 class WeighedObservation(NamedTuple):
-    """An observation with the integrated ``odometry`` at its time. ``evidence``: its log-probability given the track, zero if there
-    is no track."""
+    """An observation with the integrated ``odometry`` at its time. ``evidence``: the log-probability of the observation if the
+    estimator's pose (the track) is right, zero if the estimator has no pose."""
 
     odometry: ChainState
     observation: Evidence
@@ -90,8 +91,9 @@ class Population:
     ``start``: a known start position, or None. ``space``: the free space in which the robot is, or None.
     ``fewest``: the minimum number of particles, at least :data:`ASTRAY`.
 
-    Attributes: ``log_evidence``, the log-probability of all observations for a robot that began anywhere; ``rival_evidence``, that
-    of the same observations given the track; ``newest``, the integrated odometry at the last processed observation.
+    Attributes: ``log_evidence``: the log-probability of all observations if the robot's start pose is unknown.
+    ``rival_evidence``: the log-probability of the same observations if the estimator's pose (the track) is right.
+    ``newest``: the integrated odometry at the last processed observation.
     """
 
     at_once = False
@@ -113,11 +115,11 @@ class Population:
         self._hypotheses: tuple[Mode, ...] | None = ()
         self._informative = 0  # number of observations with detections
         self._things: set[Hashable] = set()  # the detected tags and landmarks
-        self._since = [math.inf for _ in CLEAR]  # s; since when the probability has exceeded each limit of CLEAR
+        self._since = [math.inf for _ in CLEAR]  # s; the time since which the best mode exceeds each limit of CLEAR
         self._waiting: deque[WeighedObservation] = deque()
         self._running: Steps[None] | None = None
         self.newest: ChainState | None = None  # the odometry at the last observation that was processed
-        self.log_evidence = 0.0  # log-probability of all observations for a robot that began anywhere
+        self.log_evidence = 0.0  # log-probability of all observations if the start pose is unknown
         self.rival_evidence = 0.0
 
     @property
@@ -134,7 +136,7 @@ class Population:
 
     @property
     def best(self) -> PosePrior | None:
-        """The robot's pose at the last observation if one mode is clear, otherwise None."""
+        """The robot's pose at the last observation. None if no mode has exceeded a probability in :data:`CLEAR` for long enough."""
         at = self.newest
         if at is None or all(at.t < since + lasts for since, (_, lasts) in zip(self._since, CLEAR, strict=True)):
             return None
@@ -147,7 +149,8 @@ class Population:
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
-        """Queue an observation, see :class:`WeighedObservation`. Returns False if it is older than the last one and is ignored."""
+        """Queue an observation with the fields of :class:`WeighedObservation`. Returns False if it is ignored, because it is older
+        than the last queued observation."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
         if newest is not None and odometry.t < newest.t:
             return False
@@ -169,7 +172,7 @@ class Population:
         return done
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw ``count`` poses (N, 3) at the last observation, from the clear mode, or from all modes if none is clear. Empty
+        """Draw ``count`` poses (N, 3) at the last observation, around :attr:`best`, or from all particles if that is None. Empty
         before the first observation."""
         if self._cloud is None:
             return np.empty((0, 3))
@@ -257,7 +260,8 @@ class Population:
         return float(area) * 2.0 * math.pi
 
     def _room_of(self, count: int) -> Array:
-        """The volume (N,) per particle, in cells, of ``count`` particles drawn anywhere; zero if the start position is known."""
+        """The volume (N,) per particle, in grid cells, if ``count`` particles are drawn from the whole space of poses. Zero if the
+        start position is known."""
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:
@@ -274,7 +278,7 @@ class Population:
 
 
 def _cloud(poses: Array, log_weights: Array) -> Cloud:
-    """Particles without constants, which may have several modes."""
+    """Make a cloud of particles that have no sensor constants and may have several modes."""
     return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
 
 

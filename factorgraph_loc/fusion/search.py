@@ -27,7 +27,7 @@ from factors.motion import ChainState
 from factors.se2 import Array
 
 DURATION = 60.0  # s: observations of this duration are kept
-SLICE = 2_500_000  # cost of one slice, in the units of `population`
+SLICE = 2_500_000  # cost of one slice of the computation, in the units of the module `population`
 PAUSE = 0.05  # s: minimum time between two slices, because a measurement and a tick often arrive together
 
 
@@ -76,7 +76,7 @@ class Search:
         self._motion.horizon = self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:
-        """Begin a search for the heading at a known position ``start``. None ends the restriction to a position."""
+        """Begin a search for the heading at a known position ``start``. If ``start`` is None, the position counts as unknown."""
         self.start = start
         for finder in self._finders.values():
             finder.start = start
@@ -86,7 +86,7 @@ class Search:
 
     def look(self, m: Any, odometry: ChainState) -> bool:
         """Process a measurement while the pose is unknown. ``odometry``: the integrated odometry at its time. Returns True if the
-        measurement was informative, or if the particles completed an observation."""
+        result of the search may have changed: the measurement was informative, or the particles completed an observation."""
         sensor, finder = self._sensors.get(m.source), self._finders.get(m.source)
         if sensor is None:
             return False
@@ -187,7 +187,7 @@ class Search:
         return next(iter(informative), None)
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
-        """True if the particles should get an observation of this sensor at time ``t`` [s]: the last one is long enough ago."""
+        """True if the particles' last observation of this sensor is long enough before ``t`` [s], so that they need a new one."""
         last = self._last.get(sensor.name, -math.inf)
         if t <= last or t < last + sensor.evidence_every:
             return False

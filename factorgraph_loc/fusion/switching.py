@@ -29,12 +29,12 @@ from factors.motion import ChainState, Increment, propagate
 from factors.se2 import Array
 
 JUMPED = 50.0  # squared Mahalanobis distance: above it an estimate does not follow from the previous one
-# Is added to covariances (standard deviations in m, m, rad), because identical particles have a singular covariance.
+# This is added to covariances (standard deviations in m, m, rad), because identical particles have a singular covariance.
 LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2
 
 
 class SwitchingSettings(FilterSettings):
-    """Settings of the switch."""
+    """Settings of the estimator that switches between a particle filter and an EKF."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     """number of particles of the particle filter"""
@@ -51,7 +51,7 @@ class _PoseBelief:
 
 
 class Switching:
-    """The fusion of the paper: the particle filter while tags are read, else the EKF. See the module."""
+    """The fusion rule of Raoui, Bouyakhf and Devy (2011): a particle filter while RFID tags are read, otherwise an EKF."""
 
     deterministic = False
     takes_rows = True
@@ -92,7 +92,7 @@ class Switching:
             counted = self.diagnostics.ignored, self.diagnostics.late
             previous = [dict(counts) for counts in counted]
             self._vision.process(measurement)
-            # both filters counted the same rows: restore one count
+            # both filters counted the same ignored and late measurements: restore the counts of the first filter
             for counts, once in zip(counted, previous, strict=True):
                 counts.clear()
                 counts.update(once)
@@ -146,7 +146,7 @@ class Switching:
         self._records = {t: record for t, record in self._records.items() if t >= until}
 
     def _hand_over(self, successor: Filter) -> None:
-        """Make ``successor`` the active filter, unless the present one is not localized."""
+        """Make ``successor`` the active filter, starting at the present pose. Do nothing if the active filter is not localized."""
         if successor is self._active:
             return
         now = self._active.estimate()

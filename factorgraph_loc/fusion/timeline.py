@@ -41,8 +41,8 @@ class Timeline(ABC):
     """The base of estimators that process measurements in the order of time. See the module."""
 
     deterministic = True
-    takes_rows = True  # several rows of odometry may arrive as one measurement
-    # the kinds of measurements that update the estimator; the rest is counted as ignored
+    takes_rows = True  # several measurements of odometry may arrive joined to one
+    # the kinds of sensors that the estimator uses; measurements of other sensors are only counted as ignored
     modalities: Container[str] = EVERY
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics, max_delay: float) -> None:
@@ -124,8 +124,8 @@ class Timeline(ABC):
         search.begin(KnownPosition(prior, self._motion))
 
     def _seek_start(self, m: Measurement, search: Tracking) -> None:
-        """Update the search for the start pose by a measurement. If the search has one clear pose then, start the estimator and
-        process all kept measurements again."""
+        """Update the search for the start pose by the measurement ``m``. If this gives one clear pose, start the estimator there
+        and process all measurements since the start again."""
         start = search.start
         if start is not None:
             start.settle()

@@ -38,21 +38,21 @@ from factors.se2 import Array
 from factors.update import Correction
 
 REFUTING = 8.0  # log-odds against a track that reject it; high, because robots are rarely carried
-BEFORE = 2.0  # s: the robot left the track at most this long before the first doubt, or before evidence of that
-# times at which the robot may have left the track have a log-likelihood within this difference of the highest
+BEFORE = 2.0  # s: the robot left the track at most this long before a sensor's first doubt or the first observation against it
+# times are possible for the departure from the track if their log-likelihood is within this difference of the highest
 UNSURE = 5.0
 NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
-CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known with variances of its position below this sum
+CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known if its variances of x and y have a smaller sum
 PROBATION = 5.0  # s; for this time after a rejection the new track is not yet reported as localized
 # Covariance of a pose from the search, as a prior (standard deviations in m, m, rad). It is large, because the same measurements
 # are also factors of a graph, and because the odometry that moved the search's particles may have failed.
 FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
-APART = 16.0  # squared Mahalanobis distance: above it a pose differs from the track
-WINDOW = 3.0  # s: observations of this duration are compared
+APART = 16.0  # squared Mahalanobis distance above which a pose of the search differs from the track
+WINDOW = 3.0  # s: the observations of the last WINDOW seconds are compared with the odometry
 ONSETS = (0.75, 1.5, 3.0)  # s: possible times since the begin or end of wheel slip
 SHARES = (0.0, 0.33, 0.67, 1.5)  # alternatives for the fraction of the reported distance that the robot has moved
-SURPRISING = 2.0  # a comparison starts if the mean of K surprises exceeds this value divided by the square root of K
-ENOUGH = 2  # a comparison needs more observations than this
+SURPRISING = 2.0  # a comparison starts if the mean of `surprise` over K observations exceeds this divided by sqrt(K)
+ENOUGH = 2  # a comparison needs more than this number of observations
 STILL, SPEED = 0.05, 0.5  # m: largest reported distance of wheels at rest; m/s: assumed speed of a carried robot
 _ANGLES = np.arange(8) * math.pi / 4.0
 # Alternatives (9, 3) for the velocity of a robot whose wheels are at rest: none, or SPEED in one of eight directions.
@@ -60,7 +60,7 @@ CARRIED = np.concatenate((np.zeros((1, 3)), SPEED * np.column_stack((np.cos(_ANG
 CLEAR = 3.0  # a comparison needs a motion of this many standard deviations of the start position
 # Log-odds above which an alternative is accepted, high because odometry is rarely wrong; largest contribution of one observation.
 RARE, MOST = 7.0, 3.0
-EVERY, HOLDS = 1.0, 1.0  # s: interval between comparisons during a slip; log-odds for the odometry that end a slip
+EVERY, HOLDS = 1.0, 1.0  # s: interval between comparisons during a slip; a slip ends at these log-odds for the odometry
 # The times [s] between which a robot was carried: the last time at its old pose (-inf if it never was there), and the first time at
 # the new pose. In between the pose is unknown, and the final trajectory has no poses. The gap in the trajectory is at least MAX_GAP
 # long, because scoring interpolates over shorter gaps.
@@ -131,11 +131,11 @@ class Tracking(Search):
 
     @property
     def doubts(self) -> bool:
-        """True if any sensor doubts the track."""
+        """True if the measurements of any sensor contradict the track (the estimated poses)."""
         return is_doubted(self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
-        """Report an observation before it is applied to a track. Sensors that can find a pose use it to check the track."""
+        """Report an observation before it corrects the estimated pose. Sensors that can find a pose use it to check the track."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
             self._looked.append(odometry.t)
@@ -145,8 +145,8 @@ class Tracking(Search):
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
-        """Store an observation after it was applied to a track, for a later search. ``evidence()``: returns its log-probability
-        given the track."""
+        """Store an observation for a later search, after it has corrected the estimated pose. ``evidence()``: returns the
+        log-probability of the observation if the estimated pose (the track) is right."""
         current = observation.at_its_time() if self._weighs else None
         if current is None or not self._is_due(sensor, odometry.t):
             return
@@ -241,7 +241,7 @@ class Tracking(Search):
 
 
 class _Compared(NamedTuple):
-    """An observation that was applied to a track, for the comparison of motions.
+    """An observation that has corrected the estimated pose, for the comparison of alternative motions.
 
     ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation as a function of the pose at its
     time, or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``: the motion
@@ -269,8 +269,8 @@ class _Compared(NamedTuple):
 
 
 class SlipMonitor:
-    """Detects from a track's observations that the odometry is wrong. It then marks the ``motion`` as unknown and adds an event to
-    the ``diagnostics``."""
+    """A detector of wrong odometry (wheel slip, carried robot), which uses the observations that corrected the pose. While the
+    odometry is wrong, it marks the ``motion`` as unknown. It adds an event to the ``diagnostics``."""
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
@@ -286,7 +286,7 @@ class SlipMonitor:
         odometry at that time. ``view``: the estimator's state before the correction.
         """
         t = odometry.t
-        # later observations will be processed again after a late one
+        # a late measurement: remove the later observations, because they will be processed again
         while self._rows and self._rows[-1].odometry.t > t:
             self._rows.pop()
         while self._rows and self._rows[0].odometry.t < t - WINDOW:
@@ -312,8 +312,9 @@ class SlipMonitor:
         return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """The log-odds that the odometry is wrong since about the time ``begin`` [s], and the exact time assumed. That is the time
-        of the first observation after ``begin`` that is not surprising. The log-odds are zero if too little is known."""
+        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the exact start time that they assume. This
+        is the time of the first observation from ``begin`` on that is not surprising. The log-odds are zero with too few
+        observations or too little motion."""
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > 1.0:
             del rows[0]
@@ -351,7 +352,7 @@ def surprise(correction: Correction) -> float:
 
 
 def is_doubted(sensors: Iterable[Sensor]) -> bool:
-    """True if one of the sensors doubts the track, or detects nothing although it should."""
+    """True if the measurements of one of the sensors contradict the track, or if it detects nothing although it should."""
     return any(sensor.suspicious_since is not None or sensor.silent for sensor in sensors)
 
 

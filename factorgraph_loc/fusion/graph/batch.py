@@ -22,8 +22,8 @@ NARROWED = 0.5  # the factor by which the scales decrease in each step
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
-    """All measurements of a graph as one problem. ``width``: a factor on the scales of robust losses. ``link_width``: that for the
-    losses of links between poses."""
+    """All measurements of a graph as one problem. ``width`` multiplies the scales of robust losses. ``link_width`` multiplies the
+    scales of the losses of links (factors between two poses, such as loop closures) instead."""
     assert graph.prior is not None
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
@@ -41,7 +41,8 @@ def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> 
 
 
 def convex_width(graph: Graph, values: Values) -> float:
-    """The factor, at least 1, on the scales of the losses of all links that makes these losses convex at ``values``."""
+    """The smallest factor, at least 1, that makes the losses of all links (such as loop closures) convex at ``values`` when it
+    multiplies their scales."""
     linked = {name: sensor for name, sensor in graph.sensors.items() if sensor.links}
     nodes = (node for k in graph.keyframes.values() for node in k.nodes if linked and node.sensor in linked)
     return max(
@@ -51,8 +52,9 @@ def convex_width(graph: Graph, values: Values) -> float:
 
 
 def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, Solution]:
-    """The problem of a graph, and the better one of two optima found from the values ``start``: directly, and by graduated
-    non-convexity. ``widest``: the initial factor on the scales of losses. With 1, and without links, only the first is computed."""
+    """Optimise a graph from the values ``start``, directly and by graduated non-convexity. Returns the problem and the better
+    optimum. ``widest``: the initial factor on the scales of the losses. If it is 1 and the graph has no loop closures, only the
+    direct optimum is computed."""
     problem = whole_problem(graph)
     best = problem.solve(start)
     width = max(widest, convex_width(graph, start))
@@ -62,12 +64,12 @@ def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, S
     while width > 1.0:
         values = whole_problem(graph, min(width, widest), width).solve(values, ITERATIONS_PER_WIDTH).values
         width *= NARROWED
-    # either of the two may be the better optimum
+    # either optimum may be the better one
     return problem, min(best, problem.solve(values), key=lambda s: s.cost)
 
 
 def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, Array]:
-    """Solve a graph with all its measurements. Sightings that are certainly false matches of their points are removed.
+    """Solve a graph with all its measurements. Observations of points that are certainly false matches are removed.
 
     ``start``: initial values of all variables. ``is_guess``: True if the initial values are rough, so that graduated non-convexity
     is needed. Returns the poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes. The estimates of all other variables
@@ -93,8 +95,8 @@ def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, 
 
 
 class AtTheEnd:
-    """A backend of a graph that solves the problem only at the end of the run. During the run it has rough estimates like those of
-    an EKF, which are the initial values."""
+    """A backend that solves the graph only at the end of the run. During the run it has rough estimates like those of an EKF,
+    which become the initial values of the solution."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
@@ -109,8 +111,8 @@ class AtTheEnd:
         newest.causal = graph.pose, graph.covariance
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Accept new factors and variables on a keyframe, which may be new. ``guess``: pose and covariance of the newest keyframe,
-        or None if ``keyframe`` is an older one."""
+        """Store the new variables of ``addition``, which were observed at ``keyframe``. ``guess``: the pose and covariance of this
+        keyframe, or None if it is not the newest keyframe."""
         self._guesses |= addition.values
         if guess is not None:
             keyframe.causal = self._graph.pose, self._graph.covariance = guess

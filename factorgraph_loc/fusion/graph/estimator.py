@@ -49,7 +49,7 @@ from factors.se2 import Array
 __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
 
 
-REPLAYED, TICK = 300, 2  # costs of one slice of a replay, and of a tick, in the units of `Sensor.work`
+REPLAYED, TICK = 300, 2  # cost of the measurements replayed at once, and of one tick, in the units of `Sensor.work`
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class _Conclusion:
 
 
 class Smoother(Timeline):
-    """Incremental factor graph (iSAM2): a window and the whole problem at the end, a fixed lag, or the full history. See above."""
+    """An incremental factor graph (iSAM2) over a window of time or over the full history. The setting ``lag`` chooses."""
 
-    # the estimator can estimate points that the map lacks, depending on the setting `landmarks`
+    # True because the setting `landmarks` can make this class estimate points that the map lacks
     estimates_points = True
 
     def __init__(self, setup: Setup, settings: SmootherSettings) -> None:
@@ -134,7 +134,8 @@ class Smoother(Timeline):
         return _learnt(end.graph, end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of all past poses, at the times of the ticks from the start on. Empty if the start was never found."""
+        """The best estimate of all poses since the start, at the ticks (the times at which a run records the pose). Empty if the
+        start pose was never found."""
         if self._graph.prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         end = self._concluded()
@@ -176,8 +177,8 @@ class Smoother(Timeline):
         return PosePrior(t, pose, FOUND) if start is None else start.facing(float(pose[2]))
 
     def _doubt(self, m: Measurement) -> None:
-        """Check whether the observations contradict the estimated poses. If they do, continue at the pose that the search has
-        found."""
+        """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do, continue at the
+        pose that the search has found."""
         graph, odometry = self._graph, self._odometry
 
         def track() -> Tracked:
@@ -195,7 +196,8 @@ class Smoother(Timeline):
             self._go_on(refuted, best)
 
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
-        """Remove the keyframes since the track became wrong, and replay their measurements, beginning at the pose ``best``."""
+        """Remove the keyframes since ``refuted.since``, when the estimated pose became wrong, and process their measurements again,
+        beginning at the pose ``best``."""
         graph, since = self._graph, refuted.since
         first = graph.newest.index + 1  # the number of the first keyframe to remove
         while first > 1 and graph.keyframes[first - 1].t >= since and self._backend.is_open(first - 2):
@@ -220,8 +222,8 @@ class Smoother(Timeline):
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
-        """The robot's pose (3,) at time ``t`` [s], from a pose ``best`` of the search at a later time and the odometry in
-        between."""
+        """The robot's pose (3,) at time ``t`` [s], computed back from the pose ``best`` that the search has found for a later time,
+        by the odometry in between."""
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
 
@@ -245,7 +247,7 @@ class Smoother(Timeline):
 
 
 class Batch(Smoother):
-    """Robust optimum over the whole log, computed once at its end. See the module."""
+    """An estimator that computes the robust optimum over the whole log, once at the end of the log. See the module."""
 
     causal = False
 

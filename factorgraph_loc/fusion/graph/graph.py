@@ -38,7 +38,7 @@ from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 STATE = len(ChainState._fields)
-NOTHING_KNOWN = np.zeros(0)  # the values of the odometry's constants if none are estimated
+NOTHING_KNOWN = np.zeros(0)  # the empty array of the odometry's estimated constants, if none are estimated
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ def jumps(guess: Guess, pose: Array) -> bool:
 class Mapper:
     """Adds points that a sensor observes and the map lacks to the graph, as variables. This base class adds nothing.
 
-    ``sensor``: the name of the sensor, "" for none. ``fewest``: the minimum number of sightings of a point in the graph.
-    ``horizon``: the number of recent keyframes that the mapper needs. ``rejected``: the message for rejected sightings.
+    ``sensor``: the name of the sensor, "" for none. ``fewest``: the minimum number of observations of a point in the graph.
+    ``horizon``: the number of recent keyframes that the mapper needs. ``rejected``: the message for rejected observations.
     ``estimates``: True if points become variables. ``knows_scale``: False if only odometry determines the scale of the points.
     """
 
@@ -129,20 +129,20 @@ class Mapper:
     knows_scale: bool = True
 
     def is_due(self, m: Any) -> bool:
-        """True if a measurement must become a keyframe."""
+        """True if a new keyframe is needed at the time of the measurement ``m``."""
         return False
 
     def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
         """Process a measurement at the newest keyframe, and add its factors and points to ``addition``. ``guess``: pose and
-        covariance of the keyframe. Returns these, corrected by the measurement."""
+        covariance of the keyframe. Returns the pose and covariance after a correction by the measurement."""
         return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:
-        """True if a node is a sighting that is certainly a false match of its point."""
+        """True if a node is an observation of a point that certainly is a false match, judged at the estimates ``values``."""
         return False
 
     def point(self, node: Node) -> int | None:
-        """The key of the point if a node is a sighting of a point, otherwise None."""
+        """The key of the point if a node is an observation of a point, otherwise None."""
         return None
 
     def leave(self, t: float) -> Sequence[int]:
@@ -185,8 +185,8 @@ class Graph:
         self.keyframes: dict[int, Keyframe] = {}  # by consecutive numbers
         self.ticks: list[TickAt] = []
         self.changes: tuple[Change, ...] = ()  # the intervals in which the robot was carried
-        self.is_anchored = False  # False while rows of odometry from before the first keyframe may still arrive
-        self._damping = 0.0  # the largest damping that covariances needed
+        self.is_anchored = False  # False while odometry from before the first keyframe may still arrive
+        self._damping = 0.0  # the largest damping that was needed so far to compute covariances
         self.t = -math.inf
         self.prior: PosePrior | None = None
         self.pose, self.covariance = np.full(3, np.nan), np.full((3, 3), np.nan)
@@ -211,7 +211,8 @@ class Graph:
         return graph
 
     def anchor(self) -> None:
-        """Set the odometry of the first keyframe, at the first measurement after a start. By then all earlier rows have arrived."""
+        """Store the integrated odometry at the first keyframe. Call this at the first measurement after a start, when all odometry
+        from before the start has arrived."""
         self.newest.odometry, self.is_anchored = self.motion.state(self.newest.t), True
 
     def append(self, keyframe: Keyframe) -> None:
@@ -219,15 +220,14 @@ class Graph:
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
-        """Remove the keyframes from number ``first`` on, and the ticks that follow these or are not before ``t`` [s]."""
+        """Remove the keyframes from number ``first`` on, the ticks after the first of them, and the ticks from ``t`` [s] on."""
         for index in range(first, self.newest.index + 1):
             del self.keyframes[index]
         self.newest = self.keyframes[first - 1]
         self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
 
     def forget(self, first: int) -> None:
-        """Delete the keyframes before number ``first``, the ticks that follow these, and the points that were not observed
-        since."""
+        """Delete the keyframes before number ``first``, the ticks between them, and the points that no later keyframe observes."""
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
@@ -257,8 +257,8 @@ class Graph:
         return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
 
     def moved(self, t: float) -> tuple[Array, Array, Array]:
-        """The newest pose (3,), predicted to time ``t`` [s] by odometry if that is later. Also returns its covariance (3, 3) in the
-        body frame, and that in the world frame."""
+        """The newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns its covariance (3, 3) twice, in
+        the body frame and in the world frame."""
         newest = self.newest
         if t <= newest.t:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
@@ -271,7 +271,7 @@ class Graph:
 
     @property
     def mapped_constants(self) -> int | None:
-        """The key of the estimated constants of the mapper's sensor, or None if there are none."""
+        """The key of the estimated constants of the sensor whose points are mapped, or None if there are none."""
         return self.keys.get(self.mapper.sensor)
 
     def recalibrated(self, increment: Increment) -> Increment:
@@ -292,8 +292,8 @@ class Graph:
         return {key: np.zeros(len(s)) for key, s in sigmas.items()}, {key: np.diag(s**2) for key, s in sigmas.items()}
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
-        """Add a landmark or a bias as a variable, and return its key. ``covariance`` (3, 3): that of the pose it was observed
-        from."""
+        """Add the landmark or bias ``new`` as a variable, and return its key. ``covariance`` (3, 3): the covariance of the pose
+        from which it was observed."""
         is_position = len(new.mean) > 1
         numbers = [index_of(key) for key in self.keys.values() if is_landmark(key) is is_position]
         first = 0 if is_position else len(self.constants)
@@ -303,12 +303,13 @@ class Graph:
         return key
 
     def node(self, keyframe: Keyframe, term: Term, sensor: str) -> Node:
-        """Convert a term of an observation to a node on a keyframe. ``sensor``: the name of the sensor."""
+        """Make a node of the graph from one term (one factor) of an observation at a keyframe. ``sensor``: the sensor's name."""
         keys = (keyframe.key, *map(self.keys.__getitem__, term.blocks))
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
     def odometry_factor(self, keyframe: Keyframe) -> tuple[Factor, tuple[int, ...]]:
-        """The odometry factor from the previous keyframe, and its keys. It has no odometry constants if the robot was carried."""
+        """The odometry factor from the previous keyframe to this one, and the keys of its variables. If the robot was carried in
+        between, the factor does not depend on the odometry's constants."""
         assert keyframe.from_previous is not None
         keys: tuple[int, ...] = (keyframe.key - 1, keyframe.key)
         if MOTION in self.keys and not keyframe.is_elsewhere:
@@ -322,8 +323,8 @@ class Graph:
         return keyframe.factor, keys
 
     def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
-        """Remove sightings that do not fit the estimate of their point, and points with too few remaining sightings. Returns True
-        if any was removed."""
+        """Remove observations in ``keyframes`` that do not fit the estimate of their point in ``values``, and points with too few
+        remaining observations. Returns True if any was removed."""
         mapper = self.mapper
         if not mapper.estimates:
             return False
@@ -343,7 +344,7 @@ class Graph:
         return True
 
     def forget_points(self) -> None:
-        """Remove points that the remaining keyframes do not determine, after keyframes were removed."""
+        """Remove points that the remaining keyframes do not determine. Call this after keyframes were removed."""
         keyframes = self.keyframes.values()
         sightings = Counter(key for k in keyframes for node in k.nodes for key in node.keys if is_point(key))
         if self.mapper.estimates:
@@ -357,15 +358,15 @@ class Graph:
             del self.values[key]  # the tilt of a removed keyframe
 
     def forget_landmarks(self, known: Collection[int]) -> None:
-        """Remove landmarks and biases that no remaining keyframe observes and no summary contains. ``known``: variables of the
-        summary of marginalised keyframes."""
+        """Remove landmarks and biases that no remaining keyframe observes. ``known``: the keys of variables on which marginalised
+        keyframes left information; these are kept."""
         observed = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
         for name, key in list(self.keys.items()):
             if name not in self.constants and key not in observed and key not in known:
                 del self.keys[name], self.values[key], self.covariances[key]
 
     def report_damping(self, damping: float) -> None:
-        """Add an event to the diagnostics if covariances needed a larger damping than before."""
+        """Add an event to the diagnostics if ``damping``, which was needed to compute covariances, is larger than ever before."""
         if damping > self._damping:
             self._damping = damping
             self.diagnostics.event(self.t, "damped", DAMPED, damping=damping)

@@ -38,21 +38,23 @@ class Incremental:
 
     def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
-        # True if factors from between keyframes wait for the next keyframe, because updates are slow when landmarks are estimated
+        # True if factors of measurements between two keyframes wait until the next keyframe, because updates of the solver are slow
+        # when landmarks are estimated
         self._waits = settings.landmarks != "known"
         self._maps = graph.mapper.estimates
         self._margin = WITH_POINTS if self._maps else MARGIN
-        # True if the final trajectory is the solution of the whole problem; the length [s] of the window, None for the full history
+        # `_is_whole`: True if the final trajectory is the solution of the whole problem. `_lag` [s]: the length of the window, or
+        # None for the full history.
         self._is_whole = settings.lag is None or settings.lag == math.inf
         self._lag = None if settings.lag == math.inf else settings.lag
         links = any(sensor.links for sensor in graph.sensors.values())
         if settings.lag is None and not (self._waits or self._maps or links):
             self._lag = LAG
-        # the time [s] for which factors may wait for an update of the solver
+        # `_solve_every` [s]: the time for which new factors may wait for the next update of the solver
         every = max((sensor.solve_every for sensor in graph.sensors.values()), default=0.0)
         defers = not self._waits and (self._lag is None or self._lag >= 2.0 * every)
         self._solve_every = every if defers else 0.0
-        # the keys of constants whose covariance sensors need during the run
+        # the keys of the constants whose covariance is computed during the run, because their sensor needs it
         self._followed = {
             graph.keys[name]
             for name, sensor in graph.sensors.items()
@@ -65,20 +67,20 @@ class Incremental:
         self._oldest = 0  # the number of the oldest keyframe that has not left the window
 
     def forget(self, until: float) -> None:
-        """Delete the keyframes before the time ``until`` [s] that have left the window. None is deleted if the whole problem is
-        solved at the end."""
+        """Delete the keyframes before the time ``until`` [s] that have left the window. If the whole problem is solved at the end,
+        all keyframes are needed and nothing is deleted."""
         graph = self._graph
         if self._is_whole or not graph.keyframes or until < next(iter(graph.keyframes.values())).t:
             return
-        # the newest keyframes are needed, because they contain sightings of points that are not yet variables
+        # the newest keyframes are needed, because they contain observations of points that are not yet variables
         last = min(graph.keyframe_before(until).index, self._oldest, graph.newest.index - graph.mapper.horizon)
         graph.forget(min(last, self._solver.oldest))  # a rebuilt solver needs the rest
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
         """The final poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes of ``graph``, a copy of the graph.
 
-        If the setting ``lag`` is a number, a pose has the estimate with which it left the window. Poses in the window have their
-        present estimate. Poses that wait for the solver have a predicted estimate. Otherwise the whole problem is solved.
+        If the setting ``lag`` is a number, a pose keeps the estimate that it had when it left the window. Poses in the window have
+        their present estimate. Poses that wait for the solver have a predicted estimate. Otherwise the whole problem is solved.
         """
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)
@@ -198,8 +200,8 @@ class Incremental:
         return value
 
     def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
-        """The estimate and covariance of a variable. ``known``: the covariance if it is already computed. ``graph``: a copy of the
-        graph whose diagnostics get the event of a damping."""
+        """The estimate and covariance of a variable. ``known``: the covariance if it is already computed. ``graph``: the copy of
+        the graph in whose diagnostics a damping of the covariance is reported; by default the graph itself."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if known is None else known
@@ -221,7 +223,7 @@ class Incremental:
         """
         assert self._lag is not None
         graph, oldest = self._graph, self._graph.keyframes[self._oldest]
-        # keyframes whose estimates are stored already leave now; storing and leaving together would take longer
+        # keyframes leave one update after their estimates are stored, because both in one update would take longer
         if not self._maps:
             window.lag = now - oldest.t + ROUNDING
         if oldest.t >= now - self._lag - self._margin:
@@ -246,7 +248,7 @@ class Incremental:
                 graph.values[key], graph.covariances[key] = self._marginal(key, marginals.get(key))
         except GTSAM_ERRORS:
             pass  # the causal estimates remain
-        first = window.oldest  # variables that a rebuilt solver needs are kept
+        first = window.oldest  # a rebuilt solver needs the variables from this keyframe on
         for key in [key for key in graph.values if is_of_keyframe(key) and index_of(key) < first]:
             del graph.values[key]
         self._forget(points, marginals)
@@ -265,8 +267,9 @@ class Incremental:
     def _start_again(self, newest: Keyframe, summary: MarginalSummary | None, *, failed: bool = False) -> None:
         """Build a new solver from the graph.
 
-        ``summary``: the information of variables that have left the window. The new solver begins with it and with all measurements
-        that it does not contain. If it is None, the solver begins with the priors. ``failed``: True if the previous solver failed.
+        ``summary``: the information of variables that have left the window. The new solver begins with this summary, and with all
+        measurements that are not part of it. If it is None, the solver begins with the priors. ``failed``: True if the previous
+        solver failed.
         Raises RunFailedError if the new solver fails.
         """
         graph, first = self._graph, 0 if summary is None else summary.oldest
@@ -299,8 +302,8 @@ class Incremental:
         return [start, *(gtsam.PriorFactorVector(key, mean, gaussian(covariances[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
-        """The time [s] of each variable of a new window, which decides when it leaves. Points get the time of the newest
-        keyframe."""
+        """The time [s] of each variable of a new window, by key. A variable leaves the window when it is older than the lag. Points
+        get the time of the newest keyframe."""
         now = keyframes[-1].t
         oldest = -math.inf if self._lag is None else now - self._lag - self._margin
         stamps = {key: now if key in self._graph.values else oldest for key in values}
@@ -321,20 +324,22 @@ class Incremental:
     def _new_solver(self, *, failed: bool = False) -> FullHistory | Window:
         """An empty solver. ``failed``: True if the previous solver failed."""
         parameters = gtsam.ISAM2Params()
-        # Cholesky fails for long dead reckoning, which is numerically indeterminate. With points it takes half the time of QR.
+        # QR is the default, because Cholesky fails in long dead reckoning, which is numerically indeterminate. With points,
+        # Cholesky is used because it takes half the time of QR.
         parameters.setFactorization("CHOLESKY" if self._maps and not failed else "QR")
-        # points move far from their initial positions, where the linearisation of their factors becomes meaningless
+        # points move far from their initial positions, so every update checks which factors to linearise again
         parameters.relinearizeSkip = 1 if self._maps else CHECKED_EVERY
         if self._lag is None:
             return FullHistory(parameters, MOVED, self._failed.append)
         parameters.findUnusedFactorSlots = True
         threshold = NEAR_POINTS if self._maps else MOVED
-        # with points, poses leave one by one, so that the linearisation points of a rebuilt window are soon final again
+        # With points, the oldest pose leaves at almost every update. In a rebuilt window, poses are then soon marginalised, and the
+        # linearisation points next to them become fixed.
         return Window(parameters, threshold, self._failed.append, self._lag + self._margin if self._maps else math.inf)
 
 
 def _is_definite(covariance: Array) -> bool:
-    """True if a covariance (D, D) is finite and has a Cholesky root."""
+    """True if a covariance (D, D) is finite and has a Cholesky factorisation."""
     try:
         return math.isfinite(np.linalg.cholesky(covariance).sum())
     except np.linalg.LinAlgError:

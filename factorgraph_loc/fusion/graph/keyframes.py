@@ -34,13 +34,13 @@ from factors.se2 import Array
 
 ITERATIONS_OF_GUESS = 1  # iterations of a correction of the newest pose before the graph is solved
 MAPPING_KEYFRAME_INTERVAL = 0.5  # s; interval between keyframes if landmarks are estimated
-LONGEST_INTERVAL = 1.0  # s; a tick becomes a keyframe after this time
+LONGEST_INTERVAL = 1.0  # s; time after which a keyframe is added even without a measurement
 
 Backend = AtTheEnd | Incremental  # solves the graph
 
 
 class _KeyframeView:
-    """The state of the graph as sensors read it, for a measurement on one keyframe.
+    """Read access to the state of the graph, for the sensor of a measurement on one keyframe.
 
     ``guess``: pose and covariance of the keyframe. ``offset``: the motion from the keyframe to the measurement, None for zero.
     ``newest``: True if the keyframe is the newest one.
@@ -91,12 +91,12 @@ class Builder:
     def __init__(self, graph: Graph, backend: Backend, search: Tracking, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
         graph.current, graph.is_open = backend.current, backend.is_open
-        # gathered observations on the newest keyframe that are not yet in the graph
+        # observations on the newest keyframe that are collected, to be added to the graph as one factor
         self._waiting: list[Observation] = []
-        self._gatherer: Sensor | None = None  # the sensor of these observations
+        self._gatherer: Sensor | None = None  # the sensor of the collected observations
 
     def pass_time(self, odometry: ChainState) -> None:
-        """Process a tick. ``odometry``: the integrated odometry at its time."""
+        """Process a tick, a time at which a run records the pose. ``odometry``: the integrated odometry at this time."""
         graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
         if t - graph.newest.t >= LONGEST_INTERVAL:
@@ -104,8 +104,8 @@ class Builder:
         graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
     def take(self, m: Measurement, odometry: ChainState) -> bool:
-        """Process a measurement. ``odometry``: the integrated odometry at its time. Returns False if it is too late and is
-        ignored."""
+        """Process a measurement. ``odometry``: the integrated odometry at its time. Returns False if the measurement is ignored,
+        because its keyframe has already left the solver."""
         graph, sensor = self._graph, self._graph.sensors[m.source]
         graph.t = max(graph.t, m.t)
         if self._needs_keyframe(m, sensor):
@@ -128,7 +128,7 @@ class Builder:
         return True
 
     def _needs_keyframe(self, m: Measurement, sensor: Sensor) -> bool:
-        """True if a keyframe must be added at the time of the measurement."""
+        """True if a new keyframe is needed at the time of the measurement ``m`` of ``sensor``."""
         since, interval = m.t - self._graph.newest.t, sensor.keyframe_every
         if not sensor.gathers and self._settings.landmarks != "known":
             interval = MAPPING_KEYFRAME_INTERVAL
@@ -136,28 +136,28 @@ class Builder:
         return since >= interval or (since > 0.0 and m.source == mapper.sensor and mapper.is_due(m))
 
     def gather(self) -> list[Node]:
-        """Convert the gathered observations on the newest keyframe to factors of the keyframe, and return these."""
+        """Convert the collected observations on the newest keyframe to factors, and add these to it. Returns the factors."""
         nodes = self.waiting() if self._waiting else []
         self._graph.newest.nodes += nodes
         self._waiting = []
         return nodes
 
     def waiting(self) -> list[Node]:
-        """The factors of the gathered observations on the newest keyframe, without adding them to the keyframe."""
+        """Convert the collected observations on the newest keyframe to factors, without adding these to the keyframe."""
         if self._gatherer is None:
             return []
         terms = self._gatherer.gathered(self._waiting)
         return [self._graph.node(self._graph.newest, term, self._gatherer.name) for term in terms]
 
     def clear(self) -> None:
-        """Discard the gathered observations, because a new track begins."""
+        """Discard the collected observations. Call this when the estimator restarts at another pose."""
         self._waiting = []
 
     def _gather_from(
         self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None, guess: Guess
     ) -> None:
-        """Correct the newest pose by the observations of a sensor that gathers, and store the observations until :meth:`gather`.
-        ``guess``: the newest pose and its covariance."""
+        """Correct the newest pose by a measurement of a sensor whose observations are collected until :meth:`gather`. ``guess``:
+        the newest pose and its covariance. ``offset``: the motion from this pose to the measurement, or None."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
@@ -172,8 +172,8 @@ class Builder:
     def _observe(
         self, sensor: Sensor, m: Measurement, view: _KeyframeView, odometry: ChainState, addition: Addition | None
     ) -> bool:
-        """Convert a measurement to observations, and add these to ``addition``, or to the gathered ones if it is None. If the
-        keyframe is the newest, each observation corrects its estimate in ``view``. Returns True if any observation was accepted."""
+        """Convert a measurement to observations, and add these to ``addition``, or collect them if ``addition`` is None. On the
+        newest keyframe, each observation also corrects the pose in ``view``. Returns True if any observation was accepted."""
         applied = False
         for observation in sensor.observe(m, view):
             if isinstance(observation, Link):
@@ -205,7 +205,7 @@ class Builder:
         return applied
 
     def _add_keyframe(self, odometry: ChainState, m: Measurement | None) -> None:
-        """Add a keyframe, with the measurement at its time if there is one."""
+        """Add a keyframe at the time of ``odometry``. ``m``: a measurement at this time to add on the keyframe, or None."""
         graph, newest, t = self._graph, self._graph.newest, odometry.t
         keyframe = Keyframe(newest.index + 1, t, *graph.motion.travelled(newest.odometry, t))
         pose, covariance, _ = graph.moved(t)
@@ -228,8 +228,8 @@ class Builder:
     ) -> Guess | None:
         """Convert a measurement to factors of ``keyframe``. Returns the pose and covariance of the keyframe, corrected by them.
 
-        ``guess``: pose and covariance of the newest keyframe, at which the graph linearises first. None if ``keyframe`` is an older
-        one. Then innovations are relative to its causal estimate, and None is returned.
+        ``guess``: the predicted pose and covariance if ``keyframe`` is the newest keyframe, otherwise None. For an older keyframe,
+        innovations are relative to its causal estimate, and None is returned. ``addition``: gets the factors.
         """
         graph, sensor = self._graph, self._graph.sensors[m.source]
         expected = keyframe.causal if guess is None else guess
@@ -244,8 +244,8 @@ class Builder:
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
-        """Add a factor on a keyframe and an earlier one. If the earlier one has left the solver, the factor is only part of the
-        final problem."""
+        """Add a link (such as a loop closure) between a keyframe and an earlier keyframe. If the earlier keyframe has left the
+        solver, the link is only part of the final problem."""
         earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
@@ -253,8 +253,8 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add a landmark to the graph, with its earlier sightings or with its prior. If the poses of most sightings have left the
-        graph, the present estimate of the landmark is the prior."""
+        """Add a landmark to the graph, with its earlier observations or with its prior. If the poses of most observations have left
+        the graph, the present estimate of the landmark is used as its prior."""
         graph = self._graph
         key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean

@@ -78,7 +78,7 @@ def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys
 
 
 def blamed(error: Exception) -> int | None:
-    """The key of the variable that an IndeterminateError or an error of GTSAM names, or None."""
+    """The key of the undetermined variable that an IndeterminateError or an error of GTSAM names. None if it names none."""
     if isinstance(error, IndeterminateError):
         return error.key
     near = _NEAR.search(str(error))
@@ -88,7 +88,8 @@ def blamed(error: Exception) -> int | None:
 def _solved(
     graph: gtsam.GaussianFactorGraph, keys: Sequence[int], *, robust: bool
 ) -> dict[int, Array] | IndeterminateError:
-    """The marginal covariances by key, or the error. ``robust``: True to use QR instead of Cholesky."""
+    """The marginal covariances of the variables ``keys`` of a linear graph, by key. If the graph cannot be solved, the error is
+    returned and not raised. ``robust``: True to use QR instead of Cholesky."""
     order = gtsam.Ordering.OrderingType.COLAMD
     marginals: dict[int, Array] = {}
     try:
@@ -115,7 +116,7 @@ def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping:
     """The graph with a prior on each variable, whose information is ``damping`` times the diagonal of the graph's information."""
     keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
     ends = np.cumsum([sizes[key] for key in keys])
-    # the last column is that of the right side
+    # the last column is the right side of the equations
     information = np.bincount(columns.astype(np.int64) - 1, values**2, int(ends[-1]) + 1)[:-1]
     out = gtsam.GaussianFactorGraph()
     out.push_back(graph)
@@ -225,7 +226,7 @@ class Chained:
 
 
 def _kind(factor: Factor, keys: tuple[int, ...]) -> Hashable:
-    """A key that is equal for factors that are linearised by one call. None for a factor that is linearised separately."""
+    """A key for grouping: factors with equal keys are linearised by one call. None for a factor that is linearised separately."""
     kind = cast(Stackable, factor).kind if _is_stackable(type(factor)) else None
     return None if kind is None else (type(factor), kind, *[key for key in keys if not is_pose(key)])
 

@@ -22,12 +22,12 @@ class GraphSettings(FileModel):
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
-    """Convert ``all`` to infinity, and check the bounds of other values."""
+    """Convert the value ``all`` of the setting ``lag`` to infinity, and check other values by ``bounded``."""
     return math.inf if value in ("all", math.inf) else bounded(value)
 
 
 def _written(lag: float | None) -> float | str | None:
-    """The value of ``lag`` in files: ``all`` for infinity."""
+    """The value of the setting ``lag`` as it is written to files. Infinity is written as ``all``."""
     return "all" if lag == math.inf else lag
 
 

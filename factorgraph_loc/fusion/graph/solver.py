@@ -44,14 +44,14 @@ from factors.graph import (
 )
 from factors.se2 import Array
 
-# A pose may stay this much longer [s] in a window than the lag, so that several estimates are read together. The second value is
-# for windows with points, which are large.
+# A pose may stay this much longer [s] in a window than the lag. Several poses then leave together, and their estimates are computed
+# at once. The second value is for windows with points, which are large.
 MARGIN, WITH_POINTS = 2.0, 1.0
 FOREVER = 1e300  # s; with this lag only variables with the time minus infinity leave a window
 
 
 class FullHistory:
-    """An incremental solver that keeps its whole graph. It is unusable after an error of GTSAM in any method.
+    """An incremental solver that keeps its whole graph. After a method raises an error of GTSAM, discard the solver.
 
     ``threshold``: the change of a variable, in m, rad or the units of constants, after which it is linearised again.
     ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
@@ -116,8 +116,8 @@ class FullHistory:
         return isam.getFactorsUnsafe().linearize(at), sizes
 
 
-# A copy of a window's state: all factors, the linearisation points of iSAM2, those of a new window, and the slots of the
-# measurements' factors.
+# A copy of a window's state: all factors, the linearisation points of iSAM2, the linearisation points for a rebuilt window, and the
+# indices of the measurements' factors.
 _State = tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Values, frozenset[int]]
 
 
@@ -134,7 +134,7 @@ class Window(FullHistory):
         self.lag = lag
         self._solver = gtsam.IncrementalFixedLagSmoother(lag, parameters)
         self._stamps: dict[int, float] = {}  # s; the time of each variable that may leave
-        # the state at the begin or after the last marginalisation
+        # the state after the first update or after the last marginalisation
         self._left: _State = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}, frozenset()
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
@@ -163,7 +163,7 @@ class Window(FullHistory):
                 graph.add(factor)
                 start.insert(key, np.zeros(1))
             stamps = {**stamps, **dict.fromkeys(holding, -math.inf)}
-        # never together with the variables of `_holding`: GTSAM may fail then
+        # In the update that adds the auxiliary variables of `_holding`, no variable of the window leaves: GTSAM could fail.
         elif min(self._stamps.values()) < now - self.lag:
             leaving = [key for key, t in self._stamps.items() if t < now - self.lag]
             stamps = {**stamps, **dict.fromkeys(filter(is_constant, self._ours.at), now)}
@@ -213,9 +213,9 @@ class Window(FullHistory):
 def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[int, gtsam.NonlinearFactor]:
     """Auxiliary factors that make iSAM2 hold the linearisation points of the variables of marginal ``factors``.
 
-    Each is a factor without information between one of these variables and a new auxiliary variable, which leaves immediately.
-    iSAM2 never moves the linearisation point of a variable next to one that has left. Returns the factors by the key of the
-    auxiliary variable. ``values``: the values of the variables.
+    Each auxiliary factor connects one of these variables with a new auxiliary variable, and has no information. The auxiliary
+    variable is marginalised immediately. iSAM2 never moves the linearisation point of a variable next to a marginalised one.
+    Returns the auxiliary factors by the key of their auxiliary variable. ``values``: the values of the variables.
     """
     marginal = (factor.keys() for factor in factors if isinstance(factor, gtsam.LinearContainerFactor))
     fixed = dict.fromkeys(key for keys in marginal for key in keys)
@@ -230,16 +230,17 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
 class LinearFactors:
     """The factors of measurements in a solver, and the linearisation points of the solver's variables.
 
-    ``threshold``: variables that have changed by this much are linearised again. ``skip``: this is checked at every ``skip``-th
-    update.
-    ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
+    ``threshold``: variables that have changed by more are linearised again. ``skip``: the number of updates between two checks of
+    the changes. ``on_failure``: called with the reason if a factor cannot be linearised. This factor is left out.
+    A slot is the index of a factor in the solver's graph.
     """
 
     def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
         self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
         self._updates = 0
         self.at: Values = {}  # the linearisation point of each variable
-        self._held: Values = {}  # the linearisation points that iSAM2 does not move, after a common translation
+        # the linearisation points that iSAM2 does not move, all shifted by the common translation of the estimates
+        self._held: Values = {}
         # the factors on each variable, by their identity
         self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)
         self._slots: set[int] = set()  # the slots of the factors in the solver
@@ -284,8 +285,8 @@ class LinearFactors:
         return graph, removed
 
     def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
-        """A linearised factor on variables of which at least one is held, with its linearisation point. Its Jacobian is corrected
-        so that it agrees with the marginal factors, see the module."""
+        """Correct the Jacobian of a factor that is ``linearized`` at a held variable, so that it agrees with the marginal factors
+        (see the module). Returns the factor with its linearisation point."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
         if sum(map(is_place, keys)) > 1:  # a factor on one position has absolute information, which must not be removed
@@ -300,7 +301,7 @@ class LinearFactors:
             self._slots.add(linear.slot)
 
     def forget(self, key: int) -> None:
-        """Delete what is stored of a variable that has left the solver, and of all factors on it."""
+        """Delete the stored data of a variable and of all factors on it. Call this after the variable has left the solver."""
         del self.at[key]
         self._held.pop(key, None)
         for linear in self._on.pop(key, {}).values():
@@ -311,7 +312,7 @@ class LinearFactors:
 
     @property
     def framed(self) -> Values:
-        """The linearisation points for a new solver. The variables of marginal factors keep their relative positions."""
+        """The linearisation points for a new solver. Variables of marginal factors keep their positions relative to each other."""
         return self.at | self._held
 
     @property
@@ -336,7 +337,7 @@ class LinearFactors:
     def _followed(self, estimates: Values) -> list[int]:
         """The held variables whose factors must be linearised again. ``estimates``: the present estimates of all held variables.
 
-        Empty if all are poses, because in a known map the odometry factors are GTSAM's own and are not replaced.
+        Empty if all held variables are poses. Then the map is known, and their odometry factors are never linearised again.
         """
         if all(map(is_pose, estimates)):
             return []

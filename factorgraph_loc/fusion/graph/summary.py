@@ -25,8 +25,8 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class MarginalSummary:
-    """The information of a window without its own measurements. ``factors``: marginal factors and priors. ``keys``: the keys of all
-    variables of the window. ``at``: their linearisation points."""
+    """The information that marginalised variables and priors give on a window, without the measurements in the window. ``factors``:
+    marginal factors and priors. ``keys``: the keys of all variables of the window. ``at``: their linearisation points."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     keys: frozenset[int]
@@ -45,7 +45,7 @@ class MarginalSummary:
         values = to_gtsam(at)
 
         def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
-            """The marginal factor with linearisation points. It has none in iSAM2, which never moves those of its variables."""
+            """Move a marginal factor from the linearisation points of iSAM2 to those of the summary, and store these in it."""
             return gtsam.LinearContainerFactor(
                 gtsam.LinearContainerFactor(factor.factor(), points).linearize(values), values
             )
@@ -61,12 +61,12 @@ class MarginalSummary:
         return oldest_pose(self.keys)
 
     def before_pose(self, pose: int) -> MarginalSummary:
-        """The summary without the poses from index ``pose`` on, because new poses will have their keys."""
+        """The summary without the poses from index ``pose`` on. Call this before new poses get the keys of removed poses."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
-        """The factors on the variables ``present``. All other variables are marginalised out."""
+        """The factors of the summary on the variables with the keys ``present``. All other variables are marginalised out."""
         kept: list[gtsam.NonlinearFactor] = []
         linear, gone, at = gtsam.GaussianFactorGraph(), set[int](), to_gtsam(self.at)
         for factor in self.factors:
