@@ -1,15 +1,14 @@
-"""Faults of cameras and images, one at a time: their effect on the errors, the messages about them, and the recovery."""
+"""Faults of cameras and images, one at a time: their effect on the errors, and the recovery."""
 
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from benchmarking.report import NOTHING, Options, Report, pooled
+from benchmarking.report import Options, Report, pooled
 
 from camera_benchmark.drives import Drive, log_of, map_of, with_map
 from camera_benchmark.faulty import FAULTS, Given
@@ -34,8 +33,6 @@ CONFIGS = {
     "smoother, rfid, camera": RunConfig("smoother", sensors=BOTH),
     NO_MAP: RunConfig("smoother", sensors=CAMERA),
 }
-REPORTED = "smoother, camera"
-SHOWN = 110  # characters of a message
 
 
 def section(options: Options) -> Report:
@@ -65,14 +62,6 @@ def section(options: Options) -> Report:
         for fault, found in runs.items()
     ]
     report.table(("fault", *CONFIGS), rows)
-    report.say(
-        f"The next table has warnings, events and changed diagnostics of the run *{REPORTED}* in the first office. "
-        "*NIS*: normalised "
-        "innovation squared of the camera, per degree of freedom. *Rejected*: number of rejected features."
-    )
-    right = runs.get(RIGHT, [{}])[0].get(REPORTED)
-    reports = [(fault, said(found[0][REPORTED], right or found[0][REPORTED])) for fault, found in runs.items()]
-    report.table(("fault", "reported"), [row for row in reports if row[1] != NOTHING])
     return report
 
 
@@ -111,28 +100,3 @@ def at_end(runs: Sequence[Attempt]) -> float:
     """Return the causal RMSE [m] of the last part of the runs, that of the worst run."""
     causal = [one.errors.causal for one in runs if one.errors is not None]
     return max((one.where(one.t > one.t[-1] - AFTERWARDS).position_rmse() for one in causal), default=0.0)
-
-
-def said(one: Attempt, right: Attempt) -> str:
-    """Return the messages of the run ``one`` that do not occur in ``right``, the run without the fault."""
-    if one.failure:
-        return short(one.failure)
-    new = [warning for warning in one.warnings if warning not in right.warnings]
-    parts = [short(str(replace(warning, sentence=warning.sentence.removeprefix("{log}: ")))) for warning in new]
-    events = Counter(text for text in one.events if text not in right.events)
-    parts += [short(text) + (f" ({times} times)" if times > 1 else "") for text, times in events.items()]
-    for name, key in (("NIS", "nis.camera.median_ratio"), ("rejected", "rejected.total"), ("late", "late.total")):
-        now, before = one.figures.get(key), right.figures.get(key)
-        if now is not None and before is not None and abs(now - before) > 0.2 * abs(before):
-            parts.append(f"{name} {before:.3g} → {now:.3g}")
-    for key, value in one.figures.items():
-        if key.startswith("learnt.camera.") and key.endswith(".value"):
-            sigma = one.figures[key.replace(".value", ".sigma")]
-            parts.append(f"{key.removeprefix('learnt.').removesuffix('.value')} {value:.4f} ± {sigma:.4f}")
-    return "; ".join(parts) or NOTHING
-
-
-def short(text: str) -> str:
-    text = text.replace("|", "/")
-    text = re.sub(r"/[^ ]*/", "", text)  # folders
-    return text if len(text) <= SHOWN else text[: SHOWN - 3] + "..."

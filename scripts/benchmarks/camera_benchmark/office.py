@@ -8,7 +8,7 @@ from pathlib import Path
 from benchmarking.report import ACCURACY, NOTHING, Options, Report, accuracy_cells
 
 from camera_benchmark.drives import MAP_DURATION, MAP_RATE, RATE, TAGS, Drive, log_of, map_of, with_map
-from camera_benchmark.report import Attempt, Attempts, attempts, failures, ratio_cell, succeeded
+from camera_benchmark.report import Attempt, Attempts, attempts, failures, succeeded
 from factorgraph_loc.experiments.run import RunConfig
 
 SEEDS = 20
@@ -58,7 +58,6 @@ def section(options: Options) -> Report:
             f"images/s, whose poses have errors of 0.02 m and 0.01 rad. Targets for final errors: {TARGETS}."
         )
     accuracy(report, found)
-    comparisons(report, found)
     return report
 
 
@@ -70,19 +69,6 @@ def accuracy(report: Report, found: Attempts) -> None:
             name = label.partition(",")[0]
             rows.append((name, NAMES[config.sensors or ()], str(len(runs)), *accuracy_cells(runs)))
     report.table(("estimator", "sensors", "runs", *ACCURACY), rows)
-
-
-def comparisons(report: Report, found: Attempts) -> None:
-    report.say(
-        "*Ratio*: final position RMSE, divided by that of the smoother with all sensors. In brackets: 95 % interval over offices. "
-        "*Largest*: ratio of one office."
-    )
-    rows = []
-    for label in (*CONFIGS, *SLOW):
-        if label == BEST or not succeeded(found, label):
-            continue
-        rows.append((label, *ratio_cell(found, label, BEST, "final")))
-    report.table(("run", "ratio (95 %)", "largest"), rows)
 
 
 def localized(drive: Drive, folder: Path, configs: Mapping[str, RunConfig]) -> tuple[dict[str, Attempt], int]:

@@ -6,29 +6,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from benchmarking.ensemble import RunErrors, run_errors
-from benchmarking.report import NOTHING, Report, ratio_cells
+from benchmarking.report import Report
 
 from factorgraph_loc.errors import FglocError
 from factorgraph_loc.evaluation.metrics import score
 from factorgraph_loc.experiments.run import RunConfig, run
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.text import Notice
 
 
 @dataclass(frozen=True)
 class Attempt:
     """The outcome of a run.
 
-    ``errors``: None if the run failed. ``figures``: its scores (:func:`factorgraph_loc.evaluation.metrics.score`). ``events``:
-    the texts of events, without times. ``failure``: the error message of a failed run, otherwise empty.
+    ``errors``: None if the run failed. ``figures``: its scores (:func:`factorgraph_loc.evaluation.metrics.score`).
+    ``failure``: the error message of a failed run, otherwise empty.
     """
 
     errors: RunErrors | None
     figures: Mapping[str, Any]
-    warnings: tuple[Notice, ...] = ()
-    events: tuple[str, ...] = ()
     failure: str = ""
 
 
@@ -43,8 +39,7 @@ def attempt(log: Log, config: RunConfig) -> Attempt:
         return Attempt(None, {}, failure=str(error))
     except Exception as error:
         return Attempt(None, {}, failure=repr(error))
-    events = tuple(f"{e.kind}: {e.fields['why']}" if "why" in e.fields else str(e) for e in result.diagnostics.events)
-    return Attempt(run_errors(result, log), score(result, log), result.warnings, events)
+    return Attempt(run_errors(result, log), score(result, log))
 
 
 def attempts(log: Log, configs: Mapping[str, RunConfig]) -> dict[str, Attempt]:
@@ -64,14 +59,3 @@ def succeeded(found: Attempts, label: str) -> dict[int, RunErrors]:
         for seed, runs in sorted(found.items())
         if label in runs and runs[label].errors is not None
     }
-
-
-def ratio_cell(found: Attempts, label: str, to: str, kind: str) -> tuple[str, str]:
-    """Return two cells: the pooled position RMSE of the runs ``label``, divided by that of the runs ``to``, with its interval;
-    and the largest ratio of a single log. ``kind``: "causal" or "final"."""
-    a, b = succeeded(found, label), succeeded(found, to)
-    both = sorted(a.keys() & b.keys())
-    first, second = ([getattr(of[seed], kind) for seed in both] for of in (a, b))
-    if not both or not all(np.isfinite(one.position).any() for one in (*first, *second)):
-        return NOTHING, NOTHING
-    return ratio_cells(first, second)

@@ -63,23 +63,19 @@ def section(options: Options) -> Report:
     if options.data_root is None:
         raise InputError("sevenscenes: expected --data-root with a folder sevenscenes")
     log, cameras = read(options.data_root / "sevenscenes")
-    located_rows, map_rows = [], []
+    rows = []
     for feature in EXTRACTORS:
         frames = frames_of(with_features(log, FrontendSettings(feature=feature, count=COUNT))[0])[1]
         made = mapped([frames[i] for i in MAPPED], cameras[MAPPED])
-        map_rows.append((feature, *map_cells(made)))
         for query, numbers in QUERIES.items():
             errors = errors_of(made, [frames[i] for i in numbers], cameras[numbers])
-            located_rows.append((feature, query, *errors.cells()))
+            rows.append((feature, query, *errors.cells()))
     report.say(
         f"Each image has {COUNT} features. Errors are medians and 90th percentiles (p90). *Located*: errors within {NEAR} m and "
         f"{TURNED:.0f} degrees."
     )
     heads = ("located", "position [m]", "angle [rad]", "p90 [m]", "p90 [rad]")
-    report.table(("feature", "images", *heads), located_rows)
-    report.say("The next table describes the maps, made of images 0, 2, ... 198.")
-    heads = ("points", "observations", "residual RMS [px]", "median [px]", "parallax [rad]", "sigma [m]")
-    report.table(("feature", *heads), map_rows)
+    report.table(("feature", "images", *heads), rows)
     return report
 
 
@@ -132,9 +128,3 @@ def camera_of(associator: Associator, made: MadePoints, frame: CameraFrame) -> t
         camera = better.camera
         position, rotation, covariance = camera.position, camera.rotation, camera.covariance
     return position, rotation
-
-
-def map_cells(made: MadePoints) -> tuple[str, ...]:
-    told = made.report
-    counts = str(told.points), str(told.observations)
-    return *counts, f"{told.rms:.2f}", f"{told.mad:.2f}", f"{told.parallax:.3f}", f"{told.sigma:.3f}"

@@ -30,7 +30,6 @@ def configs(seen: str) -> dict[str, RunConfig]:
         "dead_reckoning": RunConfig("dead_reckoning", sensors=ODOMETRY),
         "smoother": RunConfig("smoother", NO_MAP, (*ODOMETRY, seen)),
         "smoother of 10 s": RunConfig("smoother", {**NO_MAP, "lag": 10.0}, (*ODOMETRY, seen)),
-        "batch": RunConfig("batch", NO_MAP, (*ODOMETRY, seen)),
         "monoslam": RunConfig("monoslam", NO_MAP, (*ODOMETRY, seen)),
         "smoother, with tags": RunConfig("smoother", NO_MAP, (*ODOMETRY, "rfid", seen)),
     }
