@@ -17,7 +17,7 @@ from factors.gaussian import inverse, product, product_by_transpose, put
 from factors.se2 import Array, Integers
 
 POSE = 3
-LEAST = 1e-11  # if elimination leaves a smaller fraction of a diagonal element, the element is a rounding error
+LEAST = 1e-11  # if elimination reduces a diagonal element to a smaller fraction, the rest counts as a rounding error
 
 # The normal equations as four blocks of the information matrix, two of which contain the gradient in their last column:
 # - each pose with itself (N, 3, 3);
@@ -29,7 +29,8 @@ System = tuple[Array, Array, Array, Array]
 
 @compiled
 def normal(count: int, first: Integers, jacobian: Array, residual: Array) -> System:
-    """The normal equations of ``count`` poses, from ``first`` (M,), ``jacobian`` (M, 6 + P) and ``residual`` (M,)."""
+    """The normal equations of ``count`` poses and P parameters, from M residuals. ``first`` (M,): the number of the first pose that
+    each residual depends on. ``jacobian`` (M, 6 + P): derivatives by this pose, by the next pose, and by the parameters."""
     shared = jacobian.shape[1] - 2 * POSE
     own, coupling = np.zeros((count, POSE, POSE)), np.zeros((count, POSE, POSE))
     side, corner = np.zeros((count, POSE, shared + 1)), np.zeros((shared + 1, shared + 1))
@@ -84,7 +85,7 @@ def _inverted(block: Array, out: Array) -> bool:
 
 @compiled
 def _subtract(left: Array, right: Array, out: Array) -> None:
-    """Subtract the transpose of ``left`` (3, C) times ``right`` (3, D) from ``out`` (C, D)."""
+    """Subtract the matrix product of the transpose of ``left`` (3, C) and ``right`` (3, D) from ``out`` (C, D), in place."""
     for a in range(POSE):
         for j in range(left.shape[1]):
             for k in range(right.shape[1]):

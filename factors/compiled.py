@@ -40,7 +40,7 @@ def compiled(function: Any = None, /, **options: Any) -> Any:
 
 
 def _compiled(function: Any, options: dict[str, Any]) -> Any:
-    # without the wrapper for calls from C, which numba would compile too and which nobody needs
+    # no wrapper for calls from C: numba would compile it too, and nobody calls the functions from C
     made = numba.njit(**{"no_cfunc_wrapper": True, **options})(function)
     with suppress(RuntimeError):  # no folder for the cache is writable
         made._cache = _Shared(function)  # the option `cache=True` does the same with numba's own class

@@ -34,7 +34,7 @@ Values = dict[int, Array]
 GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)  # all exceptions that GTSAM raises
 
 _POSE, _TILT, _POINT, _LANDMARK = ord("x"), ord("t"), ord("p"), ord("l")
-_CHARACTER = 56  # bits of a key below its character
+_CHARACTER = 56  # number of bits of a key below the character, which denotes the kind of variable
 
 
 def pose_key(index: int) -> int:
@@ -63,7 +63,8 @@ def point_key(index: int) -> int:
 
 
 def leaving_key(index: int) -> int:
-    """The key of auxiliary variable number ``index``, which is added to a fixed-lag smoother only to be marginalised at once."""
+    """The key of auxiliary variable number ``index``. A fixed-lag smoother marginalises such a variable in the update that adds
+    it."""
     return int(gtsam.symbol("q", index))
 
 
@@ -113,8 +114,8 @@ class Factor(Protocol):
 
 
 class Stack(Protocol):
-    """Many factors of one kind that are linearised by one call, for speed. Each depends on one of N poses or on two consecutive
-    ones, and on some of P parameters of the graph, such as sensor constants."""
+    """Many factors of one kind that are linearised by one call, for speed. Each factor depends on one of N poses or on two
+    consecutive poses, and on some of P parameters of the graph, such as sensor constants."""
 
     rows: int
 
@@ -137,8 +138,8 @@ class Stackable(Factor, Protocol):
 
     @property
     def kind(self) -> Hashable:
-        """A key that is equal for factors that can be in one stack, given equal type and parameters. None if the factor must be
-        linearised alone."""
+        """A key for grouping: factors of one class with equal ``kind`` and on equal parameters can be in one stack. None if the
+        factor must be linearised alone."""
 
     def stack(self, factors: Sequence[Any], numbers: Sequence[int], column: int) -> Stack:
         """Combine ``factors`` of this type and kind.
@@ -166,8 +167,8 @@ def jacobian_factors(
     ``on_failure``: is called with the reason if a residual or Jacobian is not finite or has a wrong shape. The linear factor is
     then zero. If ``on_failure`` is None, nothing is checked.
 
-    Factors with equal values of an attribute ``alike`` are linearised together by ``linearize_all`` of their class, for speed. That
-    returns residuals (N, m) and a Jacobian (N, m, d) for each variable. Such factors are never checked.
+    Some factors have an attribute ``alike``. Those with equal values of it are linearised together by ``linearize_all`` of their
+    class, for speed. It returns residuals (N, m) and a Jacobian (N, m, d) for each variable. These factors are never checked.
     """
     out: list[Any] = []
     alike: defaultdict[Hashable, list[int]] = defaultdict(list)
@@ -326,7 +327,7 @@ def _whitened(lower: Array, vector: Array, out: Array) -> float:
 
 @compiled(error_model="numpy")
 def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
-    """:func:`compressed` of contiguous arrays."""
+    """The compiled part of :func:`compressed`. The arrays must be contiguous."""
     size, curvature, trace = len(gradient), information.copy(), 0.0
     residual, jacobian = np.empty(size + 1), np.zeros((size + 1, size))
     for i in range(size):

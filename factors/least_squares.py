@@ -14,7 +14,7 @@ import numpy as np
 from factors.se2 import Array, Integers
 
 DAMPING, MAX_DAMPING = 1e-3, 1e8
-LEAST = 1e-9  # minimum of a diagonal element of the curvature, for directions that the problem does not determine
+LEAST = 1e-9  # minimum of a diagonal element of the curvature, because the cost may not depend on some directions
 # Limits of `descended`. The gain is relative to the cost; the step is in m, rad or the units of other variables.
 MAX_ITERATIONS, CONVERGED_GAIN, CONVERGED_STEP, INITIAL_DAMPING = 100, 1e-6, 1e-6, 1e-8
 State = TypeVar("State")

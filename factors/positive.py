@@ -17,7 +17,7 @@ from factors.se2 import Array
 
 LEAST = 1e-12  # minimum eigenvalue of an invertible correlation matrix
 CLEAR = 1e-9  # a correlation matrix with a larger determinant is certainly invertible
-SKEW = 1e-6  # largest asymmetry of a correlation matrix that rounding explains
+SKEW = 1e-6  # largest asymmetry of a correlation matrix that counts as a rounding error
 
 
 def nearest(covariances: Array) -> Array:
@@ -62,8 +62,9 @@ def is_clear(covariance: Array) -> bool:
 
 
 def whitener(covariances: Array) -> Array:
-    """Matrices W (..., D, D) that whiten errors with these covariances (..., D, D): ``W covariance W^T`` is the identity. They are
-    the inverses of the lower Cholesky roots, or eigenvector matrices with raised eigenvalues where a root does not exist."""
+    """Matrices W (..., D, D) that whiten errors with these covariances (..., D, D): ``W covariance W^T`` is the identity. W is the
+    inverse of the lower Cholesky root. If any root does not exist, all W are computed from eigenvalues, after raising small ones.
+    """
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
     except np.linalg.LinAlgError:
@@ -139,7 +140,7 @@ def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
 
 
 def _whitener(covariances: Array) -> Array:
-    """Whitening matrices (..., D, D) from the raised eigenvalues of the correlation matrices."""
+    """Compute :func:`whitener` from the eigenvalues of the correlation matrices. Eigenvalues below :data:`LEAST` are raised."""
     sigmas, values, vectors = _parts(covariances)
     return np.asarray(np.swapaxes(vectors / np.sqrt(values)[..., None, :], -1, -2) / sigmas[..., None, :])
 

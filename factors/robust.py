@@ -18,19 +18,21 @@ Squared = TypeVar("Squared", float, Array)
 
 @register_jitable(inline="always")
 def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
-    """The loss of Geman and McClure (1985). It is at most ``scale^2 / 2``, so that gross outliers have no influence."""
+    """The loss of Geman and McClure (1985) for ``squared`` whitened residuals. It is at most ``scale^2 / 2``, so that gross
+    outliers have no influence. ``scale``: in standard deviations."""
     return 0.5 * squared / (1.0 + squared / scale**2)
 
 
 @register_jitable(inline="always")
 def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
-    """The weight of :func:`geman_mcclure_loss`."""
+    """The factor, at most 1, of ``squared`` residuals in iteratively reweighted least squares for :func:`geman_mcclure_loss`."""
     return (1.0 + squared / scale**2) ** -2
 
 
 @register_jitable(inline="always")
 def huber_loss(squared: Squared, scale: float) -> Squared:
-    """The loss of Huber (1964). It is linear in the residual beyond ``scale``."""
+    """The loss of Huber (1964) for ``squared`` whitened residuals. It is linear in the residual beyond ``scale`` standard
+    deviations."""
     size = np.sqrt(squared)
     inner = np.minimum(size, scale)
     loss: Squared = inner * (size - 0.5 * inner)
@@ -39,6 +41,6 @@ def huber_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_weight(squared: Squared, scale: float) -> Squared:
-    """The weight of :func:`huber_loss`."""
+    """The factor, at most 1, of ``squared`` residuals in iteratively reweighted least squares for :func:`huber_loss`."""
     weight: Squared = scale / np.maximum(np.sqrt(squared), scale)
     return weight

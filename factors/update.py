@@ -106,7 +106,8 @@ def _iterated(
     dof: int,
     converged: float,
 ) -> Correction:
-    """The iterations of :func:`update_state`. ``first_solve`` solves without tempering, ``solve`` with it."""
+    """Run the iterations of :func:`update_state`. ``solve``: solves one linearised update. ``first_solve``: the same without the
+    tempering exponent."""
     zero = np.zeros(len(covariance))
     # numba would compile `normalised` and `inform` again for another memory order
     residual, blocks = map(np.ascontiguousarray, linearize(zero))
@@ -132,7 +133,7 @@ def _iterated(
 
 
 def _informed(prior: Array) -> _Solver:
-    """A solver in information form. ``prior`` (S, S): the information of the prediction."""
+    """Make a solver of linearised updates in information form. ``prior`` (S, S): the inverse covariance of the prediction."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         information = prior.copy()
@@ -144,8 +145,8 @@ def _informed(prior: Array) -> _Solver:
 
 
 def _rooted(root: Array) -> _Solver:
-    """A solver in square-root form, whose covariance is always positive definite. ``root`` (S, S): lower Cholesky root of the
-    covariance of the prediction."""
+    """Make a solver of linearised updates in square-root form, whose covariance is always positive definite. ``root`` (S, S): lower
+    Cholesky root of the covariance of the prediction."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size, scale = len(at), np.sqrt(np.repeat(weight, blocks.shape[1]))

@@ -25,7 +25,7 @@ from factors.sighting import delayed
 from factors.update import CONVERGED, Correction, update_state
 
 TILTS = 2  # the number of errors that all points of an image have in common: roll and pitch of the robot
-# Arguments of compiled code without an offset, without a covariance of the offset, and with exact points.
+# Arguments of compiled code if there is no offset, if the offset has no covariance, and if the points are exact.
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 
@@ -64,7 +64,7 @@ class ReprojectionFactor:
         return not self.estimated and not self.moved_by
 
     def packed(self) -> pixel_kernels.PackedImage:
-        """The factor as an argument of compiled code. The factor must depend on the pose only."""
+        """The fields of the factor as a tuple, for compiled code. The factor must depend on the pose only."""
         model, offset, noise, covariances = self.model, self.offset, self.offset_covariance, self.point_covariances
         return pixel_kernels.PackedImage(
             lens_of(model),
@@ -202,8 +202,8 @@ def image_update(
 
 
 def turns(estimated: tuple[int, ...], changes: Array) -> Array:
-    """The Jacobian (3, 3) of the camera's rotation, as a perturbation about the robot's axes, by the corrections of roll, pitch and
-    yaw. It is the left Jacobian of SO(3), which equals the right Jacobian of the opposite rotation.
+    """The Jacobian (3, 3) of the camera's rotation by the estimated corrections of its roll, pitch and yaw. The rotation is a
+    perturbation about the robot's axes. Computed as the left Jacobian of SO(3), the right Jacobian of the opposite rotation.
 
     ``changes`` (P,): corrections of the constants with indices ``estimated`` in :data:`PARAMETERS`.
     """

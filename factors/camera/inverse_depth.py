@@ -22,8 +22,8 @@ LINEAR = 0.1  # below this linearity index, x, y, z of a point are nearly Gaussi
 
 
 def directions(rays: Array) -> tuple[Array, Array]:
-    """The directions of ``rays`` (K, 6) as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and
-    elevation."""
+    """The directions of ``rays`` (K, 6) as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and elevation.
+    A ray is x, y, z of its start, azimuth, elevation, and the inverse depth of the point on it."""
     azimuth, elevation = rays[:, 3], rays[:, 4]
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     by_angles = np.zeros((len(rays), 3, 2))
@@ -42,8 +42,8 @@ def turned(angles: Array) -> Array:
 
 
 def positions(rays: Array) -> tuple[Array, Array]:
-    """The positions (K, 3) in the world of points given as ``rays`` (K, 6), and their Jacobian (K, 3, 6) by the rays. The inverse
-    depths must be positive."""
+    """The positions (K, 3) in the world of points given as ``rays`` (K, 6), and their Jacobian (K, 3, 6) by the rays. A ray is
+    x, y, z of its start, azimuth, elevation, and inverse depth, which must be positive."""
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5]
     jacobian = np.zeros((len(rays), 3, SIZE))
@@ -54,8 +54,8 @@ def positions(rays: Array) -> tuple[Array, Array]:
 
 
 def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array) -> tuple[Array, Array, Array]:
-    """Predict the pixels of points given as ``rays`` (K, 6), in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the
-    world.
+    """Predict the pixels of points in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world. The points are given as
+    ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, inverse depth.
 
     Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6), as in
     :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6). A pixel depends only on the direction from the
@@ -78,10 +78,10 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
 def begin(
     model: CameraModel, position: Array, rotation: Array, pixel: Array, inverse_depth: float
 ) -> tuple[Array, Array, Array]:
-    """Initialise a ray from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m] (section IV).
+    """Initialise the ray of a point from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m] (section IV).
 
-    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,) and its Jacobians by the camera's
-    perturbation (6, 6), and by the pixel and the inverse depth (6, 3).
+    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,) (camera position, azimuth,
+    elevation, inverse depth) and its Jacobians by the camera's perturbation (6, 6), and by pixel and inverse depth (6, 3).
     """
     (local,) = rays(model, pixel[None])
     _, _, by_local = linearize_in_space(model, np.zeros(3), np.eye(3), local[None])
@@ -108,8 +108,9 @@ def begin(
 def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
     """The linearity index (K,) of ``rays`` (K, 6) for a camera at ``position`` (3,) (section VI).
 
-    ``sigmas`` (K,): standard deviations of the inverse depths. If the index is below :data:`LINEAR`, the point's x, y, z are nearly
-    Gaussian, and can replace the ray. The index is infinite if the inverse depth is not positive.
+    A ray is x, y, z of its start, azimuth, elevation, and inverse depth. ``sigmas`` (K,): standard deviations of the inverse
+    depths. If the index is below :data:`LINEAR`, the point's x, y, z are nearly Gaussian and can replace the ray. The index is
+    infinite if the inverse depth is not positive.
     """
     inverse = rays[:, 5]
     index = np.full(len(rays), np.inf)

@@ -359,7 +359,7 @@ def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_
 
 @compiled(error_model="numpy")
 def _normalised(log: Array) -> Array:
-    """Weights with the sum 1 from log weights."""
+    """Convert log-weights to weights with the sum 1."""
     weights: Array = np.exp(log - log.max())
     weights /= weights.sum()
     return weights

@@ -53,12 +53,12 @@ TWIST_TIME = 0.1  # s; a velocity is the mean over this time
 class OdometryChain:
     """The integrated odometry of a run. Add rows (odometry measurements), then ask for states and motions at any time.
 
-    Rows may arrive late. The knots after a late row are then computed again. After the last row, the robot is assumed to continue
-    with its velocity.
+    Rows may arrive late. The integrated states at the later rows (knots) are then computed again. After the last row, the robot is
+    assumed to continue with its velocity.
 
     ``model``: the odometry's constants and noise.
     ``use_gyro``: True if gyro rows replace the rotation of the wheels.
-    ``horizon`` [s]: rows that are this much older than the newest row may be deleted. A row before the first remaining knot is
+    ``horizon`` [s]: rows that are this much older than the newest row may be deleted. New rows before the oldest remaining row are
     rejected.
     ``estimated``: indices in :data:`~factors.odometry.model.PARAMETERS` of the P constants that the estimator estimates. Methods
     with ``constants`` (P,) correct motions for changes of these.
@@ -160,8 +160,8 @@ class OdometryChain:
     def begin_slip(self, since: float) -> None:
         """Report that the wheels slip since the time ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
 
-        If a row from before ``since`` arrives later, the motion between ``since`` and the newest row counts as known again, because
-        knots are recomputed.
+        If a row from before ``since`` arrives later, all later states are integrated again. The motion between ``since`` and the
+        newest row then counts as known again.
         """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
@@ -281,7 +281,7 @@ class OdometryChain:
             self._knots = np.concatenate((self._knots, np.zeros((more, KNOT))))
 
     def _now_has(self, count: int, *, forgets: bool) -> None:
-        """Set the number of rows. ``forgets``: True if rows at the front were deleted."""
+        """Set the number of stored rows to ``count``. ``forgets``: True if old rows were deleted."""
         self._count = count
         if forgets:
             self.begin = float(self._knots[0, T])
@@ -289,8 +289,8 @@ class OdometryChain:
 
 @compiled
 def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
-    """The integrated state at time ``t``, from the last of ``count`` knots before it. The elements are the fields of
-    :class:`~factors.motion.ChainState`."""
+    """The integrated state at time ``t``, computed from the last of ``count`` knots (states at the odometry rows) before ``t``. The
+    elements are the fields of :class:`~factors.motion.ChainState`."""
     if count == 0:
         return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
     i = np.searchsorted(knots[:count, T], t, side="right") - 1

@@ -38,7 +38,8 @@ def copy(row: Array, to: Array) -> None:
 
 @compiled
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
-    """Delete the rows and knots that are more than ``horizon`` seconds older than the newest one. Returns the new count.
+    """Delete rows, and the integrated states at these rows (knots), that are more than ``horizon`` seconds older than the newest
+    row. ``count``: the number of rows. Returns the new number.
 
     Nothing is deleted before the oldest row is two horizons old, because each deletion moves all remaining rows to the front.
     """
@@ -64,7 +65,7 @@ def append(
     constants: Array,
     horizon: float,
 ) -> int:
-    """Append rows of velocities and their knots to the ``count`` existing rows, and delete old rows.
+    """Append velocities to the ``count`` existing rows, integrate them into ``knots`` (the state at each row), and delete old rows.
 
     ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the times.
     Returns the new count. If the first new row is older than the last existing one, returns -1 and changes nothing.
@@ -109,7 +110,8 @@ def insert(
 
 @compiled
 def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array) -> None:
-    """Compute the knots of the rows from index ``begin`` up to, but not including, ``end``. Each follows from the previous knot."""
+    """Integrate the odometry rows from index ``begin`` up to, but not including, ``end``. Writes the state at each row into
+    ``knots``, computed from the previous one."""
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
     c, s, lag, hold = constants[_COS], constants[_SIN], constants[LAG], constants[HOLD]
@@ -125,7 +127,7 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
         elif kind == INCREMENT:
             previous = knots[i - 1]
             duration = t - previous[T]
-            if duration > 0.0:  # otherwise there is no time for motion
+            if duration > 0.0:  # rows with equal times have no motion between them
                 forward, sideways, turn = a / duration - speed_bias, b / duration, phi / duration - heading_rate_bias
                 stands = abs(forward) <= _REST and abs(sideways) <= _REST and abs(turn) <= _REST
                 if stands:
@@ -157,17 +159,18 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
 
 @compiled
 def _take_gyro(knot: Array, t: float, turn: float) -> None:
-    """Set the turn rate of a knot to the rate ``turn`` of a gyro row at ``t``. The rate is zero if wheels and gyro agree on
-    rest."""
+    """Set the turn rate in ``knot``, the integrated state at time ``t``, to the rate ``turn`` that a gyro measures. If both wheels
+    and gyro are at rest, the rate is set to zero."""
     knot[_GYRO_T] = t
     knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
 
 
 @compiled
 def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
-    """Compute the knot of the increment in row ``i``, with the translation of the increment and the rotation of the gyro.
+    """Integrate the increment in row ``i``, with the translation of the increment and the rotation of the gyro.
 
-    This recomputes the knots of the gyro rows since the previous increment, because the translation in that time is known only now.
+    This also recomputes the states (``knots``) at the gyro rows since the previous increment, because the translation in that time
+    is known only now.
     """
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift = constants[3], constants[4]
@@ -203,7 +206,7 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 
 @compiled
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
-    """Write the knot ``duration`` seconds after ``knot`` into ``out``.
+    """Predict the integrated state ``knot`` by ``duration`` seconds, and write the new state into ``out``.
 
     The velocity converges to its target with the time constant ``lag`` [s], and continues for at most ``hold`` seconds. The motion
     after that is unknown. If ``slipping`` is 1, all motion is unknown.

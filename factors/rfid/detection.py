@@ -50,10 +50,10 @@ class TagReadCounts:
     reference pose.
     ``antennas`` (K,): indices of the antennas in the model. ``rounds`` (K,): numbers of inventory rounds.
     ``hits`` (K, C): the number of rounds that read each of C listed tags. Tags that are not listed were not read.
-    ``odds`` (C,): prior log-odds that a listed tag is not as surveyed (:class:`~factors.rfid.tag_states.TagStates`). ``-inf``, the
-    default, means certainly as surveyed.
-    ``elsewhere`` (C,): the tempered log-likelihood of a tag's reads and misses if the tag is not as surveyed, relative to that of
-    misses out of reach. The default is that of dead tags: 0, or ``-inf`` for a tag that was read.
+    ``odds`` (C,): prior log-odds that a listed tag is weak, moved or dead (:class:`~factors.rfid.tag_states.TagStates`), and not as
+    surveyed. ``-inf``, the default, means certainly as surveyed.
+    ``elsewhere`` (C,): the tempered log-likelihood ratio of a tag's reads and misses, between a tag that is not as surveyed and a
+    tag out of reach that is never read. The default is that of dead tags: 0, or ``-inf`` for a tag that was read.
     ``tags`` (C,): indices in the map of the listed tags, ascending. The default is all tags of the map.
     ``unlisted_odds``: the odds of tags that are not listed.
     ``twists`` (K, 3): the robot's body-frame velocity [m/s, m/s, rad/s] at each measurement. The default is zero.
@@ -81,7 +81,7 @@ class TagReadCounts:
 
     @cached_property
     def packed(self) -> Counts:
-        """The counts for compiled code."""
+        """The fields of the counts as a tuple, for compiled code."""
         counts = self.offsets, self.antennas, self.rounds, self.hits
         return (*counts, self.odds, self.elsewhere, self.tags, self.unlisted_odds, self.twists)
 
@@ -199,20 +199,21 @@ class RfidLikelihood:
         return out
 
     def prepare(self) -> None:
-        """Compute the tables for particles now, instead of at their first use. This takes time once."""
+        """Compute the tables of the likelihood of particles now. Otherwise the first call of :meth:`log_likelihood` computes
+        them, which delays a running filter."""
         for name in ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
     @cached_property
     def packed(self) -> Packed:
-        """The models, adjusted to the parameters, for compiled code."""
+        """The detection models, adjusted to the parameters, as a tuple of arrays for compiled code."""
         if self._unadjusted is self:
             return self.model.packed()
         return adjusted(self._unadjusted.packed, self.parameters)
 
     @cached_property
     def arrays(self) -> tuple[Packed, MapTags]:
-        """The models before adjustment, and the map, for compiled code."""
+        """The detection models before adjustment, and the tags of the map, as tuples of arrays for compiled code."""
         return self._unadjusted.packed, self._unadjusted._map
 
     def joint_score(
@@ -247,8 +248,8 @@ class RfidLikelihood:
         ``margin`` [m]: tags that are farther than reach plus margin from all poses are left out, unless they were read.
         ``parameters`` (Q,): parameters of the likelihood. ``odds`` (T,): tags with odds ``-inf`` are left out.
 
-        Returns the indices (U,) of the remaining tags, the tempered log-likelihood (U, S) of the reads and misses of each tag for
-        each state, relative to that of misses out of reach, and a mask (U,) of the tags that were read.
+        Returns the indices (U,) of the remaining tags, a log-likelihood ratio (U, S), and a mask (U,) of the tags that were read.
+        The ratio is tempered. It compares each state with a tag out of reach that is never read, by the tag's reads and misses.
         """
         alpha = float(self.model.tempering)
         return tag_states.displaced(*self._tabled, counts.packed, poses, margin, odds, hypotheses, alpha, parameters)
@@ -280,7 +281,8 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """An estimate of the cost of the likelihood at one pose, about the number of tags to evaluate, if poses are far apart."""
+        """An estimate of the cost of :meth:`log_likelihood` for each of many poses that are far apart: about the number of tags to
+        evaluate."""
         return self._unadjusted._places.work(counts.packed)
 
     @property
@@ -303,9 +305,9 @@ class RfidLikelihood:
         return any(self.model.models[a.model].uses_facing for a in self.model.antennas)
 
     def robot_tables(self, finest: int, facings: int) -> RobotTables:
-        """Tables of the antennas' responses by a tag's position in the robot frame. ``finest``: cell size in units of the finest
-        table.
-        ``facings``: number of facing directions. See :func:`factors.rfid.places.robot_tables`."""
+        """Tables of read probabilities of each antenna by a tag's position in the robot frame. ``finest``: the cell size, as a
+        multiple of the cell size of the finest table that exists. ``facings``: number of facing directions. See
+        :func:`factors.rfid.places.robot_tables`."""
         antennas = antennas_of(self.packed, self._unadjusted._tables)
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
@@ -325,6 +327,6 @@ class RfidLikelihood:
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
-        """The probability (N, T), floor included, that one round of an ``antenna`` (index) reads each tag from each pose (N, 3)."""
+        """The probability (N, T), including false reads, that one round of an ``antenna`` (index) reads each tag from each pose."""
         poses, antennas = np.ascontiguousarray(poses, dtype=float), np.full(len(poses), antenna)
         return kernels.probabilities(self.packed, antennas, poses, self.tags.points, self.tags.normals)[0]

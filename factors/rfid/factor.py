@@ -58,8 +58,9 @@ class TagLikelihood(Protocol):
 
 
 class TagProblem(NamedTuple):
-    """Reads and misses for compiled code. ``packed``: models before adjustment. ``parameters`` (Q,): adjustments of the models.
-    ``estimated`` (P,): the indices of those parameters that are estimated."""
+    """The likelihood of read counts, for compiled code. ``packed``: detection models before adjustment. ``of_map``: the tags of the
+    map. ``counts``: reads and misses. ``tempering``: exponent of the likelihood. ``parameters`` (Q,): adjustments of the models.
+    ``estimated`` (P,): the indices of the parameters that are estimated."""
 
     packed: Packed
     of_map: MapTags
@@ -73,7 +74,7 @@ class TagProblem(NamedTuple):
 class RfidFactor:
     """RFID measurements as a factor on the robot's pose, and optionally on parameters of the read model.
 
-    ``likelihood``: that of read counts, signal strengths or phases.
+    ``likelihood``: a likelihood of read counts, signal strengths or phases.
     ``reads``: :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`, otherwise
     :class:`~factors.rfid.signals.RssiReads` or :class:`~factors.rfid.signals.PhaseReads`.
     ``estimated`` (P,): indices of the parameters (:mod:`factors.rfid.parameters`) that are estimated; read counts only.
@@ -157,7 +158,7 @@ class RfidFactor:
         return Correction(delta, posterior, NO_RESIDUAL, nis, dof, *rest)
 
     def _problems(self) -> tuple[TagProblem | None, PhaseProblem | None, StrengthProblem | None]:
-        """The likelihood and reads for compiled code: read counts, phases, and strengths, of which two are None."""
+        """The likelihood with its reads, for compiled code: one of read counts, phases and strengths. The other two are None."""
         match self.likelihood, self.reads:
             case RfidLikelihood() as detection, TagReadCounts() as counts:
                 estimated, alpha = np.array(self.estimated, dtype=np.int64), float(detection.model.tempering)
@@ -277,7 +278,8 @@ def _corrected(
 
 @compiled
 def _difference(pose: Array, values: Array, target: Array, other_values: Array) -> Array:
-    """The step (3 + P,) from ``pose`` and ``values`` to ``target`` and ``other_values``."""
+    """The step (3 + P,) from ``pose`` (3,) and ``values`` (P,) to ``target`` and ``other_values``. The first three components are
+    the twist between the poses."""
     out = np.empty(3 + len(values))
     out[0], out[1], out[2] = se2.twist_to(pose, target)
     for i in range(len(values)):
@@ -287,8 +289,8 @@ def _difference(pose: Array, values: Array, target: Array, other_values: Array) 
 
 @compiled
 def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array) -> Array:
-    """One step (D,) of Fisher scoring, shortened to the largest allowed step. ``moved`` (D,): the total step so far, from the
-    prediction."""
+    """One step (D,) of Fisher scoring, shortened to the largest allowed step. ``prior_information`` (D, D): the inverse covariance
+    of the prediction. ``information``, ``gradient``: of the likelihood. ``moved`` (D,): the sum of all steps so far."""
     size, both, pull = len(gradient), prior_information.copy(), np.empty((len(gradient), 1))
     for i in range(size):
         pull[i, 0] = -gradient[i]
@@ -307,7 +309,7 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
 
 @compiled
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """The covariance (D, D) after an update, and the logarithm of its determinant relative to that before the update."""
+    """The covariance (D, D) after an update, and the logarithm of the ratio of its determinant to that before the update."""
     size, both = len(information), prior_information.copy()
     for i in range(size):
         for j in range(size):

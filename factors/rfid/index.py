@@ -95,8 +95,8 @@ class MapTags(NamedTuple):
 
 
 class NearTags(NamedTuple):
-    """The data of the C tags that matter for some poses. ``tags`` (C,): their indices in the map, ascending. The remaining fields
-    are those of :class:`MapTags` and of :class:`~factors.rfid.detection.TagReadCounts` for these tags."""
+    """The data of the C tags that are near some poses or listed in the reads. ``tags`` (C,): their indices in the map, ascending.
+    The other fields are those of :class:`MapTags` and :class:`~factors.rfid.detection.TagReadCounts` for these tags."""
 
     tags: Integers
     points: Array
@@ -182,8 +182,8 @@ def union(first: Integers, second: Integers) -> Integers:
 def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """The hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,), from those of the ``listed`` tags. Both arrays of tags are
-    ascending. A tag that is not listed has 0 hits, ``unlisted_odds`` and 0."""
+    """Select for ``tags`` (U,) the columns of hits (K, U), odds (U,) and elsewhere (U,), which are given for the ``listed`` tags.
+    Both arrays of tags are ascending. A tag that is not listed gets 0 hits, ``unlisted_odds``, and 0 for elsewhere."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
     new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0

@@ -79,11 +79,11 @@ def of_tag(
 
 @compiled(inline="always")
 def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, float]:
-    """The read probability, floor included, at the logit ``z``, and its derivatives by the logit and by the logarithm of
-    ``rate``."""
+    """The read probability, including false reads, at the logit ``z``. Also returns its derivatives by the logit and by the
+    logarithm of ``rate``, a factor of the probability."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
     by_rate = packed.span * rate * sigmoid
-    # without a floor a probability may be 0 or 1, whose logarithm or that of the complement is infinite
+    # without false reads, a probability may be 0 or 1, and the logarithm of it or of its complement is infinite
     q = min(max(packed.false_read + by_rate, 1e-12), 1.0 - 1e-12)
     return q, by_rate * (1.0 - sigmoid), by_rate
 
@@ -125,9 +125,9 @@ def mixture(
 
     ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`. ``e``, ``mean``, ``variance``: the untempered
     negative log-likelihood of a tag as surveyed, and its mean and variance over all outcomes. ``none``: the untempered negative
-    log-likelihood of misses out of range. Returns a factor for the derivatives of ``e``, and the tempered negative log-likelihood
-    with its mean and variance. The derivatives neglect the information that the unknown state costs (Louis, JRSS B 44(2), 1982,
-    eq. 3.2').
+    log-likelihood that a tag out of range is never read. Returns a factor for the derivatives of ``e``, and the tempered negative
+    log-likelihood with its mean and variance. An unknown state reduces the information on the pose, which the derivatives neglect
+    (Louis, JRSS B 44(2), 1982, eq. 3.2').
     """
     if odds == -np.inf or elsewhere == -np.inf:
         return tempering, tempering * e, tempering * mean, tempering * variance
@@ -156,8 +156,8 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
 
 @compiled
 def _unread(packed: Packed, rounds: Integers) -> Array:
-    """For each of K measurements, the negative log-likelihood that a tag out of range is missed, and its mean and variance
-    (K, 3)."""
+    """For each of K measurements, the negative log-likelihood that a tag out of range is not read, and the mean and variance of the
+    negative log-likelihood over all outcomes (K, 3)."""
     out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
     for k in range(len(rounds)):
         out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])
@@ -260,8 +260,8 @@ def _add_measurement(
 def scores(
     packed: Packed, of_map: MapTags, counts: Counts, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """The fields of a :class:`~factors.rfid.detection.Score` of poses (N, 3), for adjusted models. ``columns`` (Q,): the component
-    of each parameter in the gradient, -1 if it is not estimated."""
+    """Compute the fields of a :class:`~factors.rfid.detection.Score` at poses (N, 3). ``packed``: adjusted models. ``columns``
+    (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
     antennas, rounds, twists = counts[1], counts[2], counts[8]
     offsets = delayed(counts[0], twists, packed.delay)
     count, scans, size = len(poses), len(antennas), 3
@@ -368,8 +368,8 @@ def by_tag(
 def probabilities(
     packed: Packed, antennas: Integers, poses: Array, points: Array, normals: Array
 ) -> tuple[Array, Array]:
-    """The probability (N, T), floor included, that one round of antenna ``antennas[n]`` on a robot at ``poses[n]`` reads each tag,
-    and the horizontal distance (N, T) [m] from the antenna to the tag."""
+    """The probability (N, T), including false reads, that one round of antenna ``antennas[n]`` on a robot at ``poses[n]`` reads
+    each tag. Also returns the horizontal distance (N, T) [m] from the antenna to the tag."""
     none = np.zeros(3)
     p, distance = np.empty((len(poses), len(points))), np.empty((len(poses), len(points)))
     for n in range(len(poses)):

@@ -43,12 +43,12 @@ class DetectionModel(Protocol):
         """The largest read probability of the model."""
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
-        """The model for compiled code: its kind, its parameters, and the knots (H, F, NX, NY) of a grid, empty for other kinds."""
+        """The model for compiled code: its kind, its parameters, and the logits (H, F, NX, NY) of a grid, empty for other kinds."""
 
 
 @dataclass(frozen=True)
 class BeamModel:
-    """A beam with soft edges, the default of uncalibrated antennas.
+    """A detection model of a beam with soft edges, the default of uncalibrated antennas.
 
     ``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with the distance r [m] to the tag and the
     tag's bearing phi [rad] from the boresight. ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)`` depends on the cosine
@@ -82,7 +82,7 @@ class BeamModel:
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """A logit that is linear in :data:`FEATURES`. ``coefficients`` (11,): one for each feature.
+    """A detection model whose logit is linear in :data:`FEATURES`. ``coefficients`` (11,): one for each feature.
 
     The features are made of the horizontal distance r [m], w = 1 - cosine of the bearing, the height difference z [m], and c, the
     cosine of the angle between the tag's facing and the direction to the antenna (0 if the facing is unknown).
@@ -105,8 +105,8 @@ class LogisticModel:
 
 @dataclass(frozen=True, eq=False)
 class GridModel:
-    """A grid of logits in the antenna's frame. ``logits`` (H, F, NX, NY): at knots ``cell`` [m] apart, the first at (``x0``,
-    ``y0``).
+    """A detection model with a grid of logits in the antenna's frame. ``logits`` (H, F, NX, NY): the logits of the read probability
+    at grid points ``cell`` [m] apart, the first at (``x0``, ``y0``).
 
     ``heights`` (H,) [m]: heights of the tag above the antenna, ascending and evenly spaced. The F facings are evenly spaced cosines
     from -1 to 1 of the angle between the tag's facing and the direction to the antenna; F is 1 if the facing is irrelevant.
@@ -187,7 +187,7 @@ class RfidModel:
     tempering: float = 1.0
 
     def packed(self) -> Packed:
-        """The model for compiled code."""
+        """The model as a tuple of arrays for compiled code."""
         compiled = [model.compiled() for model in self.models]
         parameters = np.zeros((len(compiled), PARAMETERS))
         shapes = np.zeros((len(compiled), 5), dtype=np.int64)
@@ -233,14 +233,16 @@ def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) ->
 
 
 def probability(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> Array:
-    """The read probabilities (N,), without the floor, of tags at ``points`` (N, 3) in the antenna's frame."""
+    """The read probabilities (N,), without false reads, of tags at ``points`` (N, 3) [m] in the antenna's frame. ``facing`` (N,):
+    the cosine of the angle between each tag's facing and the direction to the antenna."""
     return np.asarray(1.0 / (1.0 + np.exp(-logits(model, points, facing)[0])))
 
 
 def bake(
     model: DetectionModel, extent: float, cell: float = 0.1, heights: Sequence[float] = (0.0,), facings: int = 1
 ) -> GridModel:
-    """Sample any model as a grid from -``extent`` to ``extent`` [m] in x and y, with ``facings`` knots of the facing's cosine."""
+    """Convert any detection model to a grid from -``extent`` to ``extent`` [m] in x and y. ``cell`` [m]: the spacing. ``heights``
+    [m]: tag heights above the antenna. ``facings``: the number of evenly spaced cosines of the facing."""
     count = 2 * math.ceil(extent / cell) + 1
     axis = cell * (np.arange(count) - (count - 1) / 2.0)
     cosines = np.linspace(-1.0, 1.0, facings) if facings > 1 else np.zeros(1)
@@ -306,7 +308,8 @@ def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> flo
 
 @compiled
 def _logistic_peak(b: Array, reach: float) -> float:
-    """The largest logit at the antenna's height, over ranges, bearings and facings."""
+    """The largest logit of a logistic model with coefficients ``b`` (11,), over all ranges up to ``reach`` [m], bearings and
+    facings, for tags at the antenna's height."""
     largest = -np.inf
     for r in np.linspace(0.0, reach, 81):
         for w in np.linspace(0.0, 2.0, 9):
@@ -342,8 +345,8 @@ def _slope(f: float) -> tuple[float, float, float, float]:
 
 @compiled
 def _place(s: float, count: int) -> tuple[int, float, float]:
-    """Clip a place ``s`` to a row of ``count`` knots. Returns the knot below, the fraction above that knot, and 1 if the place is
-    inside, otherwise 0."""
+    """Clip a coordinate ``s`` to a row of ``count`` grid points 0, 1, .... Returns the grid point below, the fractional part, and 1
+    if ``s`` was inside, otherwise 0."""
     if count == 1 or s <= 0.0:
         return 0, 0.0, 0.0
     if s >= count - 1:

@@ -52,11 +52,11 @@ class RobotTables(NamedTuple):
 
 
 class MissTable(NamedTuple):
-    """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is relative to that
-    of a tag out of reach.
+    """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is relative to the
+    log-likelihood that they miss a tag out of reach.
 
-    ``surveyed`` (H, S, S): that of a tag that works and is where the map has it, untempered, for H heights.
-    ``folded`` (H, S, S): that of a tag that may be weak, moved or dead, tempered.
+    ``surveyed`` (H, S, S): untempered, for a tag that works and is where the map has it, at H heights.
+    ``folded`` (H, S, S): tempered, for a tag that may be weak, moved or dead.
     ``cell`` [m]: the size of a cell. ``reach`` [m]: the distance beyond which both are zero.
     """
 
@@ -100,7 +100,7 @@ def antennas_of(packed: Packed, tables: Tables) -> Antennas:
 
 
 def is_wide(poses: Array, reach: float) -> bool:
-    """True if poses (N, 3) are so far apart that most tags are within ``reach`` [m] of only a few poses."""
+    """True if most tags are within ``reach`` [m] of only a few of the poses (N, 3), because the poses are far apart."""
     reached = np.ptp(poses[:, :2], axis=0) + 2.0 * reach
     return bool(np.prod(reached) > WIDE * (2.0 * reach) ** 2)
 
@@ -117,8 +117,8 @@ def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: i
     """Compute the tables of a model by the tag's position in the robot frame.
 
     ``heights`` (T,) [m]: heights of the tags. ``facings``: number of facing directions, besides that for an irrelevant facing.
-    ``finest``: the size of cells and height steps, in units of those in the tables of the antennas. It is increased if the tables
-    would be too large.
+    ``finest``: the size of cells and of height steps, as a multiple of their size in the tables of ``antennas``. It is increased if
+    the tables would be too large.
     """
     scale, size, (packed, tables, logs, reach) = finest, MOST + 1, antennas
     while size > MOST:
@@ -230,7 +230,7 @@ def _log_likelihood(
     tempering: float,
     out: Array,
 ) -> None:
-    """Add the tempered log-likelihood of poses (N, 3), relative to that of misses out of reach, to ``out`` (N,).
+    """Add the tempered log-likelihood of poses (N, 3), relative to that of poses without tags in reach, to ``out`` (N,).
 
     ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): those of :class:`Places`. ``missed``: the table of misses.
     """
@@ -275,8 +275,8 @@ def _log_likelihood(
 def _of_tag(
     model: Antennas, scan: Scan, x: float, y: float, height: float, nx: float, ny: float, levels: Integers, w: int
 ) -> float:
-    """The untempered log-likelihood of one tag that works and is where the map has it, relative to that of misses out of reach,
-    from the tables of each antenna.
+    """The untempered log-likelihood of one tag that works and is where the map has it, from the tables of each antenna. It is
+    relative to the log-likelihood that a tag out of reach is never read.
 
     ``x``, ``y``, ``height``, ``nx``, ``ny``: position and facing of the tag in the robot frame. ``levels`` (A,): the tables of the
     tag. ``w``: its number among the exceptional tags, -1 if it was not read.
@@ -301,8 +301,8 @@ def _of_tag(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _far(tables: RobotTables, scan: Scan, tempering: float) -> Array:
-    """The tempered log-likelihood (W,) of the reads of each exceptional tag if the tag is out of reach, relative to that of
-    misses."""
+    """The tempered log-likelihood (W,) of the reads of each exceptional tag if the tag is out of reach, relative to the
+    log-likelihood of no reads."""
     out = np.empty(len(scan.odds))
     for w in range(len(out)):
         own = 0.0

@@ -118,8 +118,8 @@ class _Ordered(NamedTuple):
 
 
 class PhaseProblem(NamedTuple):
-    """Phase reads, map and model for compiled code. ``antennas`` (A, 6): from :func:`mounting`. ``points`` (T, 3): of the tags.
-    ``weight``: tempering times kappa."""
+    """Phase reads, map and model as arrays for compiled code. ``antennas`` (A, 6): the result of :func:`mounting`. ``points``
+    (T, 3): positions of the tags. ``weight``: the tempering exponent times the concentration kappa."""
 
     antennas: Array
     points: Array
@@ -234,7 +234,7 @@ class RssiLikelihood:
 
 
 def _rows(poses: Array) -> Array:
-    """Poses (N, 3) for compiled code."""
+    """Convert one pose (3,) or N poses to a contiguous array (N, 3) for compiled code."""
     return np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
 
 
@@ -255,7 +255,8 @@ def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: Rs
 
 @compiled(inline="always")
 def _on_robot(offset: Array, x: float, y: float) -> tuple[float, float]:
-    """Transform a position (x, y) from the robot frame at a read to the frame of the reference pose."""
+    """Transform a position (x, y) from the robot frame at a read to the frame of the reference pose. ``offset`` (3,): the robot's
+    pose at the read in that frame."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * x - s * y, offset[1] + s * x + c * y
 
@@ -299,7 +300,8 @@ def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tupl
 
 @compiled
 def _add_group(psi: Array, by: Array, offset: float, gradient: Array, information: Array) -> None:
-    """Add the ``gradient`` (3,) and ``information`` (3, 3) of one group, for kappa 1. ``offset``: arg S of the module's formula."""
+    """Add the contribution of one group of reads to ``gradient`` (3,) and ``information`` (3, 3), for a concentration kappa of 1.
+    ``offset``: the common phase arg S in the formula of the module."""
     total, mean = 0.0, np.zeros(3)
     for r in range(len(psi)):
         sine, weight = math.sin(psi[r] - offset), max(math.cos(psi[r] - offset), 0.0)
@@ -340,7 +342,7 @@ def _features(
 def _all_features(
     antennas: Array, points: Array, normals: Array, pose: Array, offsets: Array, which: Integers, tags: Integers
 ) -> Array:
-    """Compute :func:`features`."""
+    """The compiled part of :func:`features`, with the same result."""
     out, c0, s0 = np.empty((len(tags), 6)), math.cos(pose[2]), math.sin(pose[2])
     for r in range(len(tags)):
         antenna, point, normal = antennas[which[r]], points[tags[r]], normals[tags[r]]

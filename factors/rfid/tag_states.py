@@ -39,7 +39,7 @@ from factors.rfid.tables import Tables
 from factors.rfid.weighing import FARTHEST_RATIO, fast_exp, mark_near, place_antennas, tags_of_tables, weigh_tag
 from factors.se2 import Array, Integers
 
-KEPT = 200.0  # s; evidence of this age can still be removed
+KEPT = 200.0  # s; the evidence of scans is stored for this time, and can be removed from the filters until then
 BELIEVED = 0.5  # a tag is reported as dead, weak or moved if the probability exceeds this value
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: spacing of the grid of displacements, and the largest displacement
@@ -135,8 +135,8 @@ class TagStates:
     def expect(self, tags: Integers, evidence: Array) -> Array:
         """The log-likelihood (U,) of a scan's reads and misses of ``tags`` (U,) if these are weak, moved or dead (``elsewhere``).
 
-        ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative to that of
-        misses out of range.
+        ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative to the
+        log-likelihood that a tag out of range is never read.
         """
         return _expected(self._weights, tags, evidence)
 
@@ -303,7 +303,7 @@ def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
 @compiled
 def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.float32], sign: float) -> bool:
     """Add ``sign`` times the log-likelihoods ``evidence`` to the weights of ``tags``. Returns True if this changes which tags are
-    doubtful."""
+    believed to be weak, moved or dead."""
     changed = False
     for u in range(len(tags)):
         of_tag, old_odds = weights[tags[u]], odds[tags[u]]
@@ -316,7 +316,7 @@ def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.flo
 
 @compiled
 def _all_odds(weights: Array) -> Array:
-    """:func:`_odds` of all tags."""
+    """The log-odds (T,) that each tag is weak, moved or dead. ``weights`` (T, W): the log-probabilities of their states."""
     return np.array([_odds(of_tag) for of_tag in weights])
 
 

@@ -197,7 +197,7 @@ def weigh_tag(
     product: Array,
     room: Array,
 ) -> None:
-    """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of misses out of reach.
+    """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
 
     ``at``, ``models``: the results of :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of measurements to evaluate.
     ``product`` (N,), ``room`` (N,): working memory.
@@ -273,8 +273,8 @@ def _chances(
 
 @compiled(inline="always")
 def _floored(packed: Packed, rate: float, chance: float) -> float:
-    """The read probability with floor and limits, from the sigmoid ``chance``. ``rate``: that of ``models`` in
-    :func:`place_antennas`."""
+    """The read probability from the sigmoid ``chance`` of a logit, including false reads, at least :data:`LEAST` and at most
+    1 - :data:`LEAST`. ``rate``: the factor of the probability, from ``models`` of :func:`place_antennas`."""
     return float(min(max(packed.false_read + rate * chance, LEAST), 1.0 - LEAST))
 
 
