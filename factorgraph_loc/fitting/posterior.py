@@ -20,12 +20,12 @@ from factors.least_squares import minimum
 from factors.se2 import Array, Integers
 
 LOSS_SCALE = 2.0  # standard deviations at which the loss changes from quadratic to linear
-MAD_TO_SIGMA = 1.4826  # the standard deviation of a Gaussian divided by its median absolute deviation
-# maximum number of steps; smallest and largest step in sigmas of the prior
+MAD_TO_SIGMA = 1.4826  # factor from the median absolute deviation of a Gaussian to its standard deviation
+# maximum number of steps; the step at which the fit has converged, and the largest step, both in standard deviations of the prior
 ITERATIONS, CONVERGED, LARGEST = 30, 3e-3, 2.0
 STEP = 1e-4  # step of numerical derivatives, in standard deviations of the prior
-LEAST_SHARE = 1e-3  # minimum fraction of independent information
-DETERMINED = 0.7  # if the standard error exceeds this fraction of the prior's, the logs hardly determine the parameter
+LEAST_SHARE = 1e-3  # minimum of the fraction of independent information, see :func:`independent_share`
+DETERMINED = 0.7  # a parameter is hardly determined if its error exceeds this fraction of its prior standard deviation
 CORRELATED = 0.8  # two parameters with a larger absolute correlation are reported
 
 
@@ -54,9 +54,9 @@ Likelihood = Callable[[Array], LikelihoodTerms]
 
 @dataclass(frozen=True)
 class Posterior:
-    """The estimate of P parameters. ``values`` (P,): the maximum of the posterior density. ``covariance`` (P, P): that of their
-    errors.
-    ``share``: the fraction of independent information in the measurements, from 0 to 1."""
+    """The estimate of P parameters. ``values`` (P,): the values with the largest posterior density. ``covariance`` (P, P): the
+    covariance of their errors. ``share``: the fraction of independent information in the measurements, from 0 to 1, because errors
+    of measurements that are close in time are correlated."""
 
     parameters: tuple[Parameter, ...]
     values: Array
@@ -141,7 +141,7 @@ def maximise(
 def independent_share(scores: Array, information: Array, precision: Array | float = 0.0) -> float:
     """The fraction of independent information in correlated measurements, at most 1. A likelihood is multiplied by this fraction.
 
-    ``scores`` (B, P): gradients of the log-likelihood in B blocks of time. ``information`` (P, P): the Fisher information of all.
+    ``scores`` (B, P): gradients of the log-likelihood in B blocks of time. ``information`` (P, P): the total Fisher information.
     ``precision`` (P, P): the inverse covariance of the prior. If measurements are independent, the covariance of the scores equals
     the information. The fraction is the ratio of the two (Varin, Reid and Firth, "An overview of composite likelihood methods",
     Statistica Sinica 21, 2011, section 2.2).
@@ -152,9 +152,10 @@ def independent_share(scores: Array, information: Array, precision: Array | floa
 
 
 def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Parameter], block: Integers) -> Likelihood:
-    """Make a likelihood from a function of residuals, with numerical derivatives and the soft-L1 loss.
+    """Make a likelihood of ``parameters`` from a function of residuals, with numerical derivatives and the soft-L1 loss.
 
-    ``whitened(values)``: returns residuals (M, D) in standard deviations. ``block`` (M,): the number of each row's block of time.
+    ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``block`` (M,): the number of
+    the time block of each row. Residuals of different blocks count as independent.
     """
     steps = STEP * np.diag([p.sigma for p in parameters])
 
@@ -195,5 +196,5 @@ def robust_sigma(values: Array) -> Array:
 
 
 def centred(parameters: Sequence[Parameter], values: Mapping[str, float]) -> list[Parameter]:
-    """The parameters with ``values`` (by name) as the means of their priors."""
+    """Return the parameters with the means of their priors replaced by ``values``, by name."""
     return [replace(p, mean=values[p.name]) for p in parameters]

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from factors.se2 import Array
 
-_Z = 1.959963984540054  # half the width of the 95 % interval of a standard normal distribution
+_Z = 1.959963984540054  # a standard normal variable is between -_Z and _Z with a probability of 95 %
 
 
 def wilson(successes: ArrayLike, count: ArrayLike) -> tuple[Array, Array]:

@@ -32,14 +32,15 @@ from factors.odometry.factor import OdometryFactor, OdometryStack
 from factors.robust import huber_loss
 from factors.se2 import Array, Integers
 
-ANCHORED, SLACK = 4, 2.0  # so many visible points of the graph determine a keyframe, to an error of so many pixels
-HORIZON, BUNDLE = 60, 8  # keyframes for which sightings are kept, and keyframes that are adjusted together
+ANCHORED, SLACK = 4, 2.0  # number of visible points that determine a keyframe's pose; its remaining error in pixels
+HORIZON, BUNDLE = 60, 8  # number of keyframes whose sightings are kept, and number of keyframes adjusted together
 DISTANCE = 3.0  # m: initial value of the distance of points
 # consecutive keyframes must share a third of the points in view, but at least FEW and at most ENOUGH
 FEW, ENOUGH = 5, 8
 ITERATIONS = 30
-FITS, MOST = 3.0, 0.5  # a sighting fits within so many standard deviations; so large a fraction per keyframe must fit
-SLIPPED = 0.1  # rad: a larger turn of the points relative to the odometry is not caused by the parallax of near points
+# a sighting fits within FITS standard deviations; at least the fraction MOST of a keyframe's sightings must fit
+FITS, MOST = 3.0, 0.5
+SLIPPED = 0.1  # rad: parallax of near points explains smaller differences between turns in the image and of odometry
 
 Waiting = Mapping[Hashable, Sequence[PointSighting]]
 State = tuple[Array, Array, Array]  # poses (N, 3) and tilts (N, 2) of keyframes, and points (P, 3)
@@ -51,10 +52,10 @@ def bundled(
     poses: Sequence[Array],
     waiting: Waiting,
 ) -> list[tuple[Array, Array]] | None:
-    """Adjust the last keyframes and the points that they observe. Returns pairs of pose (3,) and tilt (2,).
+    """Adjust the last keyframes and the points that they observe. Returns a pose (3,) and a tilt (2,) for each adjusted keyframe.
 
-    ``keyframes``: consecutive keyframes. Adjusted are the last of these, as far as each shares enough points with the previous one.
-    ``poses``: the initial poses of ``keyframes``. The first adjusted pose is fixed. ``waiting``: sightings by point.
+    ``keyframes``: consecutive keyframes. Going back from the newest, each is adjusted that shares enough points with the previous
+    one. ``poses``: the initial poses of ``keyframes``. The first adjusted pose is fixed. ``waiting``: the sightings of each point.
     Returns None if there are fewer than :data:`ENOUGH` points, or if most sightings of a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)
@@ -184,17 +185,18 @@ class LocalBundle:
 
 
 def _seen_often(first: int, waiting: Waiting) -> list[list[PointSighting]]:
-    """Return the sightings of each waiting point from keyframe number ``first`` on. Points with fewer than :data:`FEWEST` of these
-    are left out."""
+    """Return for each point its sightings from keyframe number ``first`` on. Points with fewer than :data:`FEWEST` such sightings
+    are left out. ``waiting``: the sightings of each point that is not yet triangulated."""
     return [sightings for w in waiting.values() if len(sightings := [s for s in w if s.keyframe >= first]) >= FEWEST]
 
 
 def _turned(
     model: CameraModel, poses: Sequence[Array], first: int, often: Sequence[Sequence[PointSighting]]
 ) -> list[Array]:
-    """Return ``poses`` (3,) with corrected turns between consecutive keyframes, of which ``first`` is the first number.
+    """Correct the rotations between the ``poses`` (3,) of consecutive keyframes, and return the corrected poses.
 
-    A turn is replaced by the median turn of the common points in the image if both differ by more than :data:`SLIPPED`.
+    If a rotation differs by more than :data:`SLIPPED` from the median rotation of the common points in the images, the latter
+    replaces it. ``first``: the number of the first keyframe. ``often``: the sightings of each point.
     """
     sides: list[dict[int, float]] = [{} for _ in poses]
     for i, sightings in enumerate(often):
@@ -231,18 +233,18 @@ class KeyframeCameras:
             self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 
     def anchor(self, keyframe: Keyframe, points: int) -> None:
-        """Store whether a keyframe is determined by the points of the graph. ``points``: how many of these it observes."""
+        """Store whether the points of the graph determine the pose of a keyframe. ``points``: the number that it observes."""
         self.anchored[keyframe.index] = points >= ANCHORED
 
     def forget(self, first: int) -> None:
-        """Forget the keyframes with numbers below ``first``."""
+        """Delete the stored data of the keyframes with numbers below ``first``."""
         self.twists = {number: twist for number, twist in self.twists.items() if number >= first}
         self.anchored = {number: anchored for number, anchored in self.anchored.items() if number >= first}
 
     def at_image(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
         """Return the pose at the time when the image was taken, from the pose ``guess`` at the stamp of the image.
 
-        ``keyframe``: its number. The covariance of the returned pose includes that of the time offset.
+        ``keyframe``: the number of the keyframe. The covariance of the returned pose includes the variance of the time offset.
         """
         return self._moved(keyframe, guess, graph, 1.0)
 
@@ -271,9 +273,9 @@ class KeyframeCameras:
     ) -> dict[int, KeyframeCamera]:
         """Return the camera poses, by number, of the keyframes that observe the points ``names``.
 
-        ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the sightings by point.
-        The ``slack`` of each camera pose is its error relative to the newest one, in pixels. The error is small if both keyframes
-        are determined by points of the graph. Otherwise it follows from the covariance of the odometry.
+        ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the sightings of each point.
+        The ``slack`` of each camera pose is its error relative to the newest camera pose, in pixels. The error is small if points
+        of the graph determine both keyframes. Otherwise it is computed from the covariance of the odometry.
         """
         slacks = self._slacks(newest, graph)
         cameras = {newest.index: self._camera(pose, newest.index, slacks, graph)}
@@ -305,9 +307,10 @@ class KeyframeCameras:
         return KeyframeCamera.of(self._model, pose, slacks[keyframe], graph.values[tilt_key(keyframe)])
 
     def _slacks(self, newest: Keyframe, graph: Graph) -> dict[int, float]:
-        """Return the error of the last keyframes relative to the newest one, in pixels and by number of the keyframe."""
+        """Return the errors [px] of the last keyframes relative to the newest keyframe, by number of the keyframe."""
         slacks: dict[int, float] = {}
-        # variance of the rotation between the newest and the last anchored keyframe, and before an earlier anchored keyframe
+        # variance of the odometry's rotation from the newest keyframe back to the last one whose pose is determined by points, and
+        # from an older keyframe to the next one that is determined by points
         to_anchor = since = 0.0
         reached = False
         for index in range(newest.index, max(-1, newest.index - HORIZON), -1):

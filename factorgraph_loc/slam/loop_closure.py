@@ -32,10 +32,10 @@ MOTION_SIGMAS = np.array((0.1, 0.1, 0.03))  # m, m, rad: errors allowed in the m
 FEWEST = 15  # least number of old points that must match
 LEAST_SHARE = 0.1  # least fraction of the visible old points that must match
 GRID, CELLS = (6, 4), 7  # cells of the image, and how many of them must contain a point
-# standard deviations of the track's drift in addition to its covariance: m, m, rad, and the same for each metre travelled
+# standard deviations (m, m, rad) that are added to the covariance of the estimated pose: a constant, and per metre travelled
 DRIFT, DRIFT_PER_METRE = np.array((0.05, 0.05, 0.02)), np.array((0.003, 0.003, 0.0005))
 GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
-LARGEST_SHIFT, LARGEST_TURN = 1.0, 0.3  # m, rad: largest errors of the track for which old points are still searched
+LARGEST_SHIFT, LARGEST_TURN = 1.0, 0.3  # m, rad: largest error of the estimated pose for which old points are searched
 FARTHEST = 15.0  # m: largest distance of a point that is searched
 
 
@@ -81,14 +81,14 @@ class Revisit:
 
 
 class LoopClosure:
-    """Recognizes revisited places from several consecutive images that agree."""
+    """Detector of loop closures. It accepts one if several consecutive images show the same old points at poses that agree."""
 
     def __init__(self) -> None:
         self._agreeing: list[Revisit] = []  # revisits of the last consecutive images, which agree with each other
-        self._last_time = -math.inf  # of the last image that was compared
+        self._last_time = -math.inf  # s; the time of the last image that was compared
 
     def is_due(self, t: float) -> bool:
-        """True if the last comparison is long enough ago to compare the image at time ``t`` [s]."""
+        """True if the last comparison is at least :data:`INTERVAL` before ``t`` [s], so that the image at ``t`` is compared."""
         return t >= self._last_time + INTERVAL
 
     def compare(
@@ -114,7 +114,7 @@ class LoopClosure:
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """Return the old points that one image shows, or None. Previous images are not considered."""
+    """Return the old points that one image shows, or None if it shows none. Other images are not considered."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:
@@ -158,8 +158,8 @@ def _on_floor(
 
 
 def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
-    """True if the difference between ``pose`` (3,) and the track's pose ``guess`` is a possible drift over a path of length
-    ``travelled`` [m]."""
+    """True if the drift over a path of length ``travelled`` [m] can explain the difference between ``pose`` (3,) and the estimated
+    pose ``guess``."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_PER_METRE * travelled
     return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)

@@ -189,8 +189,8 @@ class Monoslam(Filter):
         return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
-        """Return the planar poses at the ticks. In a known map they are smoothed with later images, unless the setting ``smooth``
-        is off. If points are estimated, they are the causal poses."""
+        """Return the planar poses at the ticks (the times at which a run records the pose). In a known map, later images smooth
+        the poses unless the setting ``smooth`` is off. If points are estimated, the poses are the causal ones."""
         is_known = self._settings.landmarks == "known"
         records = smoothed(self._records) if self._smooth and is_known else self._records
         ticks = np.unique(np.array(self._ticks))
@@ -248,8 +248,8 @@ class Monoslam(Filter):
         self._state = replace(state, image_odometry=self._odometry)
 
     def _match(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
-        """Return the state before an image, and the matches of the image. If points are estimated and the image shows that the
-        wheels slipped, the covariance of the state is increased first."""
+        """Match the image ``m`` with the points. Returns the predicted state and the matches. If points are estimated and the image
+        shows that the wheels slipped, the returned state has a larger covariance."""
         if self._settings.landmarks == "known" or state.image_odometry is None:
             return state, self._matcher.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.image_odometry, self._odometry))
@@ -309,7 +309,7 @@ class Monoslam(Filter):
         return relocated, True
 
     def _is_vague(self, state: SlamState) -> bool:
-        """True if the map is known and the pose is too uncertain for a linearized update."""
+        """True if the map is known and the pose is too uncertain for a Kalman update, which linearizes at the pose."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
@@ -327,8 +327,8 @@ class Monoslam(Filter):
         return SlamState(robot, lost_state.constants, covariance, floor=lost_state.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Return the state after the management of its points: counts of matches, new points, deletion, and conversion of points to
-        x, y, z."""
+        """Update the points of the state after an image: count matches, add new points, delete bad points, and convert points of
+        known depth to x, y, z. Returns the new state."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)
@@ -351,13 +351,13 @@ class Monoslam(Filter):
         return PoseEstimate(self._t, pose, covariance, "localized")
 
     def _pose_covariance(self, robot: RobotState, covariance: Array) -> Array:
-        """Return the covariance (6, 6) of a pose. It includes the uncertainty of the camera's mounting or, if the map is unknown,
-        that of the start pose."""
+        """Return the covariance (6, 6) of the pose in ``robot``. It includes the uncertainty of the camera's mounting or, if the
+        map is unknown, of the start pose. ``covariance``: of the error state."""
         return covariance[:6, :6] + (self._mounting if self._origin is None else self._origin.of_pose(robot))
 
     def _record(self) -> UpdateRecord:
         s = self._state
-        # without a step, it is a second measurement at the same time
+        # without a prediction since the last record, this record is a second measurement at the same time
         step = self._step or standstill(self._records[-1].robot if self._records else s.robot)
         self._step, relocalized, self._relocalized = None, self._relocalized, False
         return UpdateRecord(self._t, step, s.robot, s.constants, s.covariance[: s.base, : s.base].copy(), relocalized)

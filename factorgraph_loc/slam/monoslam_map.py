@@ -13,9 +13,11 @@ from factorgraph_loc.slam.monoslam_state import Eye, MapPoint, SlamState
 from factors.camera import inverse_depth
 from factors.se2 import Array, Integers
 
-# 1/m: prior of a new point. It is so vague that the priors of many points together do not determine the scale
+# 1/m: mean and standard deviation of the prior inverse depth of a new point. The prior is so wide that many points together do not
+# determine the scale of the map.
 INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0
-FEWEST_TRIALS, LEAST_FOUND = 8, 0.5  # after so many predictions, a point is deleted if a smaller fraction was matched
+# A point is deleted if it was expected in at least FEWEST_TRIALS images and matched in a smaller fraction of them than LEAST_FOUND.
+FEWEST_TRIALS, LEAST_FOUND = 8, 0.5
 
 
 def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
@@ -36,8 +38,8 @@ def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> Sla
 
 
 def settled(state: SlamState, eye: Eye) -> SlamState:
-    """Convert points from inverse depth to x, y, z if their depth is certain enough for this, by the linearity index of Civera et
-    al. Returns the new state."""
+    """Convert points from inverse depth to x, y, z if their depth is certain enough, judged by the linearity index of Civera,
+    Davison and Montiel (2008). Returns the new state."""
     position, _ = eye.pose(state.robot)
     rays = [i for i, p in enumerate(state.points) if p.ray]
     if not rays:
@@ -64,7 +66,7 @@ def settled(state: SlamState, eye: Eye) -> SlamState:
 
 
 def counted(state: SlamState, expected: Sequence[int], matched: Collection[int], t: float) -> SlamState:
-    """Return the state with updated counts of an image at time ``t`` [s].
+    """Return the state after counting for each point whether an image at time ``t`` [s] should show it and matches it.
 
     ``expected``: indices of the points that should be visible in the image. ``matched``: indices of the points that were matched.
     """
@@ -79,8 +81,8 @@ def counted(state: SlamState, expected: Sequence[int], matched: Collection[int],
 def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
     """Delete points that are often not matched, and points with a negative inverse depth.
 
-    Returns the new state and the number of these points. If more than ``most`` points remain, the points that were not matched
-    for longest are deleted too. These are not counted.
+    Returns the new state and the number of these points. If more than ``most`` points remain, the points with the oldest matches
+    are deleted too, but not counted.
     """
     failed = {
         i

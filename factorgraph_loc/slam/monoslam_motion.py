@@ -21,7 +21,8 @@ ROBOT = 12  # number of values of the robot's error state
 TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 UPRIGHT = [0, 1, 5]  # the components bounded by the floor: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # the velocities of height, roll and pitch
-# s, time constants of the return of roll, pitch and height to zero: fixed tilt sigma; tilt sigma learnt from images
+# s: time constants with which roll, pitch and height return to zero. SETTLING: the standard deviation of the tilt is fixed. UNEVEN:
+# it is estimated from images.
 SETTLING, UNEVEN = 1.0, 3.0
 SHORTEST = 1e-3  # s, shortest interval for the computation of a velocity
 
@@ -80,9 +81,10 @@ class Step:
         return result
 
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
-        """Return this step followed by another step, which does not depend on the constants of the odometry.
+        """Return this step followed by another step, as one step.
 
-        ``transition``, ``noise`` (12, 12): those of the other step. ``robot``: the state after the other step.
+        ``transition``, ``noise`` (12, 12): of the other step, which must not depend on the constants of the odometry. ``robot``:
+        the state after the other step.
         """
         return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
 
@@ -98,7 +100,7 @@ class Origin:
     covariance: Array
 
     def of_pose(self, robot: RobotState) -> Array:
-        """Return the contribution of the start's covariance to the covariance (6, 6) of a later pose, which ``robot`` has."""
+        """Return the part of the covariance (6, 6) of the later pose in ``robot`` that comes from the uncertain start pose."""
         turn = robot.rotation.T @ self.robot.rotation
         back = robot.rotation.T @ (self.robot.position - robot.position)
         adjoint = np.zeros((6, 6))
@@ -107,7 +109,8 @@ class Origin:
         return np.asarray(adjoint @ self.covariance @ adjoint.T)
 
     def of_point(self, point: Array) -> Array:
-        """Return the contribution of the start's covariance to the covariance (3, 3) of a ``point`` (3,) in the world frame."""
+        """Return the part of the covariance (3, 3) of a ``point`` (3,) in the world frame that comes from the uncertain start
+        pose."""
         rotation = self.robot.rotation
         jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
         return np.asarray(jacobian @ self.covariance @ jacobian.T)

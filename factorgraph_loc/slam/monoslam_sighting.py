@@ -34,7 +34,7 @@ from factors.se2 import Array, Integers
 from factors.update import GATE
 
 CLEARANCE = 15.0  # px: smallest distance in the image between a new point and all other points
-FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # relocalization by named points: least number and least fraction of inliers
+FEWEST_FOUND, SHARE_FOUND = 5, 0.5  # least number and fraction of inliers, to relocalize by points with names
 FEWEST_MATCHES = 3  # with fewer matches, none is rejected
 
 
@@ -63,7 +63,7 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     i = np.arange(count)
     distances[i, i], covariances[i, i] = squared(residual, each), each
     inside = distances < GATE
-    # a very uncertain point agrees with every correction: such an agreement has a low score
+    # the score of an agreement is low if the point is very uncertain, because such a point agrees with every correction
     information = np.log(np.linalg.det(each)[:, None] / np.linalg.det(covariances))
     best = int(np.argmax(np.where(inside, GATE - distances + information, 0.0).sum(axis=0)))
     return _confirmed(residual, total, inside[:, best])
@@ -101,7 +101,7 @@ class Match:
     """The inlier matches of an image: M points of the state and then P points of the map.
 
     ``pixels`` (M + P, 2): the matched pixels. ``mapped``: indices of the M points of the state.
-    ``points`` (P, 3): positions of the points of the map. ``covariances`` (P, 3, 3): theirs, or None if they are negligible.
+    ``points`` (P, 3): positions of the points of the map. ``covariances`` (P, 3, 3): of these positions, None if negligible.
     ``taken``: rows of the image that are matched. ``expected``: indices of the points of the state that should be matched.
     ``wanted``: number of map points that should be matched; 0 if they are too few to conclude that the pose is lost.
     ``tempering``: the exponent of the likelihood of map points, at most 1, because their errors are correlated.
@@ -167,9 +167,9 @@ class FeatureMatcher:
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
         """Return the rows of an image that may become new points of the state.
 
-        If the measurement has features, these are unmatched features with a track in the previous image (``tracks``). They have a
-        distance from matched and predicted pixels. If the measurement has names, these are the names that are neither in the map
-        nor in the state.
+        A feature may become a point if it is not matched, belongs to one of ``tracks`` (the feature tracks of the previous image),
+        and is far enough from matched and predicted pixels. A named pixel may become a point if its name is neither in the map nor
+        in the state.
         """
         if m.frame is None:
             known_names = {p.name for p in state.points}
@@ -245,7 +245,7 @@ class FeatureMatcher:
         associations = self._associator.guided(m, eye.predicted(state))
         if associations.rejected:
             self._diagnostics.reject(DISAGREES, associations.rejected)
-        # if new points are added, keep all matches: a feature that matches the map must not become a new point
+        # if new points are added, keep outlier matches too, so that a feature that matches the map does not become a new point
         chosen = spread_out(m.pixels[associations.features], len(associations) if self._grows else MOST)
         return list(
             zip(associations.features[chosen].tolist(), associations.points[chosen].tolist(), strict=True)
@@ -316,7 +316,7 @@ def _slip(match: Match, state: SlamState, eye: Eye, added: Array) -> float:
     """
     sights = eye.all(state, match.mapped, match.points, match.covariances)
     covariance = Innovation.of(sights, state.covariance).total(sights.noise)
-    # all points of unknown depth have the same initial depth: their errors are common, as after a slip
+    # all points of unknown depth have the same initial depth, so their errors are correlated and resemble a slip
     depths = np.minimum(sights.starts + inverse_depth.SIZE - 1, len(state.covariance) - 1)
     alike = (sights.by_point[:, :, -1] * np.sqrt(state.covariance[depths, depths])[:, None]).ravel()
     by_pose = sights.by_pose[:, :, PLANAR].reshape(-1, 3)

@@ -86,7 +86,7 @@ class SlamState:
 
     @property
     def base(self) -> int:
-        """The number of error values before those of the points."""
+        """The number of values of the error state that precede the points."""
         return ROBOT + len(self.constants)
 
     def starts(self) -> Integers:
@@ -121,8 +121,8 @@ class SlamState:
 def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
     """Return the state ``posterior`` with an updated standard deviation of the robot's tilt.
 
-    ``prior``, ``posterior``: the states before and after the update by an image at time ``t`` [s]. The evidence is the change of
-    tilt since the previous image, because the position of a point has the error of the tilt from which it was first observed.
+    ``prior``, ``posterior``: the states before and after the update by an image at time ``t`` [s]. Only the change of the tilt
+    since the previous image is used, because the tilt at the first observation of a point also displaces the point.
     """
     if prior.floor is None or prior.image_odometry is None or t <= prior.image_odometry.t:
         return replace(posterior, floor=prior.floor)
@@ -130,7 +130,7 @@ def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
     share = -math.expm1(-2.0 * (t - prior.image_odometry.t) / UNEVEN)  # fraction of the tilt's variance that is new
     was, now = (positive.inverse(s.covariance[:2, :2]) for s in (prior, posterior))
     gained, known = now - was, prior.covariance[:2, :2] - share * sigma**2 * np.eye(2)
-    weight = np.linalg.inv(np.eye(2) + gained @ known)  # the part of the evidence that concerns the new tilt
+    weight = np.linalg.inv(np.eye(2) + gained @ known)  # the part of the information that is on the change of tilt
     covariance = positive.inverse(share * weight @ gained + np.eye(2) / sigma**2)
     tilt = math.sqrt(share) * covariance @ weight @ now @ (tilt_of(posterior.robot) - tilt_of(prior.robot))
     return replace(posterior, floor=prior.floor.learnt(tilt, covariance, sigma)[0])

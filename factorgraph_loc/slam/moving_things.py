@@ -25,9 +25,9 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 MAX_TIME = 2.0  # s between two images that are compared
-ENOUGH = 8  # least number of tracks that agree with the odometry and not with another turn
-EXPLAINED = 0.8  # least fraction of the disagreeing tracks that another turn must explain
-# rad: additional turns that are tried, and their standard deviation
+ENOUGH = 8  # least number of tracks that agree with the odometry but not with another rotation of the robot
+EXPLAINED = 0.8  # least fraction that another rotation must explain, of the tracks that disagree with the odometry
+# rad: additional rotations of the robot that are tried to explain tracks, and the standard deviation of such a rotation
 TURNS, TURN_SIGMA = np.linspace(-0.6, 0.6, 61), 0.01
 FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m: bounds of a point's distance; number of distances that are tried
 
@@ -46,7 +46,8 @@ class MovingThings:
         self._doubts = False  # True while the newest image has tracks on moving objects
 
     def is_static(self, name: Hashable) -> bool:
-        """True if a track is static. While the image shows moving objects, only tracks that agreed with the odometry are static."""
+        """True if the feature track ``name`` is on a static object. While the image shows moving objects, only tracks that agreed
+        with the odometry count as static."""
         return name not in self.moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
@@ -84,13 +85,13 @@ class MovingThings:
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
-    """Search another turn of the robot that explains the tracks that disagree with the odometry. Returns a mask (K,) of the tracks
-    that fit this turn.
+    """Search another rotation of the robot that explains the feature tracks that disagree with the odometry. Returns a mask (K,) of
+    the tracks that fit this rotation.
 
     ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion of the odometry between the images.
     ``right`` (K,): mask of the tracks that agree with ``step``.
-    The result is False everywhere if most tracks agree with ``step``, or if no turn explains the fraction :data:`EXPLAINED` of the
-    disagreeing tracks.
+    The result is False everywhere if most tracks agree with ``step``, or if no rotation explains the fraction :data:`EXPLAINED` of
+    the disagreeing tracks.
     """
     best, unexplained = right, ~right
     if 2 * np.count_nonzero(unexplained) >= len(right):

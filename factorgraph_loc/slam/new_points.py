@@ -21,10 +21,10 @@ from factors.camera.model import CameraModel
 from factors.camera.triangulation_kernels import MIN_PARALLAX
 from factors.se2 import Array
 
-FEWEST, MAX_WAITING = 3, 10  # least number of sightings of a point, and the number of newest sightings that are stored
+FEWEST, MAX_WAITING = 3, 10  # least number of sightings to triangulate a point; most sightings stored of a point
 MAX_SPREAD = 0.15  # largest standard deviation of a new point, relative to its least depth in the images
 GATE = 0.999  # probability of the chi-square test of the residuals
-PATIENCE = 20  # keyframes after which a point not seen again is dropped
+PATIENCE = 20  # number of keyframes without a sighting after which a point is dropped
 UPRIGHT = np.zeros(2)
 
 
@@ -102,7 +102,7 @@ class NewPoints:
         return len(self.waiting.get(name, ()))
 
     def add(self, name: Hashable, sighting: PointSighting) -> None:
-        """Add a sighting of the point ``name``. If the point then has more than :data:`MAX_WAITING`, the oldest is dropped."""
+        """Add a sighting of the point ``name``. If it then has more than :data:`MAX_WAITING` sightings, the oldest is dropped."""
         waiting = self.waiting.setdefault(name, [])
         waiting.append(sighting)
         del waiting[:-MAX_WAITING]
@@ -120,7 +120,7 @@ class NewPoints:
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
-        """Triangulate the points ``names``, and stop collecting those with a result.
+        """Triangulate the points ``names``. The sightings of a triangulated point are returned and no longer collected.
 
         ``places``: a function that returns the camera pose of a keyframe by number, or None for a keyframe that accepts no factors.
         ``most``: the largest number of results.

@@ -35,7 +35,7 @@ class PointMapper(UnknownPoints):
         self.knows_scale = len(camera.points.map) > 0
         self._things = MovingThings(model)
         self._taken = -math.inf
-        self._tracks: set[Hashable] = set()  # of the last keyframe, without those on moving objects
+        self._tracks: set[Hashable] = set()  # feature tracks of the last keyframe, without tracks on moving objects
 
     def is_due(self, m: Pixels) -> bool:
         return m.t - self._taken >= KEYFRAME_INTERVAL or self._has_lost_features(m)

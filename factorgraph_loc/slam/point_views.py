@@ -23,7 +23,7 @@ from factors.camera.kernels import NEAREST
 from factors.camera.model import CameraModel, camera_pose, linearize_in_space
 from factors.se2 import Array
 
-VIEW_DISTANCE, VIEWS = 0.5, 4  # m travelled between two views of a point in a map, and largest number of its views
+VIEW_DISTANCE, VIEWS = 0.5, 4  # m: distance travelled between two stored views of a point; most views of a point
 NOISE = 3.0  # px: standard deviation of the predicted pixel of a lost point, in addition to the error of the pose
 FARTHEST = 15.0  # m: largest depth of a lost point that is searched
 

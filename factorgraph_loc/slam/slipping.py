@@ -34,7 +34,7 @@ def unless_slipped(
 ) -> Guess:
     """Return the predicted pose of a new keyframe. If the image shows that the wheels slipped, its covariance is increased.
 
-    In this case also the covariance of ``keyframe.from_previous``, the motion since the previous keyframe, is increased in place.
+    The motion ``keyframe.from_previous`` since the previous keyframe then also gets a larger covariance, in place.
     ``guess``: the predicted pose and its covariance. ``slip``: a function of a motion. It returns the covariance (3, 3) that slip
     adds, and minus the logarithm of the probability of slip. ``observed``: the positions (K, 3) of observed points, their pixels
     (K, 2), the covariances (K, 3, 3) of the positions, and those (K, 2, 2) of the pixels [px^2].
@@ -76,7 +76,7 @@ def _evidence(
         return 0.0
     factor = ReprojectionFactor(model, points[agrees], pixels[agrees], point_covariances=of_points[agrees])
     update = image_update(factor, pose, covariances[1], ITERATIONS, SETTLED)
-    # the information that the image alone adds
+    # the covariance of the image alone, without the prediction
     posterior = positive.inverse(update.covariance)
     gained = positive.inverse(positive.nearest(posterior - positive.inverse(covariances[1])))
     off, gained = gained @ posterior @ update.delta, gained + COMMON_COVARIANCE

@@ -39,20 +39,20 @@ from factors.camera.point import PointFactor, PointPrior
 from factors.graph import VectorPriorFactor, point_key, tilt_key
 from factors.se2 import Array
 
-PER_KEYFRAME, MOST_WAITING = 40, 160  # largest number of estimated points per keyframe, and of other points
+PER_KEYFRAME, MOST_WAITING = 40, 160  # largest numbers per keyframe of points in the graph, and of points not yet added
 STRIKES = 2  # consecutive outliers
 LEVEL = np.zeros(2)  # no tilt
 PRIOR_SIGMA = 30.0  # m: weak prior of a point, about the size of a building
-SEARCH_TIME = 10.0  # s for which a lost point is searched: later, too many other points resemble it
-RECENT = 5.0  # s: the error of a point observed within this time is correlated with the error of the track
-LEAST_INLIERS = 0.5  # required fraction of inliers among points not observed recently: descriptors may agree by chance
-REVISITED = 6  # so many inliers among features not observed recently are accepted, even if recent points disagree
+SEARCH_TIME = 10.0  # s: time for which a lost point is searched. Later, too many other points resemble it.
+RECENT = 5.0  # s: the error of a point observed within this time is correlated with the error of the robot's pose
+LEAST_INLIERS = 0.5  # least fraction of inliers among old points, because descriptors may agree by chance
+REVISITED = 6  # this many inliers among old points are accepted, even if points observed recently disagree
 
 
 @dataclass
 class _Point:
-    """A point of the graph. ``key``: its variable. ``last`` [s]: the time of its last sighting. ``information`` (3, 3): the
-    information of its sightings, for exact poses. ``strikes``: the number of consecutive outliers."""
+    """A point of the graph. ``key``: its variable. ``last`` [s]: the time of its last sighting. ``information`` (3, 3): the inverse
+    covariance of its position from all sightings, if their poses are exact. ``strikes``: the number of consecutive outliers."""
 
     key: int
     last: float
@@ -88,7 +88,8 @@ class UnknownPoints(Mapper):
         self._cameras = KeyframeCameras(model, estimated)
         self._loops = LoopClosure()
         self._distance_travelled = 0.0  # m
-        self._names_by_track: dict[Hashable, Hashable] = {}  # for points that were found again by another track
+        # the name of a point by the feature track that shows it, if this is not the track that the point was added with
+        self._names_by_track: dict[Hashable, Hashable] = {}
 
     def take_rows(
         self,
@@ -124,7 +125,7 @@ class UnknownPoints(Mapper):
         return self._cameras.at_stamp(keyframe.index, (pose, guess[1]), graph)
 
     def _chosen(self, image: _NewImage, rows: Sequence[int], names: Sequence[Hashable]) -> ChosenSightings:
-        """Select rows that are spread over the image. ``names``: the name of the point of each of the ``rows``."""
+        """Select some of the ``rows`` of the image, spread over the whole image. ``names``: the name of each row's point."""
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         pixels = np.asarray(image.m.pixels[list(rows)], dtype=float)
         chosen = spread_out(pixels, PER_KEYFRAME + MOST_WAITING, priority).tolist()
@@ -157,7 +158,7 @@ class UnknownPoints(Mapper):
     def _add_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, most: int, movers: MovingThings
     ) -> Array:
-        """Collect the sightings of points that are not in the graph, and add at ``most`` this many determined points to the graph.
+        """Collect the sightings of points that are not in the graph. Add at most ``most`` of these points, if triangulated, to it.
 
         Returns the pose (3,) of the keyframe. It is adjusted if the points of the graph do not determine it.
         """
@@ -190,11 +191,12 @@ class UnknownPoints(Mapper):
         return pose
 
     def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
-        """Return the name of the point of each row. The point of a feature has the number of the track that it was added with."""
+        """Return the name of the point in each row of the image. A point of a feature has the number of the feature track in which
+        it was first observed. Lost points are searched, and keep their name in another track."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
-        gone = self._points.keys() - set(tracks)  # the track that a point was added with may appear again
+        gone = self._points.keys() - set(tracks)  # a point has its own track again if that track appears again
         self._names_by_track = {track: name for track, name in self._names_by_track.items() if name in gone}
         names: list[Hashable] = [self._names_by_track.get(track, track) for track in tracks]
         assigned = set(names)
@@ -212,12 +214,12 @@ class UnknownPoints(Mapper):
         return names
 
     def _follow(self, track: Hashable, name: Hashable) -> None:
-        """Assign the point ``name`` to ``track``, and to no other track."""
+        """Note that the feature track ``track`` shows the point ``name``, and that no other track shows it."""
         self._names_by_track = {new_track: of for new_track, of in self._names_by_track.items() if of != name}
         self._names_by_track[track] = name
 
     def _revisited(self, image: _NewImage, guess: Guess, rows: Sequence[int], names: list[Hashable]) -> set[int]:
-        """Recognize points last observed long ago (loop closure). Returns their rows, and writes their names into ``names``."""
+        """Recognize points last observed long ago (loop closure). Returns their rows, and changes ``names`` in place."""
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
         if frame is None or not self._loops.is_due(image.m.t):
             return set()
@@ -255,7 +257,7 @@ class UnknownPoints(Mapper):
         guess: Guess,
     ) -> None:
         """Store the views of the points ``names`` in the ``rows`` of a frame. ``right``: mask of the inliers. ``keyframe``: key of
-        its pose. An outlier's track is separated from the point if it is not the track that the point was added with."""
+        the keyframe's pose. If an outlier is not in the point's first track, its track is separated from the point."""
         for row, name, agrees in zip(rows, names, right.tolist(), strict=True):
             if agrees:
                 point = self._points[name].key
@@ -334,7 +336,7 @@ class UnknownPoints(Mapper):
         observed = positions[recent], pixels[recent], covariances[recent], noise[recent]
         guess = unless_slipped(replace(model, tilt=sigma), keyframe, guess, graph.motion.slip, observed)
         since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
-        near = guess if since is None else (guess[0], since)  # covariance relative to the recent points
+        near = guess if since is None else (guess[0], since)  # with the covariance relative to recent points
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
         # a named point needs one other point that confirms it
         revisited = max(2 if named else REVISITED, math.ceil(LEAST_INLIERS * np.count_nonzero(~recent & ~known)))
