@@ -27,7 +27,8 @@ from factors.se2 import Array
 from factors.sighting import Marginalized, SightingFactor
 from factors.update import CONVERGED, Correction, update_state
 
-Blocks = Mapping[str, Array]  # values of blocks by the name of the block, or their covariances
+# values (d,) of blocks of the state, such as constants of a sensor or a landmark, by the name of the block; or their covariances
+Blocks = Mapping[str, Array]
 Columns = Mapping[str, slice]  # the components of an error state that belong to each block, by the name of the block
 
 
@@ -147,8 +148,9 @@ class Binding:
     """The arguments that bind a sensor to a run.
 
     ``setup``: rig, map and sensors of the run, with at most one sensor of the kind. ``motion``: the odometry.
-    ``use``: how landmarks of the map are used. ``points``: how points are used that one measurement does not locate.
-    ``calibration``: which uncertain constants the estimator learns. ``name``: that of one of several sensors, otherwise "".
+    ``use``: known to use the map's landmarks only, extended to estimate other landmarks too, unknown to estimate all landmarks.
+    ``points``: the same for image points and for landmarks that are observed by range alone or bearing alone.
+    ``calibration``: which uncertain constants the estimator learns. ``name``: the name of one of several sensors, otherwise "".
     """
 
     setup: Setup
@@ -290,19 +292,22 @@ class Sensor:
         return False
 
     def accept(self) -> None:
-        """Stop the suspicion, because a search has confirmed the track. The model or the map is wrong instead."""
+        """End the suspicion that the pose is wrong (``suspicious_since``), because a search found no better pose. The sensor's
+        model or the map is wrong instead."""
 
     def gathered(self, observations: Sequence[Any]) -> list[Term]:
         """Merge the observations on one pose into few factors of a graph."""
         return [term for observation in observations for term in observation.terms]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return a factor for the final solution, whose robust loss is ``width`` times as wide. None omits the factor if
-        ``width`` is above 1."""
+        """Return the factor for the solution of the whole graph after a run, with the scale of its robust loss times ``width``.
+
+        A width above 1 occurs in the first steps of graduated non-convexity. Returns None to omit the factor in these steps.
+        """
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
-        """Return the factor, at least 1, by which the loss of a link must be widened to be convex at ``values``."""
+        """Return the number, at least 1, by which the scale of the loss of ``factor`` must grow to make it convex at ``values``."""
         return 1.0
 
     def rewind(self, t: float) -> None:

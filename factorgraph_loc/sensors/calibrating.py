@@ -173,7 +173,10 @@ class ConstantsCalibrator(Calibrator):
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the completed result. ``_rig``: the rig with the estimated constants."""
+        """Return ``knowledge`` with additions of a subclass, such as noise or plots.
+
+        ``_parts``: the data of each log, from :meth:`part`. ``_rig``: the rig with the estimated constants.
+        """
         return knowledge
 
     def learn(
@@ -197,8 +200,10 @@ class ConstantsCalibrator(Calibrator):
         return self.finished(parts, rig.model_copy(update=dict(knowledge.sections)), knowledge)
 
     def estimated(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any, Posterior | None]:
-        """Return data, settings and posterior with the constants and the noise of maximal posterior density. The posterior is
-        None if there are no constants to estimate."""
+        """Estimate the constants and the noise of maximal posterior density, from the data ``parts`` of the logs.
+
+        Returns the data and ``settings``, both with the estimates, and the posterior of the constants, None without constants.
+        """
         parameters = self.parameters(parts, settings)
         start = {p.name: p.mean for p in parameters}
         posterior = None
@@ -221,8 +226,8 @@ class ConstantsCalibrator(Calibrator):
     def _constants(
         self, parts: Sequence[Any], settings: Any, initial: Any, posterior: Posterior
     ) -> list[FittedConstant]:
-        """Return the fitted constants. With several logs, each log is also fitted alone, and the differences between logs give
-        the uncertainty of each constant."""
+        """Return the fitted constants of ``posterior``. With several logs, each log is also fitted alone, and the differences
+        between logs give the uncertainty of each constant. ``initial``: the settings before the fit."""
         values = posterior.as_dict()
         own = centred(posterior.parameters, values)
         alone = [

@@ -34,7 +34,7 @@ class Channel:
     tables is an optional column of the sensor's first channel, such as ``rssi`` of ``rfid``.
     ``described``: descriptions of further tables, whose columns are the fields of measurements but not of files.
     ``assemble``: ``(rows by table, reading) -> stream``, if the fields of the stream are not columns of a table.
-    ``disassemble``: ``(stream, writing) -> columns by table``, likewise.
+    ``disassemble``: ``(stream, writing) -> columns by table``, the inverse of ``assemble``.
     ``check``: ``(measurement, where) -> validated fields``, for pushed measurements whose fields are not columns of a table.
     ``intake``: a subclass of :class:`~factorgraph_loc.sensors.tables.Intake`, which is constructed from rig and world.
     """
@@ -148,8 +148,8 @@ def sensor_of(channel: str) -> SensorType:
 
 
 def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
-    """Return the channels among ``names`` that measure motion on the floor. With ``rank``
-    :data:`~factorgraph_loc.model.measurement.TURN` include channels that measure only rotation."""
+    """Return the channels among ``names`` that measure motion on the floor. If ``rank`` is
+    :data:`~factorgraph_loc.model.measurement.TURN`, channels that measure only rotation are included."""
     streams = {name: channels()[kind_of(name)].streams for name in names if kind_of(name) in channels()}
     return tuple(name for name, kinds in streams.items() if kinds and kinds[0].rank <= rank)
 

@@ -67,7 +67,7 @@ def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Correcti
     """Return mean and scatter of ``corrections``, each given with its standard deviation.
 
     The variance between logs is the variance of the corrections minus the part that their own errors explain. It is averaged
-    with the variance ``known`` squared of the input rig, which has the weight of :data:`WORTH` logs.
+    with the square of ``known``, the standard deviation in the input rig, which has the weight of :data:`WORTH` logs.
     """
     each, errors = np.array(corrections).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))

@@ -240,8 +240,10 @@ def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] 
 
 
 def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[str, Any]]:
-    """Yield name and validated value of each field of a measurement. Fields correspond to the columns of a table. Values are
-    numbers, or names and arrays (K,) if a measurement consists of K rows."""
+    """Yield name and validated value of each field of a measurement whose fields are the columns of a table of ``channel``.
+
+    Values are numbers, or names and arrays (K,) if a measurement consists of K rows. ``where``: the measurement's name in errors.
+    """
     table = _table_of(type(m), channel)
     count: int | None = None
     for column in table.columns[1:]:

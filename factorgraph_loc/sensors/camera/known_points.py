@@ -142,7 +142,7 @@ class KnownPoints:
         twist: Array | None = None,
         displaced: Mapping[str, tuple[Array, Array]] = NOT_DISPLACED,
     ) -> ReprojectionFactor | None:
-        """Return the factor of the known points in an image without outliers, or None if there are none.
+        """Return the factor of the known points in an image after outliers are removed, or None if no points remain.
 
         ``offset``: the motion from the pose that the factor depends on to the image, None if the times are equal.
         ``twist`` (3,): the robot's velocity at the image. It is required if the camera's time offset is estimated.

@@ -206,11 +206,11 @@ def bind(binding: Binding) -> CameraSensor | None:
 
 
 CLEAR, CLEAR_SHARE = 8, 0.5  # a single image is sufficient if it has this number and fraction of inliers
-AGREEING = 3  # otherwise so many images must agree
+AGREEING = 3  # number of images that must agree if no single image is sufficient
 KEPT = 5.0  # s; older images are discarded
 APART = 25.0  # two poses disagree if their squared Mahalanobis distance is larger
 LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m^2, m^2, rad^2; added to covariances of poses by images
-POOR_FRAMES, POOR_TIME = 3, 0.3  # a track is suspicious if points are missing in so many images, for so long [s]
+POOR_FRAMES, POOR_TIME = 3, 0.3  # number of images and time [s] with missing points that make a track suspicious
 SEARCH_INTERVAL = 1.0  # s between unsuccessful searches
 
 
@@ -244,7 +244,7 @@ class PixelFinder:
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
-        """The pose by the last image as the only hypothesis, or ()."""
+        """The pose by the last image as the only hypothesis, or () if no image has determined a pose."""
         if not self._fixes:
             return ()
         last = self._fixes[-1]

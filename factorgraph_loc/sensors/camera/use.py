@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 
 def check(use: Use) -> Use:
-    """Return the run, with changed settings if the map has no points for the camera. The points are then estimated
-    (``landmarks=unknown``), with a warning. This requires an estimator that can, no other sensor that needs a map, and no
-    choice by the user."""
+    """Return the run. If the map has no points for the camera, change the setting ``landmarks`` to ``unknown``, so that the
+    points are estimated, and add a warning. The setting is changed only if the user has not set it, the estimator can estimate
+    points, and no other sensor of the run needs a map."""
     motion = moving(use.sensors, TURN)
     unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use)
     if "landmarks" in use.given or not unmapped or any(name not in (*CAMERAS, *motion) for name in use.sensors):

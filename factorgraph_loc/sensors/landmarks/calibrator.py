@@ -128,8 +128,9 @@ class LandmarkCalibrator(ConstantsCalibrator):
     first, rounds = FIRST, 4
 
     def part(self, log: Log) -> Sightings:
-        """Return the sightings of mapped landmarks at least ``MAX_OFFSET`` inside the time span of the reference. Of many,
-        every n-th timestamp is used. Raises InputError if there are fewer than ``MIN_SIGHTINGS``."""
+        """Return the sightings of mapped landmarks at least ``MAX_OFFSET`` inside the time span of the reference. If there are
+        more than ``MOST_SIGHTINGS``, only every n-th timestamp is used. Raises InputError if there are fewer than
+        ``MIN_SIGHTINGS``."""
         stream, reference = log.streams["bearing_range"], log.reference
         assert isinstance(stream, BearingRangeStream)
         assert reference is not None
@@ -185,8 +186,11 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def estimated(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings, Posterior | None]:
-        """Return sightings, settings and posterior of the best fit. Ranges are fitted as distances and as depths. The other
-        kind replaces the given one only if its range errors are clearly smaller (``BETTER_KIND``)."""
+        """Return ``parts`` and ``settings`` with the estimates of the best fit, and its posterior.
+
+        Ranges are fitted as distances and as depths. A kind of range other than the one in ``settings`` is chosen only if its
+        range errors are clearly smaller (``BETTER_KIND``).
+        """
         given = super().estimated(parts, settings)
         if not any(np.any(np.isfinite(part.ranges) & np.isfinite(part.bearings)) for part in parts):
             return given

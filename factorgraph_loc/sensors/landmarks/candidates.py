@@ -35,7 +35,9 @@ ITERATIONS, REFINEMENTS = 20, 8  # largest numbers of iterations, with independe
 CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m; iterations end if a step is shorter than the first; longest step
 FLAT = 1e-4 * np.eye(2)  # information of the nearly flat prior [1/m^2]
 NEAR, MOST_FUSED = 0.5, 8  # m; minimum distance between distinct positions; largest number of distinct positions
-MARGIN = 12.0  # minimum excess of the losses of other positions; more if the median squared residual is above TYPICAL
+# the best position is unambiguous if the loss of each other position is larger by MARGIN, which is multiplied by the median squared
+# residual over TYPICAL if that is above 1
+MARGIN = 12.0
 TYPICAL = 0.455  # median of the square of a standard normal residual
 MISFIT = 2.0  # if the mean loss of a sighting is above this, the best position is rejected
 ACCURATE, SHARE = 0.3, 0.15  # largest accepted standard deviation: m, or fraction of the distance if larger
@@ -151,7 +153,8 @@ class _PathSightings:
         self._common += np.einsum("iap,pq,jbq->ijab", turns, uncertainty, turns)
 
     def positions(self) -> list[LocatedPoint]:
-        """Return distinct positions of the landmark by increasing loss, and the mirror image of the best initial one."""
+        """Return possible positions of the landmark, sorted by loss: the distinct local optima, and a position that is refined from
+        the mirror image of the best of them."""
         starts = self._starts()
         points = self._refined(starts)
         points = points[np.argsort(self._losses(points))]

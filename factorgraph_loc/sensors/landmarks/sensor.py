@@ -200,7 +200,7 @@ class LandmarkSensor(Sensor):
         self._landmarks = KnownLandmarks(
             settings, world, self._diagnostics, use, constants.indices, carries=True, locates=locates, biased=biased
         )
-        # factors for the search of the pose; its own diagnostics, so that no sighting is counted twice
+        # makes factors for the search of the pose, with separate diagnostics, so that no sighting is counted twice
         self._sought = KnownLandmarks(settings, world, Diagnostics())
         self._shared = (self.name,) if constants.names else ()
         self._new: NewLandmarks = NewLandmarks()
@@ -342,8 +342,8 @@ def _rotation(heading: float) -> Array:
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:
-    """Return the landmark sensor of a run, or None if the run does not use it. The particle filter does not estimate its time
-    offset."""
+    """Return the landmark sensor of a run, or None if the run does not use it. The particle filter does not estimate the
+    sensor's time offset."""
     settings = binding.setup.rig.find(BearingRangeSettings)
     if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
         return None

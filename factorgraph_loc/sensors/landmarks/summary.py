@@ -42,7 +42,7 @@ UNKNOWN_LANDMARK = "landmark {landmark} is not in the map: {sightings} sightings
 MIN_SIGHTINGS = 10  # minimum number of sightings to judge a landmark
 MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
 PASS = 10.0  # s; errors within such a time interval are correlated, so intervals are counted, not sightings
-MIN_PASSES = 3  # minimum number of these intervals
+MIN_PASSES = 3  # minimum number of intervals of length PASS with sightings, to judge a landmark
 MOST = 2000  # number of sightings that are compared at time shifts
 TALL = 0.5  # m; minimum difference of heights that is reported
 MOUNTING = (0.5, 0.0, 0.0, 0.0)  # m, m, m, rad: initial height, x, y and rotation for the fit of a mounting
@@ -269,8 +269,8 @@ def _cost(errors: Array) -> float:
 
 
 def check(use: Use) -> Use:
-    """Raise InputError if the chosen estimator cannot locate the landmarks of the log. This is so if it needs ranges with
-    bearings, and no sighting has both or shows a mapped landmark that is used. Otherwise return ``use`` unchanged."""
+    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate the landmarks of the log: it needs sightings with
+    range and bearing, no sighting has both, and no landmark of the map is used and sighted."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
     if wanted == "known" or use.estimates_points or not streams:

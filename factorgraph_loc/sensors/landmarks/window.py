@@ -21,8 +21,8 @@ from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
 RECENT = 6  # number of landmarks whose last sightings generate candidates
-CIRCLE = 72  # number of candidate headings for a pose that has sighted one landmark
-HEADINGS = 24  # number of candidate bearings of that landmark if its bearing is not measured
+CIRCLE = 72  # number of candidate headings of a pose from the sighting of one landmark
+HEADINGS = 24  # number of candidate bearings of this landmark if the sighting has no bearing
 RADII = (0.7, 1.5, 3.0, 6.0)  # m; candidate ranges if the range is not measured
 BASELINE = 0.3  # m; minimum distance of two landmarks that determine a heading
 CONVERGED = 1e-4  # m, rad; a candidate whose step is smaller is not refined further
@@ -71,7 +71,7 @@ class SightingWindow:
         return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
 
     def circles(self) -> Array:
-        """Return candidates (N, 3) of the present pose that agree with the last sighting. At that time they lie around its
+        """Return candidates (N, 3) of the present pose that agree with the last sighting: poses on a circle around the sighted
         landmark."""
         k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 class LoopSettings(SensorSettings):
     """Noise of loop closures that another program found. A rig without this section has the defaults.
 
-    The standard deviations are those of a loop of score 1. A loop of score s has standard deviations that are 1/s times as
-    large. The robust loss rejects it at sqrt(s) times the distance.
+    The settings apply to a loop of score 1. A loop of score s has standard deviations that are 1/s times as large. The robust loss
+    rejects it already at a residual [m, rad] that is sqrt(s) times the residual at which it rejects a loop of score 1.
     """
 
     sigma_position: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")] = 0.1

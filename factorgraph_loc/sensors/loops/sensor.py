@@ -45,7 +45,7 @@ class LoopSensor(Sensor):
             if np.isfinite(x):
                 measured = np.array((x, y, heading))
                 sigmas = np.array((settings.sigma_position, settings.sigma_position, settings.sigma_heading))
-            # sigmas grow by 1/score, so a limit of sqrt(score) times the distance is score^1.5 times as many sigmas
+            # the limit of the residual [m] is proportional to sqrt(score), and sigma to 1/score: their ratio to score^1.5
             scale = settings.robust * wider**-1.5
             factor = LoopFactor(measured, wider * sigmas, view.offset, earlier.offset, scale)
             yield Link(m.t, earlier.t, factor, factor.rows)

@@ -240,8 +240,8 @@ class OdometryCalibrator(ConstantsCalibrator):
         return windows
 
     def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
-        """Return the constants to estimate, with priors. Delay, lag and slowdown only exist for commanded velocities. Wheels
-        with encoders have hardly any bias per time, so its priors are narrow."""
+        """Return the constants to estimate, with priors. Delay, lag and slowdown only exist for commanded velocities. The priors
+        of biases per time are narrower for wheels with encoders, which have hardly any such bias."""
         commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
         by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s; prior sigmas
         priors = {
@@ -261,7 +261,8 @@ class OdometryCalibrator(ConstantsCalibrator):
     ) -> tuple[Sequence[Windows], OdometrySettings]:
         """Return the windows with robust standard deviations of their errors, separately for windows in motion and at rest.
 
-        All windows in motion have equal standard deviations. Those of the noise model would favour windows with little motion.
+        All windows in motion have equal standard deviations. The standard deviations of the noise model are not used, because they
+        would give windows with little motion too much weight.
         """
         errors, moves = [], []
         for part in parts:

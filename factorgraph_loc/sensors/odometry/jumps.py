@@ -56,8 +56,8 @@ def jumps(stream: VelocityStream | IncrementStream) -> list[Jump]:
 
 
 def _outliers(rates: Array, least: float) -> Integers:
-    """Return the indices of ``rates`` (N,) that differ from the median of their neighbours by more than ``least``, and by a
-    factor."""
+    """Return the indices of ``rates`` (N,) that differ from the median of their neighbours by more than ``least``, and that are
+    more than FACTOR times as large as this median."""
     padded = np.pad(rates, 2, mode="edge")
     usual = np.median([padded[2 + k : len(padded) - 2 + k] for k in AROUND], axis=0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))

@@ -150,8 +150,8 @@ class PositionFinder:
         self.best = PosePrior(now.t, pose, covariance) if agree and covariance[2, 2] < HEADING**2 else None
 
     def _on(self, now: ChainState, row: Row) -> PositionFactor:
-        """Return the factor of an earlier position on the pose at ``now``. Its offset is the inverse of the motion since the
-        position, with the covariance in the body frame of the earlier pose."""
+        """Return the factor of the earlier position ``row``, changed to depend on the pose at ``now``. The factor's offset is the
+        inverse of the motion since the position, with the covariance in the body frame of the earlier pose."""
         step = self._motion.relative(row.odometry, now)
         carried = se2.adjoint(step.delta)
         back = Increment(se2.inverse(step.delta), carried @ step.covariance @ carried.T, step.duration, step.still)

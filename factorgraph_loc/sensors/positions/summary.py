@@ -49,8 +49,10 @@ def summarize(log: Log) -> Summary:
 
 
 def _ratio(log: Log, t: Array, places: Array) -> float | None:
-    """Return the median ratio of travelled distances, positions ``places`` (N, 2) at ``t`` (N,) to odometry, over spans of
-    time. Returns None if the robot hardly moves."""
+    """Return the median, over spans of time, of the distance by positions divided by the distance by odometry.
+
+    ``places`` (N, 2): the positions at the times ``t`` (N,). Returns None if the robot hardly moves.
+    """
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return None

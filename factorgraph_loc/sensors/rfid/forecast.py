@@ -27,7 +27,9 @@ from factors.se2 import Array
 
 COARSE = 3  # ratio of the size of cells, in position and height, to that of the antennas' tables
 FACINGS = 24  # number of facing directions of tags
-UNREAD = 1e-3  # a tag is out of range if no antenna exceeds the probability of a false read by this
+UNREAD = (
+    1e-3  # a tag is out of range if no antenna has a probability of a read that is this much above that of a false read
+)
 MOST_LOOKS = 1 << 16  # largest number of measurements of a path; measurement k has the same random numbers on all paths
 
 
@@ -35,7 +37,7 @@ class ScanTables(NamedTuple):
     """Tables of the response of A antennas to T tags, for simulated scans, made of :class:`~factors.rfid.places.RobotTables`.
 
     A table has C = H F S S cells: H heights, F facings (the last for an unknown one), and S x S positions in the robot frame.
-    ``read`` (C, A): probability q of a read. ``gain`` (A, C): its logit.
+    ``read`` (C, A): probability q of a read. ``gain`` (A, C): log(q / (1 - q)).
     ``missed`` (C,): sum over antennas of log(1 - q), minus its value for a tag out of range.
     ``silent`` (C,): sum over antennas of log(1 - q), 0 out of range.
     ``size``: S. ``layers``: F. ``cell``: size of a cell [m].

@@ -140,7 +140,7 @@ class KnownTags:
         return self.antennas[antenna]
 
     def temper(self, tempering: float) -> None:
-        """Set the exponent of the likelihood to ``tempering``, or to that of the rig if this is smaller."""
+        """Set the exponent of the likelihood to the smaller of ``tempering`` and the rig's setting ``tempering``."""
         new = min(self._tempering, tempering) * self.trust
         if new != self.likelihood.model.tempering:
             self.likelihood = self.likelihood.tempered(new)
@@ -335,8 +335,8 @@ class TagSignals:
         return RfidFactor(self.phase, reads) if len(reads.phase) else None
 
     def forget(self, since: float) -> None:
-        """Delete the scans since the time ``since`` [s], because they will be processed again. It is at most :data:`GOING_BACK`
-        ago."""
+        """Delete the scans since the time ``since`` [s], because they will be processed again. ``since`` is at most
+        :data:`GOING_BACK` before the last scan."""
         while self._rows and self._rows[-1][0] >= since:
             self._rows.pop()
         while self._ended and self._ended[-1] >= since:

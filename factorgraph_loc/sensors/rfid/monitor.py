@@ -36,7 +36,7 @@ class SilenceMonitor:
 
     def __init__(self) -> None:
         self._evidence = 0.0
-        self.lasts = False  # True if the last scan was part of such a failure
+        self.lasts = False  # True if the reader or the tags had failed at the last scan
 
     def add(self, reads: int, evidence: float) -> bool:
         """Add a scan: its number of ``reads``, and its log-probability ``evidence`` at the predicted pose. Returns True during
@@ -89,8 +89,8 @@ class ScanMonitor:
         self.suspicious_since = None
 
     def _sums(self) -> tuple[float, float, int]:
-        """Return the sum of the surprises, the sum of their variances, and the number of the scans of the last DURATION
-        seconds."""
+        """Return sums over the scans of the last DURATION seconds: of ``surprise``, of ``variance`` (see :meth:`add`), and the
+        number of these scans."""
         excess, variance, count = 0.0, 0.0, 0
         for t, surprise, own in reversed(self._scans):
             if t <= self._scans[-1][0] - DURATION:
@@ -99,7 +99,7 @@ class ScanMonitor:
         return excess, variance, count
 
     def _beginning(self) -> float:
-        """Return the time [s] at which the suspicion begins. It maximises the sum of the surprises after it."""
+        """Return the time [s] at which the suspicion begins: the sum of ``surprise`` (see :meth:`add`) after it is largest."""
         total, most, begin = 0.0, -math.inf, self._scans[-1][0]
         for t, surprise, variance in reversed(self._scans):
             # one standard deviation is subtracted, so that scans with the expected likelihood reduce the sum

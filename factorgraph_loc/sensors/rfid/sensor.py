@@ -180,8 +180,8 @@ class TagSensor(Sensor):
         return not self._wheels.is_slipping and self.suspicious_since is None and t >= self._confirmed
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, counts: TagReadCounts) -> TagObservation:
-        """Return the observation of reads and misses. ``moved``: relative to the pose that the observation depends on.
-        ``counts``: relative to the pose at the scan's time."""
+        """Return the observation of the reads and misses of a scan. ``counts``: the reads and misses, relative to the pose at the
+        scan's time. ``moved``: the same reads and misses, relative to the pose that the observation depends on."""
         factor = RfidFactor(self.tags.likelihood, moved, self.constants.indices)
         return TagObservation(m.t, factor, int(counts.hits.sum()), counts, len(m.antennas), self._blocks)
 
@@ -288,9 +288,9 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return the factor without tags that are clearly dead, weak or moved. Other tags have the odds before their scan,
-        because a scan must not be used twice. Returns None for phases while losses are wide (``width`` above 1), because phases
-        have local optima centimetres apart."""
+        """Return the factor without tags that are clearly dead, weak or moved. The probability that another tag is dead, weak or
+        moved remains that from before the scan, because a scan must not be used twice. Returns None for phases if ``width`` is
+        above 1, because phases have local optima centimetres apart."""
         factor = cast(RfidFactor, factor)
         if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None

@@ -165,11 +165,11 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
 
 
 def _require_all(inventories: TableRows) -> None:
-    """InputError if rows were skipped or sorted, as reads name them by their number."""
+    """Raise InputError if rows of ``inventories`` were skipped or sorted, because reads refer to the rows by number."""
     first, rows = int(inventories.rows.min(initial=2)), inventories.rows
     if first > 2 or np.any(rows != np.arange(first, first + len(rows))):
         raise InputError(
-            f"{inventories.path}: rows are skipped or sorted, but the reads name them by number in the column inventory: remove it"
+            f"{inventories.path}: rows are skipped or sorted, but reads refer to them by number: remove their column inventory"
         )
 
 

@@ -57,7 +57,8 @@ from factors.rfid.parameters import OF_MODEL
 from factors.se2 import Array
 
 DEFAULT = "default"
-CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)  # differences between the days of one installation
+# prior of a calibrated model: standard deviations of the changes from day to day in one installation
+CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)
 MIN_READS = 100.0  # minimum number of weighted reads for the fit of a model
 COEFFICIENT = "coefficient of "
 VAGUE = 0.5  # a parameter with a larger relative standard error is not determined
@@ -179,7 +180,8 @@ def _mean(
     name: str, corrections: Sequence[tuple[float, float]], initial: float, value: float, prior: float
 ) -> FittedConstant | None:
     """Return a constant that is the same in all logs: ``value`` plus the mean of its ``corrections``, each with a standard
-    deviation. It has the ``initial`` value if the logs do not determine it. Returns None without corrections."""
+    deviation. It has the ``initial`` value if the logs do not determine it. Returns None without corrections.
+    ``prior``: the standard deviation of the constant before the calibration."""
     if not corrections:
         return None
     each, errors = np.array(corrections).T

@@ -113,8 +113,8 @@ def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integ
 def overdispersion(
     hits: Array, count: Array, p: Array, antenna: Integers, tag: Integers, block: Integers
 ) -> tuple[float, float]:
-    """Return the overdispersion of reads, at least 1, and its standard error. It is the number of rounds with the information
-    of one independent round.
+    """Return the overdispersion of reads, at least 1, and its standard error. An overdispersion of n means that n correlated
+    rounds have as much information as one independent round.
 
     ``hits``, ``count``, ``p`` (M,): reads, rounds, and predicted probability of a read in one round. ``antenna``, ``tag``,
     ``block`` (M,): indices of antenna, tag and block of time. The overdispersion is the ratio of the variance of the reads of a
