@@ -20,7 +20,6 @@ RENDERED_RUNS, RENDERED_DURATION = 5, 300.0  # with images: number of drives, an
 FIRST, FIRST_RENDERED = 5000, 7000  # first seeds; those of images are the same as in the section office
 POINTS = 600
 NO_MAP = {"landmarks": "unknown"}
-TARGET = 0.15  # m
 ODOMETRY = ("odometry",)
 
 
@@ -40,7 +39,7 @@ def section(options: Options) -> Report:
     report.say(
         "The start pose is known to 0.1 m and 0.05 rad. Only tags reduce its error later. *Aligned*: the final "
         "trajectory is aligned "
-        f"with the reference, which removes the error of the start pose. Target: {TARGET} m."
+        "with the reference, which removes the error of the start pose."
     )
     for name, runs, usual, first, folder in (
         ("identified", RUNS, DURATION, FIRST, None),

@@ -38,28 +38,22 @@ ALL, SEEN = ("odometry", "rfid", "sightings"), ("odometry", "sightings")
 
 @dataclass(frozen=True)
 class Steps:
-    """A run whose steps are timed. ``what``: a description for the table. ``changes``: settings of the simulation. ``target``
-    [ms]: the targets of median and 99th percentile, as a text."""
+    """A run whose steps are timed. ``what``: a description for the table. ``changes``: settings of the simulation."""
 
     what: str
     changes: Mapping[str, Any]
     config: RunConfig
-    target: str
 
 
 STEPS = (
-    Steps("20 known points and all antennas, 10 Hz", KNOWN, RunConfig("smoother", {"lag": 10.0}, ALL), "0.3"),
-    Steps("the same, full history", KNOWN, RunConfig("smoother", {"lag": "all"}, ALL), ""),
-    Steps("the same", KNOWN, RunConfig("ekf", {}, SEEN), ""),
-    Steps("the same", KNOWN, RunConfig("particle_filter", {"smooth": False}, ALL), ""),
-    Steps("20 known points, 10 Hz", KNOWN, RunConfig("monoslam", {"smooth": False}, SEEN), ""),
-    Steps(
-        "20 unknown points, a keyframe each", KEYFRAMES, RunConfig("smoother", {**NO_MAP, "lag": 10.0}, SEEN), "2 / 8"
-    ),
-    Steps("the same, full history", KEYFRAMES, RunConfig("smoother", NO_MAP, SEEN), ""),
-    Steps(
-        "20 unknown points, 100 in the state, 5 Hz", {}, RunConfig("monoslam", {**NO_MAP, "max_points": 100}, SEEN), "3"
-    ),
+    Steps("20 known points and all antennas, 10 Hz", KNOWN, RunConfig("smoother", {"lag": 10.0}, ALL)),
+    Steps("the same, full history", KNOWN, RunConfig("smoother", {"lag": "all"}, ALL)),
+    Steps("the same", KNOWN, RunConfig("ekf", {}, SEEN)),
+    Steps("the same", KNOWN, RunConfig("particle_filter", {"smooth": False}, ALL)),
+    Steps("20 known points, 10 Hz", KNOWN, RunConfig("monoslam", {"smooth": False}, SEEN)),
+    Steps("20 unknown points, a keyframe each", KEYFRAMES, RunConfig("smoother", {**NO_MAP, "lag": 10.0}, SEEN)),
+    Steps("the same, full history", KEYFRAMES, RunConfig("smoother", NO_MAP, SEEN)),
+    Steps("20 unknown points, 100 in the state, 5 Hz", {}, RunConfig("monoslam", {**NO_MAP, "max_points": 100}, SEEN)),
 )
 
 
@@ -91,7 +85,7 @@ def chain(report: Report, options: Options) -> None:
             f"The log has {links.images} images of 640 x 480 px with at most {COUNT} features (`{links.feature}`) each, "
             "and a map of "
             f"{links.points} points. {os.cpu_count()} threads detect features, the other steps use one thread. *Smooth*: the "
-            "smoother without *associate*. Targets: 15 images/s, 10 % of the time for *smooth*."
+            "smoother without *associate*."
         )
         whole = links.find + links.follow + links.associate + links.smooth
         parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}
@@ -99,7 +93,7 @@ def chain(report: Report, options: Options) -> None:
         heads = (*(f"{name} [ms]" for name in ("detect", "track", "associate", "smooth")), "images/s")
         report.table(heads, [(*cells, f"{links.images / whole:.1f}")])
     for rate in report.collect(rendered, {"renderer": ()}, workers=1).values():
-        report.say(f"The renderer makes {rate:.1f} images/s on one core; target: 20.")
+        report.say(f"The renderer makes {rate:.1f} images/s on one core.")
 
 
 def estimators(report: Report, duration: float) -> None:
@@ -111,13 +105,13 @@ def estimators(report: Report, duration: float) -> None:
         "the run. *Learnt*: estimated points."
     )
     rows = []
-    for (i, _), (ms, points, learnt) in report.collect(timed, jobs, workers=1).items():
+    for (i, _), (ms, learnt) in report.collect(timed, jobs, workers=1).items():
         steps, half = STEPS[i], ms[len(ms) // 2 :]
         median, p99, worst = np.median(ms), np.percentile(ms, 99), ms.max()
         step = f"{median:.2f} / {p99:.2f} / {worst:.1f}"
         later = f"{np.median(half):.2f} / {np.percentile(half, 99):.2f}"
-        rows.append((steps.what, steps.config.estimator, step, later, steps.target, f"{points:.1f}", learnt))
-    heads = ("what", "estimator", "median / p99 / max [ms]", "second half", "target", "points an image", "learnt")
+        rows.append((steps.what, steps.config.estimator, step, later, learnt))
+    heads = ("what", "estimator", "median / p99 / max [ms]", "second half", "learnt")
     report.table(heads, rows)
 
 
@@ -177,15 +171,13 @@ def spent(owner: object, name: str) -> Iterator[list[float]]:
         setattr(owner, name, function)
 
 
-def timed(steps: Steps, duration: float) -> tuple[np.ndarray, float, str]:
-    """Run and time the steps. Returns the time (M,) [ms] of each step, the mean number of points per image, and the number of
-    estimated points as a text."""
+def timed(steps: Steps, duration: float) -> tuple[np.ndarray, str]:
+    """Run and time the steps. Returns the time (M,) [ms] of each step, and the number of estimated points as a text."""
     run(simulate(preset("office", changed(steps, WARM_UP)), SEED + 1), steps.config)
     log = simulate(preset("office", changed(steps, duration)), SEED)
-    _, counts = np.unique(log.streams["sightings"].t, return_counts=True)
     result = run(log, steps.config)
     learnt = str(len(result.learnt.landmarks)) if steps.config.estimator == "monoslam" else NOTHING
-    return result.timings.update_ms, float(counts.mean()), learnt
+    return result.timings.update_ms, learnt
 
 
 def changed(steps: Steps, duration: float) -> dict[str, Any]:
