@@ -37,8 +37,8 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 
 @dataclass(frozen=True)
 class ProximityReading:
-    """A reading of a proximity sensor, by which the particles of a search can be weighed. ``lengths`` (D,) [m]: the measured free
-    lengths."""
+    """A reading of a proximity sensor as an observation of the search, which weighs particles by it. ``lengths`` (D,) [m]: the
+    measured free lengths in D directions."""
 
     sensor: ProximitySensor
     lengths: Array
@@ -51,8 +51,8 @@ class ProximityReading:
 
 
 class ActiveMcl:
-    """The estimator ActiveMCL: particles in the free ``space`` of a building, for an unknown start. ``particles``: their least
-    number."""
+    """The estimator ActiveMCL: a particle filter in the free ``space`` of a building, for an unknown start. ``particles``: the
+    least number of particles."""
 
     deterministic = False
     supports_unknown_start = True
@@ -82,8 +82,8 @@ class ActiveMcl:
             self._search.look(measurement, self._motion.state(measurement.t))
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
-        """Weigh the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. There is no effect before the
-        first scan."""
+        """Weigh the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. A reading is ignored
+        before the particles have processed a measurement of another sensor."""
         self._search.queue(ProximityReading(sensor, lengths), self._motion.state(self._t))
         self._search.advance(self._t)
 
@@ -114,7 +114,7 @@ class ActiveMcl:
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """Return the causal estimates at the ticks."""
+        """Return the causal estimates at the ticks, the times at which the run recorded the pose."""
         poses = np.array([r.pose for r in self._records]).reshape(-1, 3)
         covariances = np.array([r.covariance for r in self._records]).reshape(-1, 3, 3)
         return Trajectory(np.array([r.t for r in self._records]), poses, covariances)

@@ -40,13 +40,13 @@ from factors.se2 import Array
 NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes with smaller differences are merged
 SHOWN = 300  # number of particles of a belief that are stored in the result
 SAMPLES = 2000  # number of particles that are drawn from a belief without particles
-WRONG = 3.0  # an estimator that claims to be localized is wrong if an error exceeds its limit by this factor
+WRONG = 3.0  # a localized estimate counts as wrong if an error exceeds this multiple of its limit in the settings
 MODES, LIKELY = 3, 0.05  # largest number and least weight of the modes from which paths to distant places are planned
 WAYPOINTS = 40  # number of places that are spread over free space
 TAGS, PLACES = 8, 6  # numbers of nearest tags and of nearest waypoints to which paths are planned
 READING_DISTANCE = 0.5  # m driven between two readings of the proximity sensor
 PAUSE = 1.0  # s that the robot waits if no path is free
-SLACK = 0.2  # m: particles may be nearer to walls than the robot by this distance, which is the size of a cell
+SLACK = 0.2  # m: particles may be nearer to walls than the robot by this distance, the size of a cell of free space
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,8 @@ class ActiveRun:
     ``localized``: True if the robot was localized correctly; the run then ends.
     ``metres`` [m], ``seconds`` [s]: distance and time at the end of the run.
     ``error_position`` [m], ``error_heading`` [rad]: the errors of the estimate at the end.
-    ``claimed_wrong``: True if at some time the estimator claimed to be localized with an error above three times a limit.
+    ``claimed_wrong``: True if the estimate ever had the status ``localized`` with an error above :data:`WRONG` times the limit of
+    the settings.
     ``truth``: the true trajectory. ``steps``: the choices of paths.
     """
 
@@ -109,9 +110,9 @@ def run_active(
 ) -> ActiveRun:
     """Simulate a robot that drives from an unknown start until it is localized or gives up.
 
-    ``policy``, ``estimator``: their names. Runs with the same ``seed`` have the same world, start and noise sequences, for all
-    policies and estimators. Raises InputError for a wrong policy, estimator or start, and for a sensor with a higher rate than the
-    robot's control. Raises RunFailedError if the estimator fails.
+    ``policy``, ``estimator``: the names of both. Runs with the same ``seed`` have the same world, start and noise sequences, for
+    all policies and estimators. Raises InputError for an unknown policy or estimator, for a start that is not free, and for a
+    sensor with a higher rate than the robot's control. Raises RunFailedError if the estimator fails.
     """
     loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()
@@ -163,8 +164,8 @@ class _ClosedLoop:
         self.claimed_wrong = False
         self._settings = settings
         self._paths, self._turn = primitives(settings.policy.horizon), full_turn()
-        self._proximity_at = -math.inf  # metres driven at the last proximity update of the particles
-        self._turned_at = -math.inf  # metres driven when the robot last turned around
+        self._proximity_at = -math.inf  # m: the driven distance at the last reading of the proximity sensor
+        self._turned_at = -math.inf  # m: the driven distance at the last full turn in place
         self._sensors = Sensors.of(
             world, simulation.rig, simulation, settings.speed, settings.turn_rate, only=robot.sensors
         )

@@ -41,17 +41,17 @@ from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
 POSITION, POSE = 2, 3  # number of leading coordinates of a pose (x, y, heading) whose entropy is computed
-CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; an integer number of headings
+CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; a full turn has 20 cells
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: a standard deviation below these values is not counted as a gain
-# m between stations, where measurements are predicted. A station represents all measurements over this distance
+# m: distance along a path between two stations. Measurements are predicted at stations only, for the whole distance to the next.
 STATION_DISTANCE = 1.5
 MOST_STATIONS = 10  # largest number of stations; on a longer path they are farther apart
-SAMPLES, SCANS = 256, 48  # number of particles that are weighted, and number of drawn scans
+SAMPLES, SCANS = 256, 48  # number of particles that a scan weighs, and number of scans that are simulated
 FEWEST = 10  # least number of particles
-SEVERAL = 0.5  # nats: a belief has several modes if the entropy of a Gaussian with its covariance is larger by this
-WIDEST_HEADING = 0.8  # rad: largest standard deviation of a Gaussian heading
+SEVERAL = 0.5  # nats: a belief has several modes if a Gaussian of equal covariance has more entropy by this
+WIDEST_HEADING = 0.8  # rad: with a larger standard deviation, the heading counts as unknown and not as Gaussian
 SPEED = 0.5  # m/s: converts noise of the odometry per second to noise per metre
-METRES_PER_RADIAN = 0.5  # of a robot that turns in place at 1 rad/s
+METRES_PER_RADIAN = 0.5  # m: a robot with a turn rate of 1 rad/s drives this far in the time of a turn by one radian
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,9 +144,9 @@ def expected_gain(
 
     ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is that of the pose at its end.
     ``space``: a particle whose path leads into a wall stops there and makes no further measurements.
-    ``places`` (M,): the mode of each particle. If given, the entropy of the mode index is used instead of that of the pose.
+    ``places`` (M,): the index of each particle's mode. If given, the entropy of this index is computed and not that of the pose.
     ``noise``: the noise of the odometry on the path; None means no noise.
-    ``samples``: the number of particles that are weighted. ``scans``: the number of particles at which measurements are drawn.
+    ``samples``: the number of particles that a scan weighs. ``scans``: the number of particles at which measurements are simulated.
     """
     if not paths:
         return np.empty(0)
@@ -155,7 +155,7 @@ def expected_gain(
         systematic(weights, rng, samples if len(particles) < FEWEST else min(samples, len(particles)))
     )
     poses = np.ascontiguousarray(particles[rows], dtype=float)
-    # if modes are given: put all particles of a mode into one cell of the histogram
+    # if modes are given, all particles of a mode are put into one cell of the histogram
     cells = None if places is None else np.multiply.outer(places[rows] + 0.5, (CELL[0], 0.0, 0.0))[None]
     count = len(poses)
     scans = min(scans, count)
@@ -180,7 +180,7 @@ def expected_gain(
         # the entropy at the end of the path, or at the last station if the robot stops before
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
         if cells is not None or (several and noise is None):
-            # without noise, the entropy at the start is equal, apart from the alignment with the histogram's cells
+            # without noise of the odometry, the entropy at the start can be used: a motion changes only which cells are occupied
             index = np.zeros_like(index)
         weighed = at if cells is None else cells
         posterior[c] = _entropies(weighed, index, np.exp(log_weights), POSE, several=several)
@@ -189,8 +189,8 @@ def expected_gain(
 
 def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, several: bool) -> Array:
     """Return J entropies of particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of each
-    entropy.
-    ``weights`` (J, M): the weights for each entropy. ``several``: use a histogram instead of a Gaussian."""
+    entropy. ``weights`` (J, M): the particles' weights for each entropy. ``dims``: the number of leading coordinates that are
+    considered. ``several``: True to use a histogram, False to use a Gaussian."""
     if several:
         out = np.empty(len(index))
         particle_kernels.cell_entropies(poses, index, weights, CELL, dims, out)

@@ -28,8 +28,8 @@ from factors import se2
 from factors.se2 import Array
 
 NOTHING = 0.3  # nats: a smaller gain is not significant, because the expectation is noisy
-FEW = 0.6  # distant places are evaluated if the modes have a larger total weight
-EACH, OF_MODES = 48, 96  # particles drawn from each mode, and those of them that are weighted
+FEW = 0.6  # paths to distant places are evaluated if the few main modes have a larger total weight than this
+EACH, OF_MODES = 48, 96  # particles drawn from each mode, and number of all these that a simulated scan weighs
 COMMITTED = 0.5  # fraction of an arc that is completed before the next choice
 FAR = "waypoint"  # kind of the paths to distant places
 FAR_PER_METRE = 0.02  # nats/m: small cost, so that the shorter of equally informative paths is chosen
@@ -42,7 +42,7 @@ NEAR = 3  # number of nearest tags whose mean distance is compared
 class Situation:
     """The input of a policy.
 
-    ``particles`` (M, 3), ``weights`` (M,): the belief. ``modes``: its significant modes. ``sensors``: predict measurements.
+    ``particles`` (M, 3), ``weights`` (M,): the belief. ``modes``: its significant modes. ``sensors``: models of the sensors.
     ``space``: the free space between walls. ``candidates``: C paths. ``free`` (C,) [m]: the length of each path that is free of
     walls, at most the range of the proximity sensor.
     """
@@ -79,7 +79,8 @@ Policy = Callable[[Situation], Choice]
 
 
 def information(s: Situation, sign: float = 1.0) -> Choice:
-    """Choose the path with the largest expected information. ``sign``: -1 gives the policy as printed in the paper.
+    """Choose the path with the largest expected information. With ``sign`` -1, the least informative path is preferred, as the
+    paper prints it.
 
     Near paths are evaluated first. If no near path is worth its cost and the belief has few modes, paths to distant places are
     evaluated. If these are not informative either, or if the pose is unknown, the robot patrols.
@@ -121,8 +122,8 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """Return the expected information (C,) [nats] of long paths about which mode is true, or about the pose if there is one mode.
 
-    The pose of particles is not evaluated. On a long path particles diverge and run into walls, which the real robot avoids by
-    planning again.
+    With several modes, the entropy of the particles' poses is not used. On a long path particles diverge and run into walls, which
+    the real robot avoids by planning again.
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
@@ -142,7 +143,7 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
-    """Return the costs (K,) [nats] of the candidates with the indices ``rows`` (K,)."""
+    """Return the costs (K,) [nats] of the lengths of the candidates with the indices ``rows``. ``per_metre``: cost per metre."""
     return per_metre * np.array([s.candidates[i].length for i in rows])
 
 
@@ -179,7 +180,7 @@ def patrol(s: Situation) -> Choice:
 
 
 def nearest_tags(s: Situation) -> Choice:
-    """Choose the path whose end is nearest to tags, on average over the belief."""
+    """Choose the path with the smallest mean distance from its end to the nearest tags, on average over the belief."""
     if not len(s.sensors.goals) or not s.candidates:
         return patrol(s)
     rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())

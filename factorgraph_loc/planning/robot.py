@@ -29,11 +29,11 @@ from factors import se2
 from factors.se2 import Array
 
 SIGMA = 0.3  # m: standard deviation of a measured length
-UNEXPECTED = 0.05  # likelihood of an outlier, relative to the Gaussian's peak
+UNEXPECTED = 0.05  # constant likelihood of outliers, relative to the peak of the Gaussian of other lengths
 TEMPERING = 0.25  # exponent of the likelihood
 # names of the random generators; append only, because the order determines the random sequences
 DRAWS = ("constants", "steps", "rfid", "lengths", "landmarks")
-PERIOD = 1.0 / wheels.RATE  # s between two rows of odometry, and between two control steps
+PERIOD = 1.0 / wheels.RATE  # s between two odometry measurements, and between two control steps
 BETWEEN = 5  # collision checks between two poses of a path
 
 
@@ -123,7 +123,7 @@ class SimulatedRobot:
         return tuple(channel for channel, sensor in self._order if sensor.decides or not any_decides)
 
     def begin(self) -> Iterator[Measurement]:
-        """Yield the measurements before the first motion: a row of odometry without motion, and a measurement of each sensor."""
+        """Yield the measurements before the first motion: one of odometry without motion, and one of each other sensor."""
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
         yield from self._measure()
 

@@ -17,9 +17,9 @@ class PolicySettings(FileModel):
     horizon: Annotated[float, Field(gt=0.0, le=100.0), InUnit("m")] = 3.0
     """length of arcs and straight paths"""
     far: Metres = 25.0
-    """largest length of paths to places"""
+    """largest length of paths to distant tags and places"""
     replan: Metres = 0.5
-    """least distance driven before the next choice; of a longer arc half is driven, of a path to a place all"""
+    """least distance driven before the next choice; at least half of an arc is driven, and all of a path to a distant place"""
     per_metre: Annotated[float, Field(ge=0.0, le=100.0), InUnit("nats/m")] = 0.3
     """cost of the length of an arc or straight path"""
     samples: Annotated[int, Field(ge=8, le=10_000)] = 128

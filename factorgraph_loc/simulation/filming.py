@@ -24,7 +24,8 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
-# JPEG, because PNG is five times as large and ten times as slow. Without chroma subsampling, because features use colours
+# Images are JPEG files, because PNG is five times as large and ten times as slow. The colours are not subsampled, because colour
+# features use them.
 JPEG = (
     cv2.IMWRITE_JPEG_QUALITY,
     95,
@@ -33,7 +34,7 @@ JPEG = (
 )
 MOMENT = 0.02  # s before and after an image, over which the robot's velocity is averaged
 PERIODS, AMPLITUDE = (8.0, 13.0, 29.0), 0.1  # variations of the brightness: periods in s, relative amplitude of each
-FEW = 40  # so few images are rendered by one process, because to start further processes takes longer
+FEW = 40  # at most this many images are rendered by one process, because starting more processes takes longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +143,8 @@ def _write_in_parallel(
     workers: int,
     progress: Callable[[float, float], None],
 ) -> None:
-    """Render ``count`` images by ``workers`` processes. Each process creates the scene and renders every n-th image."""
+    """Render ``count`` images by ``workers`` processes, and write them into ``folder``. Each process creates the scene and renders
+    every n-th image, where n is the number of processes."""
     write = partial(_write, settings, seed, folder)
     parts = [range(i, count, workers) for i in range(workers)]
     for _, outcome in run_each(

@@ -19,7 +19,7 @@ from factors.se2 import Array
 BINS = 2048  # horizontal directions
 LEVELS = 7  # mip levels of a texture, including the original
 TAPS = 4  # largest number of texture samples on an oblique surface
-STEEPEST = 1e3  # largest slant: the ratio by which a pixel is stretched on an oblique surface
+STEEPEST = 1e3  # largest ratio by which the footprint of a pixel is stretched on an oblique surface
 SLACK = 1e-9  # m: overlap of adjacent faces
 NEAREST = 1e-3  # m: a face is invisible if the camera is nearer to its plane
 
@@ -40,9 +40,8 @@ class Surroundings(NamedTuple):
     """The M faces of a building that are visible from a camera position, prepared for ray casting.
 
     ``origin`` (3,) [m]: the camera position. ``table`` (M, 13): the faces, sorted by distance; its columns are the constants of
-    this module. ``starts`` (BINS + 1,), ``items``: a ray in horizontal direction b may hit the rows ``items[starts[b] : starts[b
-    + 1]]``.
-    ``size`` (5,): width, depth and height of the building, and the inverses of width and depth.
+    this module. ``starts`` (BINS + 1,), ``items``: a ray whose horizontal direction is in bin b may hit the rows of the table in
+    ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth, height of the building, inverses of width and depth.
     """
 
     origin: Array
@@ -106,10 +105,10 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size:
 
 @compiled(inline="always", error_model="numpy")
 def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: float, dz: float) -> tuple[int, float]:
-    """Return what the ray along (dx, dy, dz) hits first, and the distance of the hit point.
+    """Return the index of the face that the ray along (dx, dy, dz) hits first, and the distance of the hit point.
 
-    The result is a row of the table, :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`. The distance is in units of the length of
-    the vector (dx, dy, dz). Arguments: see :class:`Surroundings` and ``Place``.
+    The index is a row of the table, or :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`. The distance is in units of the length
+    of the vector (dx, dy, dz). ``table``, ``starts``, ``items``: of :class:`Surroundings`. ``place``: the camera and the building.
     """
     best, row = np.inf, NOTHING
     x0, y0, z0, top, per_width, per_depth = place
@@ -218,7 +217,8 @@ def _shade(
     rotation: Array,
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
-    """Return what the ray along (x, y, 1) in the camera frame hits, as in :func:`cast`, and its colour (blue, green, red)."""
+    """Return the index of the face that the ray along (x, y, 1) in the camera frame hits, as :func:`cast` does, and the colour
+    (blue, green, red) of the hit point."""
     x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
@@ -310,9 +310,9 @@ def develop(
 ) -> NDArray[np.uint8]:
     """Return the 8-bit image (H, W, 3) of a camera sensor, with noise.
 
-    ``light`` (H, W, 3): the rendered colours. ``gain`` (H, W): factor of each pixel. The noise of a pixel with this value has the
-    variance read^2 + shot * value. ``noise`` (H, W, 3): random integers, which select from ``quantiles`` (Q,). Q is a power of
-    two, and the quantiles are those of a distribution with unit variance.
+    ``light`` (H, W, 3): the rendered colours. ``gain`` (H, W): the factor of each pixel. A pixel of value v after this gain has
+    noise of the variance read^2 + shot * v. ``noise`` (H, W, 3): random integers that select from ``quantiles`` (Q,), which are
+    quantiles of a distribution with unit variance. Q is a power of two.
     """
     height, width = gain.shape
     out = np.empty((height, width, 3), dtype=np.uint8)

@@ -29,12 +29,12 @@ Image = NDArray[np.uint8]
 
 ROOM_HEIGHT, DOOR_HEIGHT, HIGHEST_BOX = 2.7, 2.05, 2.0  # m; boxes are furniture
 TEXEL = 0.005  # m: size of a texel; larger in a building that would need more than MOST_TEXELS
-MOST_TEXELS = 50e6  # a texel needs three bytes, and the mip levels a third in addition
-STEP = 2.0  # px: motion between two of the sub-images whose mean is a blurred image
+MOST_TEXELS = 50e6  # largest number of texels of a building; with the mip levels, each needs four bytes of memory
+STEP = 2.0  # px: motion between two sub-images. The mean of the sub-images is an image with motion blur.
 MOST_STEPS = 16  # sub-images
 CHECKED = 8  # rows and columns of the grid of pixels whose motion is computed
 STILL: Array = np.zeros(3)  # no motion
-# quantiles of the normal distribution: to select from these is ten times as fast as to draw normal random numbers
+# quantiles of the normal distribution, because selecting from these is ten times as fast as drawing normal random numbers
 _QUANTILES = ndtri((np.arange(4096) + 0.5) / 4096)
 NORMAL = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
 
@@ -172,7 +172,7 @@ class Renderer:
 
         ``position``, ``rotation``: the camera pose in the middle of the exposure. ``velocity`` (3,) [m/s], ``turn`` (3,) [rad/s]:
         the motion of the camera in the world frame, which blurs the image. ``gain``: factor of the brightness. ``rng``: for the
-        noise; None renders an image without noise.
+        noise of the camera; None renders an image without noise.
         """
         shape = (self.model.height, self.model.width, 3)
         light = np.zeros(shape, dtype=np.float32)

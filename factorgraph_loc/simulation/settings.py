@@ -180,11 +180,11 @@ RACKHAM_RIG: Mapping[str, Any] = {
     },
 }
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
-# Reads with fades, in which a tag is not read for some time. Fades affect the fraction f of the time and have the mean duration
-# d. p is the probability of a read outside of fades. Fades increase the variance of the number of reads in many rounds at
-# intervals dt, by the factor 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p), with rho = exp(-dt / (d (1 - f))). This is 1.9 at p =
-# 0.5. The inverse would be too small as a tempering exponent, because the robot moves. With the exponent 0.7 the causal ANEES of
-# the smoother is 3.0 over six runs of 300 s, which is the ideal value. With 0.6 it is 2.8.
+# During a fade a tag is not read. Fades take the fraction f of the time and have the mean duration d. Outside of fades a round
+# reads the tag with probability p. Fades increase the variance of the number of reads in rounds at intervals dt, by the factor
+# 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p) with rho = exp(-dt / (d (1 - f))). It is 1.9 at p = 0.5. Its inverse would be too
+# small as tempering exponent, because the robot moves. With the exponent 0.7 the causal ANEES of the smoother is 3.0 over six runs
+# of 300 s, which is the ideal value. With 0.6 it is 2.8.
 _BURSTY: Mapping[str, Any] = {
     "faults": {"fading": {"duration": 2.0, "share": 0.2}},
     "rig": {"rfid": {"miss": 0.2, "tempering": 0.7}},
@@ -195,8 +195,8 @@ EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # pairs of keys: a ch
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge nested tables. Returns ``base`` with the values of ``changes``. A table in ``changes`` with another ``kind`` replaces
-    the whole table in ``base``."""
+    """Return the nested table ``base`` with the values of ``changes``. If a table in ``changes`` has another value of the key
+    ``kind`` than the table in ``base``, it replaces the whole table."""
     if "kind" in changes and changes["kind"] != base.get("kind"):
         return dict(changes)
     out = dict(base)
@@ -230,8 +230,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """Return the settings of a preset. ``changes``: nested tables of keys that differ from the preset. Raises InputError for a
-    wrong preset, key or value."""
+    """Return the settings of the preset ``name``. ``changes``: nested tables of the values that differ from the preset. Raises
+    InputError for an unknown preset or key, or for a value out of bounds."""
     content = merged(_preset(name, "the settings"), changes or {})
     return parse_model(SimulationSettings, content, "the settings")
 
@@ -239,8 +239,8 @@ def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSet
 def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
     """Read settings from a TOML file, and apply ``changes``, which are nested tables.
 
-    The key ``preset`` of the file names the preset that the file changes, office if missing. The key ``rig`` may be the path of a
-    rig file in the folder of the settings file. Raises InputError for a file that is not valid.
+    The file changes the settings of a preset. Its key ``preset`` names the preset; the default is ``office``. The key ``rig`` may
+    be the path of a rig file in the folder of the settings file. Raises InputError for a file that is not valid.
     """
     content = read_toml(path)
     base = _preset(content.pop("preset", "office"), path)

@@ -45,8 +45,8 @@ NAMES = (
 )
 LOOKAHEAD = 0.3  # m: distance of the point of the path that the robot steers towards
 STEP = 0.02  # s, control period
-GAIN = 4.0  # rad/s per rad of heading error
-START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations of the stated start pose
+GAIN = 4.0  # 1/s: turn rate of the robot per heading error
+START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations of the start pose that a log states
 
 
 def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.random.Generator:
@@ -143,7 +143,7 @@ def simulate(settings: SimulationSettings, seed: int) -> Log:
 
 
 def simulated(function: Callable[[Ride], Simulated], ride: Ride, name: str) -> Simulated:
-    """Simulate the measurements of the sensor ``name`` by its ``function``.
+    """Simulate the measurements of the sensor ``name`` on the drive ``ride``, by calling the ``function`` of the sensor's kind.
 
     A rig may have several sensors of one kind, with names such as ``camera.front``. Each of them has random generators of its own.
     """

@@ -184,7 +184,9 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     upright = [faces for name, faces in (("wall", walls), ("shelf", boxes)) if name in settings.surfaces]
     faces = np.concatenate(upright) if upright else np.empty((0, 4))
     if settings.surfaces == ("shelf",) and not len(faces):
-        raise InputError(f"world: plan {settings.plan} of this size has no shelves for tags: change surfaces")
+        raise InputError(
+            f"world: plan {settings.plan} of this size has no shelves for tags: add wall or floor to world.surfaces"
+        )
     if plan.hanging and count > len(plan.hanging):
         raise InputError(f"world: tags is {count}, expected at most {len(plan.hanging)} in plan {settings.plan}")
     on_floor = 0
@@ -240,7 +242,7 @@ def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.G
 
 def _even(settings: WorldSettings, count: int) -> Array:
     """Return ``count`` places (count, 3) at equal distances along the two walls of the outline that are parallel to x. For an even
-    count they are symmetric to reflections and half-turns. Columns: see :func:`_places`."""
+    count they are symmetric to reflections and half-turns. The columns are x, y and the direction [rad] away from the wall."""
     below, above = (count + 1) // 2, count // 2
     width, depth = settings.width, settings.depth
     rows = (((0.0, 0.0, width, 0.0), below), ((width, depth, 0.0, depth), above))
