@@ -145,14 +145,17 @@ def _run(recording: rr.RecordingStream, run: StoredRun, colour: Colour) -> None:
 
 
 def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """Draw a whole trajectory, visible at all times."""
+    """Draw a whole trajectory, visible at all times. ``at``: its entity path in Rerun."""
     lines = [_on_floor(part) for part in scene.segments(trajectory)]
     if lines:
         recording.log(at, rr.LineStrips3D(lines, radii=LINE / 2.0, colors=colour), static=True)
 
 
 def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """Draw the path up to the current time, as segments that appear at their times. A gap has no segment."""
+    """Draw the path up to the current time, as segments that appear at their times. A gap has no segment.
+
+    ``at``: the entity path in Rerun.
+    """
     positions = trajectory.poses[:, :2]
     near = np.diff(trajectory.t) <= scene.GAP
     pieces = np.stack((positions[:-1], positions[1:]), axis=1)
@@ -167,7 +170,7 @@ def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Ar
 
 
 def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """Draw the robot over time, as a point, and as an arrow if its heading is known."""
+    """Draw the robot over time, as a point, and as an arrow if its heading is known. ``at``: its entity path in Rerun."""
     if not len(trajectory):
         return
     half = trajectory.poses[:, 2] / 2.0 if trajectory.has_heading else np.zeros(len(trajectory))

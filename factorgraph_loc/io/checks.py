@@ -41,7 +41,7 @@ def require_bounds(log: Log) -> None:
 
 
 def _require(where: str, column: Column, t: Array, values: Array) -> None:
-    """Raise InputError at the first of ``values`` (N,) that is out of bounds by more than rounding.
+    """Raise InputError at the first of ``values`` (N,) that is outside of the bounds of ``column`` by more than rounding.
 
     ``where``: the beginning of the error. ``t`` (N,): the times of the values [s].
     """

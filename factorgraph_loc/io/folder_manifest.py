@@ -141,7 +141,10 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 
 
 def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
-    """Return the settings that describe the table of a map in a world file. EPCs get the letter case of the reads."""
+    """Return the settings that describe the map table with the ``role`` tags or landmarks in a world file.
+
+    If the EPCs in the map and in the reads differ in letter case, a setting converts those of the map.
+    """
     table, reads = roles.tables[role], roles.tables.get("rfid")
     settings = table.mapping(FIELDS[role])
     if role == "tags" and reads is not None:
@@ -219,7 +222,8 @@ def _sides(table: Guess) -> tuple[str, ...]:
 
 
 def _described(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
-    """Return the settings that describe a table in the manifest. ``path``: the folder of the table."""
+    """Return the settings that describe a table with a ``role`` in the manifest. ``roles``: the tables of all roles. ``path``: the
+    folder of the tables."""
     sides = _sides(table) if role == "odometry" else ()
     if sides:
         settings = table.mapping(("t", *sides))
@@ -238,6 +242,7 @@ def _has_headings(table: Guess) -> bool:
 def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], roles: _Roles, path: Path) -> None:
     """Add the distance between the wheels, and the distance per encoder count, to the ``settings`` of odometry.
 
+    ``table``: the table of odometry. ``sides``: its fields of the wheels. ``roles``: the tables of all roles, and remarks.
     Both are estimated from the reference. If that is impossible, they are examples, and a remark asks to replace them.
     """
     settings["track"] = TRACK
@@ -308,7 +313,10 @@ def _each_second(t: Array, values: Array) -> Array:
 
 
 def _counted(table: Guess, sides: Sequence[str]) -> tuple[Array, Array]:
-    """Return the counts (N,) of the left wheels and of the right wheels since the first row. Wrapped counters are unwrapped."""
+    """Return the counts (N,) of the left wheels and of the right wheels since the first row. Wrapped counters are unwrapped.
+
+    ``sides``: the fields of the wheels in the table.
+    """
     steps = {name: wheel_steps(table.values(name), 1.0) for name in sides}
     left, right = (np.mean([steps[name] for name in sides if side in name], axis=0) for side in ("left", "right"))
     return np.append(0.0, np.nancumsum(left)), np.append(0.0, np.nancumsum(right))

@@ -81,7 +81,7 @@ class WheelSizes(FileModel):
 
 
 def wheels_of(left: str, count: int) -> tuple[str, ...]:
-    """Return the names of the columns of two or four wheels. ``left``: the column of the (front) left wheel."""
+    """Return the names of the columns of ``count`` wheels (two or four). ``left``: the column of the (front) left wheel."""
     pair = (left, left.replace("left", "right"))
     return pair if count == 2 else (*pair, *(f"rear_{name}" for name in pair))
 

@@ -80,6 +80,7 @@ class Observation(Protocol):
 
         ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the pose.
         ``columns``: the components of each block. All other components are corrected through their correlation.
+        ``iterations``: the number of linearisations.
         """
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
@@ -269,7 +270,10 @@ class Sensor:
         raise NotImplementedError
 
     def judge(self, observation: Any, correction: Correction, view: View) -> bool:
-        """Record the innovation. ``view`` shows the prediction. Returns False if the observation must not be applied."""
+        """Record the innovation of an observation. Returns False if the observation must not be applied.
+
+        ``correction``: the result of :meth:`Observation.correct`, not yet applied. ``view`` shows the prediction.
+        """
         return True
 
     def evidence(self, m: Any) -> Observation | None:

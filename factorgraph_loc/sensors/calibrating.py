@@ -165,11 +165,12 @@ class ConstantsCalibrator(Calibrator):
         raise NotImplementedError
 
     def parameters(self, parts: Sequence[Any], settings: Any) -> Sequence[Parameter]:
-        """Return the constants to estimate, with priors around the values of ``settings``."""
+        """Return the constants to estimate, with priors around the values of ``settings``. ``parts``: the data of each log."""
         raise NotImplementedError
 
     def with_noise(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any]:
-        """Return data and settings with the noise that the residuals show at the constants of ``settings``."""
+        """Return ``parts``, the data of each log, and ``settings``, both with the noise that the residuals show. The residuals are
+        those at the constants of ``settings``."""
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
@@ -247,7 +248,8 @@ class ConstantsCalibrator(Calibrator):
         return out
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
-        """Return the result for smoothed logs: means of the constants that the smoother estimated in each log."""
+        """Return the result for logs whose trajectories are smoothed: the mean over the logs of each constant that the smoother
+        estimated. ``first``: the rig of the user."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""

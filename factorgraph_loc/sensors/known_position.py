@@ -51,20 +51,21 @@ class KnownPosition:
         return PosePrior(self.t, np.append(self.prior.pose[:2], heading), covariance)
 
     def mode(self, now: ChainState) -> Mode:
-        """Return mean and covariance of the current pose by the start and the odometry alone."""
+        """Return mean and covariance of the pose at the odometry state ``now``, from the start and the odometry alone."""
         x, y, turned = self.motion.relative(self.odometry, now).delta
         covariance = self.prior.covariance.copy()
         covariance[:2, :2] += 0.5 * (x**2 + y**2) * np.eye(2)  # displacement in an unknown direction
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Return candidates (N, 3) of the current pose: the robot starts at the mean position with evenly spaced headings."""
+        """Return candidates (N, 3) of the pose at the odometry state ``now``, after starts at the mean position with evenly spaced
+        headings."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)
 
     def drawn(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
-        """Return random samples (N, 3) of the current pose. Their headings are stratified."""
+        """Return ``count`` random samples (N, 3) of the pose at the odometry state ``now``. Their headings are stratified."""
         moved = self.motion.relative(self.odometry, now)
         positions = self.prior.pose[:2] + positive.draws(self.prior.covariance[:2, :2], count, rng)
         headings = (rng.permutation(count) + rng.random(count)) * 2.0 * math.pi / count - math.pi
@@ -72,28 +73,31 @@ class KnownPosition:
         return se2.compose(poses, se2.exp(positive.draws(moved.covariance, count, rng)))
 
     def loss(self, poses: Array, now: ChainState, noise: Array | None = None) -> Array:
-        """Return half the squared Mahalanobis distance (N,) between the start and the position at which a robot with a current
-        pose (N, 3) has started. ``noise`` (3, 3): an additional body-frame covariance of the current poses."""
+        """Return half the squared Mahalanobis distance (N,) between the known start position and the start positions that
+        ``poses`` (N, 3) at the odometry state ``now`` imply. ``noise`` (3, 3): an additional body-frame covariance of the poses."""
         error, _, covariance = self._linearized(poses, now, noise)
         return np.asarray(0.5 * np.einsum("ni,ni->n", error, positive.solve(covariance, error[..., None])[..., 0]))
 
     def log_density(self, poses: Array, now: ChainState) -> Array:
-        """Return the log prior density (N,) of current poses (N, 3)."""
+        """Return the log prior density (N,) of ``poses`` (N, 3) at the odometry state ``now``."""
         _, _, covariance = self._linearized(poses, now, None)
         normaliser = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1] + math.log(2.0 * math.pi)
         return np.asarray(-self.loss(poses, now) - normaliser)
 
     def normal_equations(self, poses: Array, now: ChainState, noise: Array | None = None) -> tuple[Array, Array]:
-        """Return information (N, 3, 3) and gradient (N, 3) of :meth:`loss` by the body-frame perturbation of current poses."""
+        """Return information (N, 3, 3) and gradient (N, 3) of :meth:`loss` by the body-frame perturbation of ``poses`` (N, 3).
+
+        The other arguments are those of :meth:`loss`.
+        """
         error, jacobian, covariance = self._linearized(poses, now, noise)
         weighted = positive.solve(covariance, jacobian).transpose(0, 2, 1)
         return weighted @ jacobian, (weighted @ error[..., None])[..., 0]
 
     def whitened(self, pose: Array, now: ChainState) -> tuple[Array, Array, Array]:
-        """Return the residual of the start position at a current pose (3,), without the odometry error.
+        """Return the residual (2,) of the start position that ``pose`` (3,) at the odometry state ``now`` implies.
 
-        The residual (2,) is in standard deviations of the known position. Its Jacobian (2, 3) is by the body-frame perturbation
-        of the current pose. The third value is the covariance (3, 3) of the odometry since the start.
+        The residual is in standard deviations of the known position, without the odometry error. Also returns its Jacobian (2, 3)
+        by the body-frame perturbation of the pose, and the covariance (3, 3) of the odometry since the start.
         """
         error, jacobian, _ = self._linearized(pose[None], now, None)
         root = positive.root(self.prior.covariance[:2, :2])
@@ -101,8 +105,8 @@ class KnownPosition:
         return np.linalg.solve(root, error[0]), np.linalg.solve(root, jacobian[0]), moved.covariance
 
     def _linearized(self, poses: Array, now: ChainState, noise: Array | None) -> tuple[Array, Array, Array]:
-        """Return the errors (N, 2) of the start positions that belong to current poses (N, 3), their Jacobians (N, 2, 3) by the
-        poses, and their covariances (N, 2, 2) from prior and odometry."""
+        """Return the errors (N, 2) of the start positions that ``poses`` (N, 3) imply, the Jacobians (N, 2, 3) of the errors by the
+        poses, and their covariances (N, 2, 2) from prior and odometry. For the arguments see :meth:`loss`."""
         moved = self.motion.relative(self.odometry, now)
         back = se2.inverse(moved.delta)
         error = se2.compose(poses, back)[:, :2] - self.prior.pose[:2]

@@ -167,7 +167,7 @@ def overlap(log: Log) -> tuple[float, float]:
 
 
 def integrated(log: Log, model: OdometryModel) -> OdometryChain:
-    """Return the odometry of a log, integrated from its first to its last row."""
+    """Return the odometry of a log, integrated from its first to its last row. ``model``: the odometry model."""
     chain = OdometryChain(model, horizon=np.inf)
     stream = odometry_of(log)
     t = stream.t + log.rig.time_offset("odometry")

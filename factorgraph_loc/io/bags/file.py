@@ -271,7 +271,7 @@ def require_rosbags() -> None:
 
 @lru_cache(maxsize=64)
 def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
-    """Return the compiled message types of a definition.
+    """Return the compiled message types of a ``definition``. ``msgtype``: the name of the message type that it defines.
 
     Compilation takes a hundred times as long as reading a message. The result is therefore cached for all topics and bags.
     """

@@ -159,8 +159,8 @@ def propose(bag: Bag) -> Uses:
 
 
 def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Propose the topic of odometry. Types of messages in order of preference: Odometry, tf with an odometry frame, Twist,
-    JointState. Topics of commands, plans and ground truth are excluded.
+    """Add the topic of odometry to ``out``. Types of messages in order of preference: Odometry, tf with an odometry frame, Twist,
+    JointState. Topics of commands, plans and ground truth are excluded. ``tree``: the coordinate frames of the bag.
     """
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
@@ -200,7 +200,8 @@ def _has_no_pose(bag: Bag, topic: Topic) -> bool:
 
 
 def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
-    """Return the proposed settings of wheels for a JointState topic, by the names of joints in its first message."""
+    """Return the proposed settings of wheels for a JointState topic. Wheels are recognised by the names of joints in its first
+    message. What the user should check is appended to ``remarks``."""
     first = next(bag.messages([topic.name]), None)
     names = [name for name in getattr(first and first.message, "name", ()) if isinstance(name, str)]
     wheels = [name for name in names if WHEEL.search(name)] or names
@@ -227,7 +228,7 @@ def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
 
 
 def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Propose the topics of the reference and of a position sensor.
+    """Add the topics of the reference and of a position sensor to ``out``. ``tree``: the coordinate frames of the bag.
 
     A topic whose name suggests ground truth is the reference. Otherwise, a topic of poses with headings is the reference.
     A topic of positions without headings is a position sensor.
@@ -285,7 +286,7 @@ def _camera(out: Uses, topics: Sequence[Topic]) -> None:
 
 
 def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
-    """Return the unused topics whose message types do not come with ROS, each with the paths of its fields."""
+    """Return the topics that ``out`` does not use and whose message types do not come with ROS, and the paths of their fields."""
     custom = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(

@@ -172,7 +172,8 @@ class YawRates:
 
 
 def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """Register the collectors of an odometry topic, and return the function that computes the motion once the bag is read.
+    """Register the collectors of an odometry topic at ``listeners``. Returns the function to call after the bag is read: it
+    computes the motion from the collected messages.
 
     ``static`` has the static transforms of the bag. Raises InputError if the options do not fit the message type.
     """

@@ -183,7 +183,8 @@ def _left_out(bag: Bag, listeners: Listeners) -> str:
 
 
 def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Any]:
-    """Register collectors for all sensors in the manifest except odometry. Returns them by the names of their streams."""
+    """Register collectors at ``listeners`` for all sensors in the manifest except odometry. Returns the collectors by the names of
+    their streams. ``stack``: closes their temporary files at the end. ``frames``: the static transforms of the bag."""
     bag = listeners.bag
     out: dict[str, Any] = {}
     if options.imu:

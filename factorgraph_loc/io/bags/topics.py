@@ -322,7 +322,7 @@ class Stamper:
         return self.choose(as_nanoseconds(item.message.header.stamp, 1), item.received)
 
     def choose(self, in_header: int, received: int) -> int:
-        """Return one of two timestamps [ns], according to the clock: that of the header or the time of receipt."""
+        """Return the timestamp [ns] to use: ``in_header``, that of the header, or ``received``, depending on the clock setting."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
         return in_header if self.uses_header else received
@@ -344,7 +344,7 @@ class Stamper:
 def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[Notice]]:
     """Return a text about the timestamps in use and the delays of receipt, and warnings about clocks that differ.
 
-    ``clock``: the clock setting of the bag.
+    ``stampers``: the sources of timestamps of all topics. ``clock``: the clock setting of the bag.
     """
     delays = {s.topic.name: delay for s in stampers if (delay := s.delay()) is not None}
     line = "timestamps of headers" if clock == "header" else "time of receipt"

@@ -29,8 +29,8 @@ ON_IMU = (
 
 
 class ChainCamera(FileModel):
-    """A camera of the chain. ``T_cam_imu``, ``T_imu_cam``, ``T_cn_cnm1``: transforms from the IMU to the camera, back, and from the
-    camera before in the chain."""
+    """A camera of a Kalibr camera chain. ``T_cam_imu``: transform (4, 4) from the IMU to the camera. ``T_imu_cam``: its inverse.
+    ``T_cn_cnm1``: transform from the previous camera of the chain to this one."""
 
     camera_model: str
     distortion_model: str = "none"
@@ -45,7 +45,7 @@ class ChainCamera(FileModel):
 
 
 def is_chain(text: str) -> bool:
-    """True if a text names a YAML file, perhaps with the name of a camera behind a colon."""
+    """True if a text names a YAML file, such as ``FILE.yaml`` or ``FILE.yaml:cam1``."""
     return text.endswith(SUFFIXES) or text.rpartition(":")[0].endswith(SUFFIXES)
 
 
@@ -86,13 +86,15 @@ def read_camera(text: str) -> tuple[dict[str, Any], list[str]]:
 
 
 def _camera(path: Path, name: str, content: Mapping[str, Any]) -> ChainCamera:
-    """Return the camera with a ``name`` and the ``content`` of a chain; keys that are not needed are ignored."""
+    """Return a camera from its ``content``, the keys and values in the file ``path``. ``name``: its name, for errors.
+
+    Keys that are not needed are ignored."""
     known = {key: value for key, value in content.items() if key in ChainCamera.model_fields and value is not None}
     return parse_model(ChainCamera, known, f"{path}: {name}")
 
 
 def _lens(path: Path, name: str, camera: ChainCamera) -> dict[str, Any]:
-    """Return the keys of the lens. Raises InputError if the rig has no lens of its model."""
+    """Return the settings of a rig for the lens of ``camera``. Raises InputError if no lens of a rig has the camera's model."""
     if camera.camera_model != MODEL:
         raise bad_field(path, f"{name}.camera_model", camera.camera_model, MODEL)
     if camera.distortion_model not in LENSES:
@@ -112,7 +114,8 @@ def _lens(path: Path, name: str, camera: ChainCamera) -> dict[str, Any]:
 
 
 def _on_imu(path: Path, chain: Mapping[str, ChainCamera], name: str) -> Array | None:
-    """Return the pose (4, 4) of a camera on the IMU, directly or by the cameras before it in the chain; None if it is unknown."""
+    """Return the pose (4, 4) of the camera ``name`` in the frame of the IMU, also if only a camera before it in the chain has a
+    transform to the IMU. Returns None if no such transform is known."""
     names = list(chain)
     from_later = np.eye(4)
     for known in reversed(names[: names.index(name) + 1]):
@@ -128,7 +131,7 @@ def _on_imu(path: Path, chain: Mapping[str, ChainCamera], name: str) -> Array | 
 
 
 def _transform(path: Path, key: str, rows: Matrix) -> Array:
-    """Return a transform (4, 4). Raises InputError if it is not rigid."""
+    """Return the transform (4, 4) in ``rows``, the value of ``key``. Raises InputError if it is not rigid."""
     matrix = np.array(rows)
     off = np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max()
     if off > ORTHONORMAL or np.linalg.det(matrix[:3, :3]) < 0.0 or np.any(matrix[3] != (0.0, 0.0, 0.0, 1.0)):

@@ -57,7 +57,10 @@ class _Source:
     file: Path = Path()
 
     def named(self, what: str, data_root: str | Path | None) -> Path | None:
-        """Return the path of the rig or world file that the manifest names. ``what``: ``rig`` or ``world``. None without a name."""
+        """Return the path of the rig file or world file that the manifest names, or None if it names none.
+
+        ``what``: ``rig`` or ``world``. ``data_root``: the folder of data sets, by default the environment variable FGLOC_DATA.
+        """
         name = getattr(self.manifest, what, None)
         expected = f"{EXPECTED}; or `--{what} FILE` in its place"
         return None if name is None else named_path(self.file.parent, name, self.file, data_root, expected)

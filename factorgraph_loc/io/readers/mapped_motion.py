@@ -131,7 +131,8 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
 
 
 def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tuple[Cells, Integers]:
-    """Return the rows without null poses, and the timestamps [ns] of the null poses.
+    """Return the rows of ``mapped`` without null poses, and the timestamps [ns] of the null poses, which a device reports while it
+    has lost its pose.
 
     Raises InputError if a quaternion is not a unit quaternion, unless the mapping skips such rows.
     """

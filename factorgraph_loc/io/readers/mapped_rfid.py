@@ -242,7 +242,8 @@ def _from_base64(text: str) -> str:
 
 
 def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
-    """Return the rows whose last read is not before the first one. Raises InputError at other rows, unless options skip them."""
+    """Return the rows of ``mapped`` whose last read is not before the first one. Raises InputError at other rows, unless the
+    options skip them."""
     if "last" not in mapped.columns:
         return mapped
     wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)

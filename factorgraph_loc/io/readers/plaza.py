@@ -133,7 +133,8 @@ def beacons(source: str, table: Array) -> World:
 
 
 def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> IncrementStream:
-    """Return the odometry as increments. The first row, at ``t0_ns``, has no motion, so that the first motion has a duration."""
+    """Return the rows ``driven`` of odometry as increments. If they begin after ``t0_ns``, a row without motion is added at
+    ``t0_ns``, so that the first motion has a duration."""
     moves = np.column_stack((driven.numbers["dx"], np.zeros(len(driven.rows)), driven.numbers["dtheta"]))
     t_ns, moves = checks.increments_in_order(driven.path, driven.rows, driven.t_ns, moves, warnings)
     if t_ns[0] > t0_ns:
@@ -143,7 +144,8 @@ def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> Increme
 
 
 def ranges(observed: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """Return the ranges sorted by time. The file joins overlapping recordings, so its order is not the order of arrival."""
+    """Return the rows ``observed`` of ranges as a stream, sorted by time. The file joins overlapping recordings, so its order is
+    not the order of arrival."""
     distance = observed.numbers["range"]
     require(distance > 0.0, observed.path, observed.rows, "range", distance, "more than 0")
     if moved := int(np.count_nonzero(observed.t_ns < np.maximum.accumulate(observed.t_ns))):

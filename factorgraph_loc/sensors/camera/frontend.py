@@ -123,7 +123,8 @@ def _features(
 
 
 def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
-    """Read an image's features from the cache. ``about``: text that the key depends on besides the bytes of the image."""
+    """Read an image's features from the cache ``kept``. The cache key depends on the bytes of the image ``file`` and on the text
+    ``about``."""
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:
@@ -134,7 +135,8 @@ def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
 
 
 def _find(file: Path, key: str, settings: FrontendSettings, size: Size, kept: FeatureCache) -> _ImageFile:
-    """Compute the features of an image and write them to the cache. Returns the features, or the fault of the file."""
+    """Compute the features of an image and write them to the cache ``kept`` with the ``key``. Returns the features, or the error
+    message if the file is unusable. ``size``: width and height of the camera's images [px]."""
     try:
         image = read_image(file)
     except InputError as error:

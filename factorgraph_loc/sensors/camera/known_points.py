@@ -144,6 +144,7 @@ class KnownPoints:
     ) -> ReprojectionFactor | None:
         """Return the factor of the known points in an image after outliers are removed, or None if no points remain.
 
+        ``predicted``: the predicted pose and constants of the camera, at which outliers are detected.
         ``offset``: the motion from the pose that the factor depends on to the image, None if the times are equal.
         ``twist`` (3,): the robot's velocity at the image. It is required if the camera's time offset is estimated.
         ``displaced``: by point name, the displacement (3,) of a point from the map, and the covariance (3, 3) of its position.
@@ -242,7 +243,7 @@ class KnownPoints:
     def _levelled(
         self, factor: ReprojectionFactor, expected: ReprojectionFactor, predicted: Predicted
     ) -> ReprojectionFactor | None:
-        """Update the learnt standard deviation of the robot's tilt by an image, and return ``factor`` with it.
+        """Update the learnt standard deviation of the robot's tilt by an image, and return ``factor`` with this value.
 
         ``expected``: the same factor with fixed constants. Returns None if the image requires a tilt above :data:`STEEPEST`,
         because it is probably wrong.
@@ -280,15 +281,15 @@ class KnownPoints:
 
 
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
-    """Return the pose of the camera of a robot at ``pose`` (3,) with body-frame ``covariance`` (3, 3). The covariance of the
-    result includes the tilt of the robot."""
+    """Return the pose in space of a robot's camera. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the robot's pose.
+    ``model``: the mounting, and the standard deviation of the robot's tilt, which the covariance of the result includes."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
     return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
 
 
 def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
-    """Return a mask (K,) of the points that are inliers near the prediction. All K points are inliers if there are too few to
-    decide. ``focal``: standard deviation of the logarithm of the focal length."""
+    """Return a mask (K,) of the points of ``expected`` that are inliers for a camera near the predicted pose ``camera``. All K
+    points are inliers if there are too few to decide. ``focal``: standard deviation of the logarithm of the focal length."""
     model, count = expected.model, len(expected.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)

@@ -54,7 +54,8 @@ class PixelObservation(ResidualObservation):
 
     @classmethod
     def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
-        """Return the observation of a factor ``seen``, whose values after the pose are these ``blocks``."""
+        """Return the observation of a factor ``seen``, whose values after the pose are these ``blocks``. ``expected`` (3,): the
+        predicted pose."""
         return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(
@@ -87,8 +88,8 @@ class PixelObservation(ResidualObservation):
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, covariances)
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """Return the observation as a function of the pose only. The uncertainty of the camera's constants and of displacements
-        of points is added to the noise."""
+        """Return the observation as a function of the pose only. The camera's constants and displacements of points are fixed at
+        ``values``, and their covariances ``spreads`` are added to the noise."""
         if not self.blocks:
             return self
         seen, held, blocks = self.seen, None, self.blocks
@@ -318,7 +319,8 @@ class PixelFinder:
 
     @staticmethod
     def _is_not_from(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
-        """True if a robot that started at the known position cannot be at the pose by an image."""
+        """True if a robot that started at the known position ``start`` cannot be at the pose ``fix``, which one image determined.
+        ``now``: the odometry state at the image."""
         return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
@@ -334,7 +336,7 @@ class PixelFinder:
 
 
 def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
-    """Return the squared Mahalanobis distance between ``pose`` (3,) with body-frame ``covariance`` (3, 3) and the pose by an
-    image."""
+    """Return the squared Mahalanobis distance between ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the pose of
+    ``fix``, which one image determined."""
     error = se2.log(se2.between(pose, fix.pose))
     return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

@@ -100,7 +100,8 @@ class Candidate:
     ) -> LocatedPoint | None:
         """Return the position that explains the sightings. Returns None if no position explains them, or if several do.
 
-        ``constants`` (P,) with covariance ``uncertainty`` (P, P): estimated calibration constants of the odometry.
+        ``model``: the model of the sensor. ``motion``: the odometry. ``constants`` (P,) with covariance ``uncertainty`` (P, P):
+        estimated calibration constants of the odometry.
         """
         path = _PathSightings(model, self.sightings, motion, constants, uncertainty)
         if path.count < FEWEST:

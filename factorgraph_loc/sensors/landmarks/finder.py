@@ -324,8 +324,8 @@ class TrackMonitor:
         self.suspicious_since: float | None = None  # s, or None if the track is not suspicious
 
     def add(self, t: float, factor: BearingRangeFactor, pose: Array, covariance: Array) -> None:
-        """Record how many landmarks of the timestamp ``t`` [s] contradict the predicted ``pose`` (3,) with its body-frame
-        ``covariance`` (3, 3)."""
+        """Record how many landmarks of ``factor``, sighted at the time ``t`` [s], contradict the predicted ``pose`` (3,) with its
+        body-frame ``covariance`` (3, 3)."""
         beyond = factor.count_beyond(BEYOND * GATE, pose, covariance)
         while self._stamps and self._stamps[-1][0] >= t:
             self._stamps.pop()

@@ -264,8 +264,8 @@ class LandmarkSensor(Sensor):
         return Term(factor, (*self._shared, *biases, *((block,) if factor.free else ())), 2)
 
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """Return a new landmark, located by this sighting, if an earlier sighting agrees with it. Otherwise store the sighting
-        and return None."""
+        """Return a new landmark, located by the sighting ``term`` at ``t`` [s], if an earlier sighting agrees with it. Otherwise
+        store the sighting and return None. ``block``: the name of the landmark's block."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
         factor = replace(cast(BearingRangeFactor, term.factor), biased=False)
         point, (by_pose, *by_shared), noise = factor.locate([view.pose, *shared])
@@ -277,7 +277,7 @@ class LandmarkSensor(Sensor):
 
     def _located(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
         """Return a new landmark if its sightings by range alone or bearing alone determine its position. Otherwise store the
-        sighting and return None."""
+        sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's block."""
         factor = cast(BearingRangeFactor, term.factor)
         (along_floor,) = on_floor(factor.model, factor.points, factor.ranges).tolist()
         sighting = PartialSighting(self._motion.state(t), along_floor, float(factor.bearings[0]))

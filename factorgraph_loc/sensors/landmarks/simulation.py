@@ -180,7 +180,11 @@ def _add(
     landmarks: NDArray[np.int64],
     out: Array32,
 ) -> None:
-    """Add to ``out[j, i]`` the log-likelihood of particle i, given the sightings that were simulated from particle j."""
+    """Add to ``out[j, i]`` the log-likelihood of particle i, given the sightings that were simulated from particle j.
+
+    ``scans``, ``landmarks`` (K,): particle j and landmark of each sighting. ``measured``, ``sigmas`` (K, 2): its range and bearing,
+    and their standard deviations. ``ranges``, ``bearings`` (M, L): those of L landmarks from M particles.
+    """
     for n in range(len(scans)):
         j, k = scans[n], landmarks[n]
         for i in range(len(ranges)):

@@ -138,7 +138,7 @@ class SightingWindow:
         return positive.whitener(covariance)
 
     def squared(self, poses: Array, whitener: Array) -> Array:
-        """Return squared norms (N, K) of the whitened residuals at present poses (N, 3)."""
+        """Return squared norms (N, K) of the whitened residuals at present poses (N, 3). ``whitener``: see :meth:`whitener`."""
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
     def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:

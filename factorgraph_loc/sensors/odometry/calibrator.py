@@ -172,7 +172,7 @@ def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
 
 
 def _bases(windows: Windows, model: OdometryModel) -> Array:
-    """Return covariances (M, 11, 3, 3) of the windows' errors for unit values of 11 variances. They are the variances of
+    """Return covariances (M, 11, 3, 3) of the windows' errors for unit values of 11 variances. These are the variances of
     longitudinal, lateral and heading errors per distance, rotation and time, then those of position and heading of the
     reference."""
     start, end = windows.states(model)

@@ -57,8 +57,8 @@ class DifferentialDrive(FileModel):
     """distance between the wheels"""
 
     def corrected(self, scale_distance: float, scale_rotation: float) -> tuple[float | None, float]:
-        """Return the true radius (or None) and track width [m], which include the corrections by these scales of the
-        odometry."""
+        """Return radius (or None) and track width [m] after correction. ``scale_distance``, ``scale_rotation``: the scales of the
+        odometry, as in :class:`OdometrySettings`."""
         radius = None if self.radius is None else self.radius * scale_distance
         return radius, self.track * scale_distance / scale_rotation
 

@@ -192,8 +192,8 @@ def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]
 
 
 def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
-    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``sensor``: the section of the rig whose
-    time_offset corrects the clock."""
+    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``found``: its comparison with the odometry.
+    ``sensor``: the section of the rig whose time_offset corrects the clock."""
     if found is None:
         return []
     lines = []

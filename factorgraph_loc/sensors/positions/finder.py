@@ -110,8 +110,8 @@ class PositionFinder:
         self._beyond.clear()
 
     def _add(self, odometry: ChainState, factor: PositionFactor) -> None:
-        """Store a position. A late position is skipped. Of positions that are closer in time than INTERVAL, only the last is
-        kept."""
+        """Store a position: its ``factor``, and the ``odometry`` state at its time. A late position is skipped. Of positions that
+        are closer in time than INTERVAL, only the last is kept."""
         self._robust = factor.robust
         if self._rows and odometry.t <= self._rows[-1].odometry.t:
             return
