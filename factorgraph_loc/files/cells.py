@@ -93,9 +93,10 @@ class Cells:
     def usable(
         self, columns: Mapping[str, Column], warnings: list[Notice], *, offset: float = 0.0, more: Sequence[Fault] = ()
     ) -> "Cells":
-        """The valid rows in order of time, as far as the rules say so; warnings count the skipped and the sorted ones.
+        """Return the valid rows in order of time, as the rules say. Warnings count the skipped and the sorted rows.
 
-        ``columns``: the description of each field, the timestamps first; ``offset`` [s]: added to them; ``more``: further faults.
+        ``columns``: the description of each field, that of the timestamps first. ``offset`` [s]: added to the timestamps.
+        ``more``: faults that the descriptions do not cover.
         """
         rules = self.rules
         if rules is None or rules.refuse:
@@ -111,7 +112,9 @@ class Cells:
         return kept
 
     def without(self, faults: Sequence[Fault], warnings: list[Notice]) -> "Cells":
-        """The rows without ``faults``, and a warning that counts the others; InputError if the rules do not say to skip these."""
+        """Return the rows without ``faults``. A warning counts the other rows. Raises InputError at the first fault if the
+        rules do not skip invalid rows.
+        """
         if self.rules is None or self.rules.bad_rows == "refuse":
             self.require(faults)
             return self
@@ -121,7 +124,7 @@ class Cells:
         return replace(out, resumed=out.resumed | (np.diff(kept, prepend=-1) > 1) | (np.diff(later, prepend=0) > 0))
 
     def rows_at(self, which: Integers) -> "Cells":
-        """The rows with indices ``which`` (M,), in that order."""
+        """Return the rows with indices ``which`` (M,), in that order."""
         columns = {
             name: cells[which] if isinstance(cells, np.ndarray) else [cells[i] for i in which.tolist()]
             for name, cells in self.columns.items()
@@ -129,18 +132,18 @@ class Cells:
         return replace(self, rows=self.rows[which], columns=columns, unread=(), resumed=self.resumed[which])
 
     def require(self, faults: Sequence[Fault]) -> None:
-        """InputError at the first of ``faults``, with the key that skips such rows if they are few."""
+        """Raise InputError at the first of ``faults``. If few rows are invalid, the message names the key that skips them."""
         for fault in faults:
             if fault.wrong.any():
                 is_few = self.rules is not None and fault.wrong.mean() <= MOST_SKIPPED
                 raise fault.error(self.path, self.rows, self.rules.skipping if self.rules and is_few else "")
 
     def fault(self, name: str, wrong: NDArray[np.bool_], expected: str) -> Fault:
-        """The fault of the cells of a field that are ``wrong`` (N,)."""
+        """Return the fault of the cells of a field that are ``wrong`` (N,). ``expected``: a description of valid cells."""
         return Fault(self.labels.get(name, name), self.columns[name], wrong, expected)
 
     def _faults(self, name: str, column: Column) -> Sequence[Fault]:
-        """The faults of a field."""
+        """Return the faults of a field."""
         if column.kind in NAMES:
             return self._names(name, column)[1]
         if column.kind in NUMBERS:
@@ -150,7 +153,7 @@ class Cells:
         return *faults, self.fault(name, away, f"a time at most {MAX_SPAN / 86_400.0:g} days from most of the file")
 
     def _known(self, stamps: tuple[Integers, Sequence[Fault]]) -> Integers:
-        """The stamps without faults."""
+        """Return the first of ``stamps``, the timestamps. Raises InputError if the second has a fault."""
         self.require(stamps[1])
         return stamps[0]
 
@@ -232,7 +235,9 @@ class Cells:
 
 
 def _converted(cells: Iterable[Any], convert: Callable[[Any], T], blank: T) -> tuple[list[T], NDArray[np.bool_]]:
-    """The converted cells (N), ``blank`` for those that ``convert`` refuses; and which these are (N,)."""
+    """Convert N cells. Returns the values, with ``blank`` for each cell that ``convert`` refuses, and a mask (N,) of these
+    cells.
+    """
     out: list[T] = []
     wrong: list[int] = []
     for cell in cells:

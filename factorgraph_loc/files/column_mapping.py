@@ -135,7 +135,7 @@ def _mapped(
 
 
 def _rules(mapping: ColumnMapping) -> RowRules | None:
-    """What to do with invalid rows of a table; None for tables of names and maps, whose rows must be valid."""
+    """Return the rules for the rows of a table with timestamps; None for tables of names and maps, whose rows must be valid."""
     return mapping if isinstance(mapping, TimedMapping) else None
 
 
@@ -334,8 +334,10 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
 
 
 def _wrong_value(path: Path, row: int, entry: Mapping[str, Any], fields: Sequence[str], texts: Collection[str]) -> str:
-    """The error about the first of the ``fields`` of an object whose value has a wrong type, "" if there is none. ``texts``: the
-    fields that must be texts."""
+    """Return the error about the first of the ``fields`` of an object that has a value of a wrong type, "" if there is none.
+
+    ``texts``: the fields that must be texts.
+    """
     for name in fields:
         value = entry.get(name)
         if isinstance(value, list | bool) or (name in texts and not isinstance(value, str | None)):

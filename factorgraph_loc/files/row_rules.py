@@ -1,4 +1,6 @@
-"""What a manifest says about rows that are invalid or out of order: by default an error, otherwise a warning that counts them."""
+"""The keys of a manifest for rows that are invalid or out of order. Such rows are an error, or they are skipped or sorted, with a
+warning that counts them.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ MOST_SKIPPED = 0.5  # share of the rows; more invalid rows have another cause, s
 class Fault:
     """The cells of one field that are invalid for one reason.
 
-    ``values``: the N cells of the field; ``wrong`` (N,): True for each invalid cell; ``expected``: a description of valid cells.
+    ``field``: the name of the field in errors. ``values``: the N cells of the field. ``wrong`` (N,): True for each invalid cell.
+    ``expected``: a description of valid cells.
     """
 
     field: str
@@ -30,7 +33,9 @@ class Fault:
     expected: str
 
     def error(self, source: object, rows: Integers, remedy: str = "") -> InputError:
-        """The error for the first invalid cell; ``rows`` (N,): row numbers in ``source``."""
+        """Return the error for the first invalid cell. ``rows`` (N,): row numbers in ``source``. ``remedy``: the end of the
+        message.
+        """
         i = int(self.wrong.argmax())
         value = self.values[i]
         value = value.tolist() if hasattr(value, "tolist") else value
@@ -38,7 +43,7 @@ class Fault:
 
 
 class RowRules(FileModel):
-    """What a reader does with invalid rows and with rows that are out of order. ``PLACE``: where a user types these keys."""
+    """What a reader does with invalid rows, and with rows that are out of order. ``PLACE``: the file that has these keys."""
 
     PLACE: ClassVar[str] = "the manifest"
     bad_rows: Literal["refuse", "skip"] = "refuse"
@@ -54,10 +59,11 @@ class RowRules(FileModel):
         warnings: list[Notice],
         unread: Sequence[tuple[int, str]] = (),
     ) -> Integers:
-        """The indices of the rows (N,) without a fault; a warning counts the others and names the first.
+        """Return the indices of the rows without a fault, out of N. A warning counts the other rows and names the first of them.
 
-        ``unread``: row number and error of further rows, which could not be split into cells. InputError at the first fault if
-        such rows are refused, or if more than half of all rows are invalid.
+        ``rows`` (N,): row numbers in ``source``. ``faults``: the invalid cells. ``unread``: number and error of further rows,
+        which could not be split into cells. Raises InputError at the first fault if invalid rows are refused, or if more than
+        half of all rows are invalid.
         """
         wrong = np.zeros(len(rows), dtype=bool)
         for fault in faults:
@@ -79,7 +85,9 @@ class RowRules(FileModel):
         return np.flatnonzero(~wrong)
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
-        """The indices of the rows (N,), in order of their timestamps if the rules sort them. A warning counts the late rows."""
+        """Return the indices of the N rows, in order of their timestamps ``t_ns`` (N,) if the rules sort rows. A warning counts
+        the late rows. ``rows`` (N,): row numbers in ``source``.
+        """
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))
@@ -98,18 +106,19 @@ class RowRules(FileModel):
 
     @property
     def skipping(self) -> str:
-        """How to skip invalid rows, as the end of an error."""
+        """The end of an error, which says how to skip invalid rows."""
         return f'; bad_rows = "skip" in {self.PLACE} skips such rows'
 
     @property
     def sorting(self) -> str:
-        """How to sort rows, as the end of an error."""
+        """The end of an error, which says how to sort rows."""
         return f'; order = "sort" in {self.PLACE} sorts the rows'
 
 
 def require_read(unread: Sequence[tuple[int, str]], count: int, rules: RowRules | None) -> None:
-    """InputError with the first error of ``unread`` rows (number, error), unless ``rules`` say to skip them and they are few of
-    ``count``."""
+    """Raise the first error of ``unread`` rows (number, error), unless ``rules`` skip them and they are at most half of ``count``
+    rows.
+    """
     if not unread:
         return
     is_few = len(unread) <= MOST_SKIPPED * count
@@ -119,7 +128,9 @@ def require_read(unread: Sequence[tuple[int, str]], count: int, rules: RowRules 
 
 
 def require_none(source: object, rows: Integers, faults: Sequence[Fault], remedy: str = "") -> None:
-    """InputError at the first invalid cell of ``faults``, with the ``remedy``; ``rows`` (N,): row numbers in ``source``."""
+    """Raise InputError at the first invalid cell of ``faults``. ``rows`` (N,): row numbers in ``source``. ``remedy``: the end
+    of the message.
+    """
     for fault in faults:
         if fault.wrong.any():
             raise fault.error(source, rows, remedy)

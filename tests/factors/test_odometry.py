@@ -75,6 +75,25 @@ def test_increments_of_one_stamp_are_one_motion(at_once):
         np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-15)
 
 
+@pytest.mark.parametrize("use_gyro", [False, True])
+def test_the_motion_of_an_increment_may_be_unknown(use_gyro):
+    """For a part of its time, which two increments of one stamp add up, or for all of it."""
+    t = np.array((0.0, 0.2, 0.4, 0.4, 0.6))
+    unknown = np.array((0.0, 0.0, 0.05, 0.1, 9.0))
+    chain, other = (OdometryChain(OdometryModel(), use_gyro=use_gyro) for _ in range(2))
+    for i in range(5):
+        if use_gyro and i not in (0, 3):
+            assert chain.add_yaw_rate(t[i] - 0.1, 0.0)
+        assert chain.add_increment(t[i], 0.1, 0.0, 0.0, unknown[i])
+    other.add_increments(t, *np.full((3, 5), 0.1), unknown)
+    for each in (chain, other):
+        np.testing.assert_allclose(
+            [each.state(s).unknown for s in (0.0, 0.2, 0.4, 0.6)], (0.0, 0.0, 0.15, 0.35), atol=1e-12
+        )
+    sure, unsure = (chain.relative(chain.state(s), chain.state(s + 0.2)).covariance[0, 0] for s in (0.0, 0.4))
+    assert unsure > sure + 0.2 * OdometryModel().unknown_distance ** 2
+
+
 def test_delay_and_lag_follow_the_step_response():
     delay, lag = 0.1, 0.2
     chain = velocities(OdometryModel(delay=delay, lag=lag), [(0.0, 0.0, 0.0), (1.0, 1.0, 0.0)])
