@@ -308,7 +308,7 @@ def _add_wheels(out: Guess) -> None:
     pairs = {"": front} | ({"rear_": rear} if rear["left"] and rear["right"] and front != rear else {})
     if len(pairs) == 2:
         out.reasons.append(
-            "there are four wheels: if they are mecanum wheels, set base [m], the distance between the axles"
+            "there are four wheels: if they are mecanum wheels, set base [m] of odometry, the distance between the axles"
         )
     left, right = (front[side][0] for side in ("left", "right"))
     if out.numbers(left) is None or out.numbers(right) is None:

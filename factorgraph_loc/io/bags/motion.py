@@ -244,7 +244,7 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
         )
     if wheels.right_topic is not None and len(wheels.joints) > 2:
         raise InputError(
-            f"{bag.path} {options.topic}: odometry.wheels.right_topic is given: remove rear_left and rear_right"
+            f"{bag.path} {options.topic}: odometry.wheels.right_topic is for two wheels: remove rear_left and rear_right"
         )
     are_speeds = options.use == "twist"
     rows: Motion

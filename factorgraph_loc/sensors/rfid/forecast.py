@@ -118,7 +118,7 @@ def log_weights(
     particle m, given the scans from particle j.
 
     ``poses`` (S, M, 3): poses of M particles at S stops. ``rounds`` (S,): inventory rounds at each stop. ``stops`` (M,): number
-    of stops of each particle. ``out`` (J, M).
+    of stops of each particle. ``out`` (J, M). ``seed``: determines the random reads. ``tempering``: exponent of the likelihood.
     """
     steps, count, _ = poses.shape
     tags = len(tables.points)
@@ -149,7 +149,8 @@ def log_weights(
 def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
-    """Draw the random reads of each scan, and add their log-likelihoods to ``out``. See :func:`log_weights`."""
+    """Draw the random reads of each scan, and add their log-likelihoods to ``out``. ``cells``: the table cell of each tag and pose.
+    The other arguments are those of :func:`log_weights`."""
     steps, tags, count = cells.shape
     antennas = tables.read.shape[1]
     gain = tables.gain

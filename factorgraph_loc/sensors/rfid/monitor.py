@@ -162,7 +162,7 @@ def _count(
     counts: NDArray[np.bool_],
 ) -> None:
     """Add the reads of C ``tags`` by K ``antennas`` to the cells of :class:`BurstMonitor`. ``hits``, ``p`` (K, C): numbers of
-    reads, and probabilities of a read in one of ``rounds`` (K,)."""
+    reads, and probabilities of a read in one of ``rounds`` (K,). ``counts`` (C,): True for tags that are counted."""
     for c in range(len(tags)):
         for k in range(len(antennas)):
             if counts[c] and p[k, c] > POSSIBLE:
@@ -262,8 +262,8 @@ class ConsistencyMonitor:
         self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
 
     def _chance(self, groups: slice, overdispersion: float) -> float:
-        """Return the p-value of the counts: the probability of such large errors with a correct model. It is 1 for small
-        errors."""
+        """Return the p-value of the reads in some ``groups``: the probability that a correct model predicts reads so badly. It is 1
+        if the relative error is at most DIFFERENT. ``overdispersion``: the number of correlated rounds that count as one."""
         observed, predicted, variance = _merged(self._groups.sums[:, groups], FEWEST)
         off = observed - predicted
         if np.sum(np.abs(off)) <= DIFFERENT * np.sum(predicted):
@@ -279,8 +279,10 @@ class ConsistencyMonitor:
         return self._groups.shares(groups if len(groups) else self._groups.large(1.0))
 
     def dead_antennas(self, overdispersion: float) -> list[int]:
-        """Return the indices of antennas that read nearly nothing, although :data:`MANY` independent reads were predicted of
-        each."""
+        """Return the indices of antennas that read nearly nothing, although :data:`MANY` independent reads of each were predicted.
+
+        ``overdispersion``: the number of correlated reads that count as one independent read.
+        """
         observed, predicted, _ = self._groups.sums[:, BANDS:]
         return np.flatnonzero((predicted > MANY * overdispersion) & (observed < NEARLY_NONE * predicted)).tolist()
 

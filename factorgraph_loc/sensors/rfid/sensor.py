@@ -237,7 +237,8 @@ class TagSensor(Sensor):
         return out
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
-        """False if the scan is part of a failure of the reader. ``evidence``: its log-probability at the predicted pose."""
+        """False if the reader or the tags have failed at the scan of this ``observation``. ``evidence``: log-probability of the
+        scan at the predicted pose."""
         # a scan without reads that is processed again after a late measurement counts only once
         if observation.found or observation.t > self._heard:
             lasted = self._silence.lasts

@@ -130,7 +130,8 @@ def draw_reads(
 ) -> Hits:
     """Draw the reads of A antennas and T tags in rounds at ``times`` (N,). Returns a mask (N, A, T) that is True for reads.
 
-    ``probabilities`` (N, A, T): of a read without faults. ``faults``: all except those of the map and the clock are simulated.
+    ``probabilities`` (N, A, T): the probability of a read without faults. ``faults``: faults of the map and of the clock are not
+    simulated here, all others are.
     ``dead``: indices of tags that are never read. In a fade a tag has only false reads. Outside of fades the probability is
     higher, so that its mean is that of ``probabilities``. This is possible if the rig's ``miss`` is at least the fraction of
     time in fades.

@@ -199,10 +199,10 @@ def review(use: Use, ending: Ending) -> Review:
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings about a finished run.
+    """Yield warnings about a finished run. ``diagnostics``: those of its causal estimates. ``learnt``: its estimated constants.
 
-    They state that the estimator does not use RFID, that no tag of the map is read, which tags are probably dead, weak or moved
-    (most probable first), and how the estimated models and mountings of the antennas differ from the rig.
+    The warnings state that the estimator does not use RFID, that no tag of the map is read, which tags are probably dead, weak or
+    moved (most probable first), and how the estimated models and mountings of the antennas differ from the rig.
     """
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
     if rounds and use.estimator != "dead_reckoning":  # its name says that it uses odometry only
@@ -233,7 +233,10 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notic
 
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings about estimated parameters of detection models and mountings that clearly differ from the rig."""
+    """Yield warnings about estimated parameters of detection models and mountings that clearly differ from the rig's ``settings``.
+
+    ``learnt``: the estimates of the run.
+    """
     names = settings.parameter_names()
     for name, parameters in names.items():
         peak = min(settings.models[name].model().peak, MOST_CERTAIN)
@@ -297,8 +300,8 @@ class _Trials:
 
 
 def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Review:
-    """Compare reads with the detection models, as estimated in a run, along its final trajectory. Returns the reliability and
-    warnings.
+    """Compare the reads of a run with its estimated detection models, along its ``final`` trajectory. Returns the reliability and
+    warnings. ``diagnostics``: those of the final trajectory. ``learnt``: the estimated parameters.
 
     The result is empty without reads, antennas or covariances. Tags that are probably dead, and times without reads, are
     omitted. Tags that seem to have moved are not omitted, because a wrong model has the same effect on many tags.
@@ -342,8 +345,9 @@ def _observed(
 
 
 def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -> Review:
-    """Count observed and predicted reads by bands of distance and by antennas. Returns the reliability and warnings. The result
-    is empty if there are too few predicted reads. ``log``: the name of the log."""
+    """Count observed and predicted reads of ``trials`` by bands of distance and by ``antennas``. Returns the reliability and
+    warnings. The result is empty if there are too few predicted reads. ``log``: the name of the log. ``tempering``: the rig's
+    exponent of the likelihood."""
     if trials.p.sum() < FEWEST:
         return Review()
     groups = ReadGroups(antennas)

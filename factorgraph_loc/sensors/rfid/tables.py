@@ -38,11 +38,11 @@ def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Inte
 def rounds_from_inventories(
     t_ns: Integers, antenna: Sequence[str], end_ns: Integers, inventory_antenna: Sequence[str], duration_ns: Integers
 ) -> Integers:
-    """Return for each of N reads the index of the inventory, among R, of its antenna that contains its timestamp. Without such
-    an inventory the index is :data:`OUTSIDE`.
+    """Return the index (N,) of the inventory that contains each of N reads, :data:`OUTSIDE` if none does.
 
-    An inventory contains the timestamps from ``end_ns - duration_ns`` to ``end_ns``, inclusive. A read on the border of two
-    inventories belongs to the earlier one.
+    ``t_ns`` (N,), ``antenna`` (N): time [ns] and antenna of each read. ``end_ns``, ``duration_ns`` (R,), ``inventory_antenna`` (R):
+    end [ns], duration [ns] and antenna of R inventories. An inventory contains the reads of its antenna from
+    ``end_ns - duration_ns`` to ``end_ns``, inclusive. A read on the border of two inventories belongs to the earlier one.
     """
     names, listening = np.asarray(antenna, dtype=str), np.asarray(inventory_antenna, dtype=str)
     out = np.full(len(t_ns), OUTSIDE, dtype=np.int64)
@@ -62,7 +62,7 @@ def rounds_from_inventories(
 
 def ends_of(t_ns: Integers, number: Integers, gap: float) -> Integers:
     """Return the times (R,) [ns] at which R rounds of :func:`rounds_from_gaps` end: at the next read of another antenna, but at
-    most ``gap`` seconds after the last read of the round."""
+    most ``gap`` seconds after the last read of the round. ``t_ns``, ``number`` (N,): time [ns] and round number of each read."""
     last = np.flatnonzero(np.diff(number, append=number[-1:] + 1))
     following = np.append(t_ns, np.iinfo(np.int64).max)[last + 1]
     return np.asarray(np.minimum(t_ns[last] + round(gap * 1e9), following), dtype=np.int64)
@@ -192,7 +192,8 @@ def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Int
 
 
 def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> ReadsByRound:
-    """Return the selected ``rows`` of a table of reads with their round indices ``number``."""
+    """Return the selected ``rows`` of a table of reads with their round indices ``number``. ``end_ns`` (R,), ``antenna`` (R): end
+    [ns] and antenna of each round."""
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in SIGNALS)

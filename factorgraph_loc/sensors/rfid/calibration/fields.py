@@ -138,8 +138,9 @@ class Kind:
 
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
-    """Fit detection models of a ``kind``. Returns the models, and the index of the model of each antenna. If each antenna has
-    its own model, an antenna without rounds has a model that is fitted to all antennas."""
+    """Fit detection models of a ``kind`` to the reads and misses of ``pairs``. Returns the models, and the index of the model of
+    each of the ``antennas``, which is their number. If each antenna has its own model, an antenna without rounds has a model that
+    is fitted to all antennas. ``floor``: probabilities of false reads and misses."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     active = [a for a in range(antennas) if np.any(pairs.antenna == a)]
@@ -153,7 +154,8 @@ def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tup
     """Choose the kind of detection model that predicts held-out reads best. Returns it, and the score of each kind.
 
     The score is the negative log-likelihood [nats per round] on folds of ``pairs`` that are held out. A more complex model must
-    be better than a simpler one by :data:`WORTH`. ``facing``: True if the tags' facing is known.
+    be better than a simpler one by :data:`WORTH`. ``floor``: probabilities of false reads and misses. ``antennas``: their number.
+    ``facing``: True if the tags' facing is known.
     """
     kinds = [Kind("beam"), Kind("logistic"), *([Kind("logistic", facing=True)] if facing else [])]
     if antennas > 1:
@@ -176,7 +178,8 @@ def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
 
 
 def _held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> float:
-    """Return the negative log-likelihood per round of all folds, each with models that are fitted to the other folds."""
+    """Return the negative log-likelihood per round of all folds of ``pairs``, each with models of the ``kind`` that are fitted to
+    the other folds."""
     total = 0.0
     for fold in np.unique(pairs.fold):
         models, which = fit(pairs.part(pairs.fold != fold), kind, floor, antennas)

@@ -193,8 +193,9 @@ def _mean(
 def _refitted(
     pairs: TagPairs, initial: DetectionModel, name: str, floor: Floor
 ) -> tuple[DetectionModel, list[FittedConstant]] | None:
-    """Fit a detection model of the same kind as ``initial``. Returns the model and its parameters, or None if the data do not
-    determine a beam."""
+    """Fit a detection model of the same kind as ``initial`` to ``pairs``. Returns the model and its parameters, or None if the
+    model is a beam and ``pairs`` do not determine it. ``name``: the name of the model. ``floor``: probabilities of false reads and
+    misses."""
     family = family_of(initial, pairs)
     model, posterior = fit_model(pairs, family, floor)
     if isinstance(initial, BeamModel) and np.any(posterior.errors > VAGUE * np.abs(posterior.values)):
@@ -218,8 +219,8 @@ def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
 
 
 def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
-    """Return the rounds of a smoothed log, without doubted tags, at poses drawn from the smoothed distribution. Raises
-    InputError if fewer than two tags remain."""
+    """Return the rounds of a log with a smoothed trajectory, at poses that are drawn from the distribution of the trajectory. Tags
+    that are probably not at their position in the map are omitted. Raises InputError if fewer than two tags remain."""
     rounds = rounds_of(trace.log, settings)
     kept = np.array([name not in trace.doubted for name in rounds.names])
     if kept.sum() < 2:
@@ -244,8 +245,8 @@ def _bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
 
 
 def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """Estimate survey and lever arm by phases. Returns None if there are too few phases, or if they do not agree better than
-    before."""
+    """Estimate survey and lever arm by phases. Returns None if there are too few phases, or if the phases agree with the estimate
+    no better than with ``survey`` and ``settings``."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:

@@ -61,10 +61,10 @@ def pairs_of(
     within: Sequence[Integers] | None = None,
     length: float = BLOCK,
 ) -> TagPairs:
-    """Return the pairs of several logs.
+    """Return the pairs of antenna and tag of several logs.
 
-    ``within``: for each log the flat indices (round, tag) of the pairs, None for all pairs within :data:`REACH`. ``length``:
-    length of the blocks of time [s].
+    ``survey``: the transform of the tags' positions. ``within``: for each log the flat indices (round, tag) of the pairs, None for
+    all pairs within :data:`REACH`. ``length``: length of the blocks of time [s].
     """
     numbers = {name: i for i, name in enumerate(dict.fromkeys(name for log in logs for name in log.names))}
     parts = []
@@ -86,7 +86,7 @@ def pairs_of(
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
-    """Return the flat indices (round, tag) of the pairs of a log within :data:`REACH`."""
+    """Return the flat indices (round, tag) of the pairs of a log in which antenna and tag are closer than :data:`REACH`."""
     every = np.arange(log.hits.size)
     return every[view_of(log, settings, survey, every)[1] < REACH]
 

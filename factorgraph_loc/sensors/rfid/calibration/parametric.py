@@ -118,7 +118,8 @@ def scaled(start: GridModel) -> Family:
 
 
 def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
-    """Return the family of models of the same kind as ``model``."""
+    """Return the family of models of the same kind as ``model``. ``pairs``: reads and misses that scale the priors of a logistic
+    model."""
     if isinstance(model, BeamModel):
         return beam(model)
     return scaled(model) if isinstance(model, GridModel) else logistic(pairs, with_facing=model.uses_facing)
@@ -243,7 +244,8 @@ def pose_share(
     floor: Floor,
 ) -> float:
     """Return the fraction of the reads' information on the pose that is left after correlations within windows of time are
-    accounted for. ``logs``: unmerged rounds. ``which``: the index of the model of each antenna."""
+    accounted for. ``logs``: unmerged rounds. ``models``, ``which``: the detection models, and the index of the model of each
+    antenna. ``floor``: probabilities of false reads and misses."""
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within, WINDOW)
     logit, columns = modelled(models, which, pairs), []

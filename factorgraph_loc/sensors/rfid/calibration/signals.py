@@ -108,11 +108,11 @@ class _Focus:
         return self.initial.model_copy(update=dict(zip(("x", "y", "heading"), state[:3].tolist(), strict=True)))
 
     def near(self, state: Array) -> _Focus:
-        """Return the problem with only the reads that are near their tags, in windows with enough reads."""
+        """Return a copy with only the reads that are near their tags at the ``state``, in windows with enough reads."""
         return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
 
     def without(self, block: int) -> _Focus:
-        """Return the problem without the reads of one block of windows."""
+        """Return a copy without the reads of one ``block`` of windows, for a jackknife."""
         edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
         inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
         return replace(self, reads=self.reads.chosen(~inside))
