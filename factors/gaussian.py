@@ -144,7 +144,7 @@ def invert_covariance(covariance: Array) -> Array:
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
     """Predict a ``covariance`` (S, S) over one step: ``F covariance F^T + Q``.
 
-    ``transition`` (R, S): the first R rows of the transition matrix F. Its last S - R rows are those of the identity.
+    ``transition`` (R, S): the first R rows of the transition matrix F. Its last S - R rows are the last rows of an identity matrix.
     ``noise`` (R, R): the covariance Q of the process noise of the first R components. The other components have no process noise.
     """
     rows, moved, out = len(transition), product(transition, covariance), covariance.copy()
@@ -162,7 +162,7 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
     """One backward step of the smoother of Rauch, Tung and Striebel (1965).
 
     ``covariance`` (S, S): covariance of the filtered state.
-    ``transition`` (R, S), ``noise`` (R, R): of the step that follows the filtered state, as in :func:`predicted`.
+    ``transition`` (R, S), ``noise`` (R, R): the prediction step that follows the filtered state, as in :func:`predicted`.
     ``change`` (S,): the smoothed minus the predicted state after that step.
     ``later`` (S, S): the smoothed covariance after that step.
 

@@ -204,7 +204,7 @@ def _unit(size: int) -> gtsam.noiseModel.Unit:
 
 
 class PriorFactor:
-    """A Gaussian prior of a pose. ``mean`` (3,): a pose. ``covariance`` (3, 3): that of the body-frame perturbation of the mean."""
+    """A Gaussian prior of a pose. ``mean`` (3,): a pose. ``covariance`` (3, 3): of the mean's body-frame perturbation."""
 
     def __init__(self, mean: Array, covariance: Array) -> None:
         self._mean = mean

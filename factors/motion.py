@@ -73,7 +73,7 @@ def poses_between(
     ``previous`` (T,): the index of the last estimated pose before each time.
     ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time, its
     body-frame covariance, and its duration.
-    ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: those from each estimated pose to the next.
+    ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: the motion from each estimated pose to the next.
     ``elsewhere`` (M-1,): True where somebody carried the robot to the next pose. Poses in between then ignore the next pose.
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
 

@@ -87,7 +87,7 @@ class _State(NamedTuple):
 
 class _Step(NamedTuple):
     """A prediction step, for the smoother. ``pose`` (3,): the predicted pose. ``transition`` (3, 3+R): the rows of the transition
-    matrix for the pose; its other rows are those of an identity. ``noise`` (3, 3): the covariance added to the pose."""
+    matrix for the pose; its other rows equal an identity matrix. ``noise`` (3, 3): the covariance added to the pose."""
 
     pose: Array
     transition: Array

@@ -32,7 +32,8 @@ class Description:
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
-    """The settings of an estimator. ``overrides``: values by dotted key, without the estimator's name; the rest are defaults.
+    """The settings of the estimator ``name``: the defaults, changed by ``overrides``. These are values by dotted key, without the
+    estimator's name in the key.
 
     Raises InputError if the estimator or a key is unknown, or if a value is out of bounds.
     """
@@ -66,7 +67,7 @@ def _takes(kind: type[Any], channel: Channel) -> bool:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise InputError if a name is not that of an estimator. The message proposes the most similar name."""
+    """Raise InputError if one of ``names`` is not the name of an estimator. The message proposes the most similar name."""
     for name in names:
         if name not in ESTIMATORS:
             raise InputError(f"no estimator is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")

@@ -84,8 +84,8 @@ SLIPS = "the odometry contradicts the observations since {since:.1f} s: the moti
 
 
 class Tracked(NamedTuple):
-    """The newest estimate of a track: ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the integrated ``odometry`` at its
-    time."""
+    """The newest estimated pose of an estimator: ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the integrated
+    ``odometry`` at its time."""
 
     odometry: ChainState
     pose: Array
@@ -93,7 +93,7 @@ class Tracked(NamedTuple):
 
 
 class Refuted(NamedTuple):
-    """The rejection of a track.
+    """The rejection of a track (the estimated poses since the last start), because observations contradict it.
 
     ``why``: the reason, for messages. ``since`` [s]: the track is wrong from this time on. ``change``: the interval in which the
     robot left the track. ``extra_covariance`` (3, 3): must be added to the body-frame covariance of the new pose.
@@ -119,14 +119,14 @@ class Tracking(Search):
         self._rejected = -math.inf  # s; time of the last rejection of a track by particles
 
     def is_unsure(self, t: float, covariance: Array) -> bool:
-        """True if the pose of a track at ``t`` [s] should not be reported as localized. ``covariance`` (3, 3): that of the pose.
+        """True if the estimated pose at ``t`` [s], with ``covariance`` (3, 3), should not be reported as localized.
 
         This is so if the position error exceeds :data:`NEAR` with a probability above 1 - :data:`SURE`, if the motion is unknown,
         or if the previous track was rejected less than :data:`PROBATION` ago.
         """
         if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True
-        # cheap test first: the probability is at most that of a circular Gaussian with the same sum of variances
+        # cheap test first: a circular Gaussian with the same sum of variances has at least this probability of a larger error
         return bool(covariance[0, 0] + covariance[1, 1] > CERTAIN and beyond(covariance, NEAR) > 1.0 - SURE)
 
     @property
@@ -232,8 +232,8 @@ class Tracking(Search):
         return times[int(np.argmax(likelihoods))], (last, times[possible[0]])
 
     def begin_track(self, *, by_search: bool) -> None:
-        """Begin a new track. ``by_search``: True if it begins at the pose of the search, whose observations are processed again;
-        False if it begins at a given prior."""
+        """End the search, because the estimator continues at a new pose. ``by_search``: True if the search found this pose, so that
+        the estimator processes the stored observations again. False if a prior gave the pose."""
         self.end()
         if by_search:
             self._kept.clear()
@@ -364,8 +364,8 @@ def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
 
 
 def beyond(covariance: Array, distance: float) -> float:
-    """The probability that the position of a Gaussian pose differs from its mean by more than ``distance`` [m].
-    ``covariance`` (3, 3): that of the pose."""
+    """The probability that the position of a Gaussian pose with ``covariance`` (3, 3) differs from its mean by more than
+    ``distance`` [m]."""
     angle = math.pi * np.arange(180) / 180.0
     direction = np.column_stack((np.cos(angle), np.sin(angle)))
     curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)

@@ -68,7 +68,7 @@ class Sensors:
 
     @property
     def goals(self) -> Array:
-        """Positions (K, 2) [m] near which the sensors are most informative, such as those of tags."""
+        """Positions (K, 2) [m] near which the sensors are most informative, such as the positions of tags."""
         return np.concatenate([np.empty((0, 2)), *(forecast.goals for forecast in self.forecasts)])
 
     @staticmethod
@@ -80,8 +80,8 @@ class Sensors:
         turn_rate: float,
         only: Collection[str],
     ) -> Sensors:
-        """Return the sensor models of a rig. ``only``: the names of the sensors that are used. ``settings``: those of the
-        simulation, with the rates of sensors. ``speed`` [m/s], ``turn_rate`` [rad/s]: those of the robot."""
+        """Return the sensor models of a rig. ``only``: the names of the sensors that are used. ``settings``: the settings of the
+        simulation, with the rates of sensors. ``speed`` [m/s], ``turn_rate`` [rad/s]: of the robot."""
         made = [
             forecast(world, rig.alone(name), speed, settings)
             for name, forecast in functions("forecast", rig)
@@ -142,7 +142,7 @@ def expected_gain(
 ) -> Array:
     """Return the expected reduction of entropy (C,) [nats] on each of C paths.
 
-    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is that of the pose at its end.
+    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is the entropy of its end pose.
     ``space``: a particle whose path leads into a wall stops there and makes no further measurements.
     ``places`` (M,): the index of each particle's mode. If given, the entropy of this index is computed and not that of the pose.
     ``noise``: the noise of the odometry on the path; None means no noise.

@@ -109,7 +109,7 @@ def information(s: Situation, sign: float = 1.0) -> Choice:
 
 
 def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Return the expected information (C,) [nats] of near paths, with respect to the whole belief."""
+    """Return the expected reduction of the belief's entropy (C,) [nats] on each of C near paths."""
     samples = s.settings.policy.samples
     gains = expected_gain(s.sensors, s.particles, s.weights, paths, s.rng, samples=samples, space=s.space)
     if len(s.modes) != 1:

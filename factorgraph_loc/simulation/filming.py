@@ -43,7 +43,7 @@ class Film:
 
     ``times`` (N,) [s]: the times of the middle of the exposures. ``stamps`` (N,) [s]: the same times by the camera's clock.
     ``truth``: the true trajectory of the robot. ``renderer``: renders the images, and computes the 3-D point of a pixel.
-    ``seed``: that of the image noise.
+    ``seed``: the seed of the image noise.
     """
 
     renderer: Renderer
@@ -86,7 +86,7 @@ class Film:
 
 
 def film(settings: SimulationSettings, seed: int) -> Film:
-    """Return the images of a simulated drive. The drive is that of :func:`~factorgraph_loc.simulation.simulate` with the same
+    """Return the images of a simulated drive. :func:`~factorgraph_loc.simulation.simulate` simulates the same drive with the same
     settings and seed.
 
     Raises InputError if the rig has no camera, or if the camera is higher than the furniture.

@@ -45,7 +45,7 @@ class TexturedScene:
 
     ``faces`` (F, 4) [m]: segments (x1, y1, x2, y2), visible from their left side. ``bottoms``, ``tops`` (F,) [m]: heights of the
     faces.
-    ``width``, ``depth`` [m]: size of floor and ceiling. ``height`` [m]: of the ceiling.
+    ``width``, ``depth`` [m]: size of floor and ceiling. ``height`` [m]: height of the ceiling.
     ``texels`` (T, 3): the BGR colours of all mip levels of all textures. Columns of a face's texture run from left to right for the
     viewer, rows run downwards. On floor and ceiling, columns run along x and rows along y.
     ``layout`` (F + 2, LEVELS, 3): index of the first texel, width and height of each level of each texture. The textures of floor

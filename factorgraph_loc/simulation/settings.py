@@ -102,7 +102,7 @@ class SimulationSettings(FileModel):
     """name of the log"""
     world: WorldSettings
     world_seed: Annotated[int, Field(ge=0, le=2**63 - 1)] | None = None
-    """seed of the building, its textures and its survey, for several drives in one building; by default that of the log"""
+    """seed of the building, its textures and its survey, for several drives in one building; by default the seed of the log"""
     drive: DriveSettings = DriveSettings()
     rounds_per_second: Hertz = 2.0
     """inventory rounds of each antenna"""

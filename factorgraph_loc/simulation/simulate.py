@@ -90,7 +90,7 @@ def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Tr
 def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
     """Follow a path (N, 2) by pure pursuit: turn towards a point ahead on the path, and slow down if the heading error is large.
 
-    ``heading`` [rad]: that of the start pose. Returns the driven poses.
+    ``heading`` [rad]: the heading at the start. Returns the driven poses.
     """
     every = max(1, round(1.0 / (settings.rate * STEP)))
     step = 1.0 / (settings.rate * every)

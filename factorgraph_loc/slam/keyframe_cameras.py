@@ -287,7 +287,7 @@ class KeyframeCameras:
     def bundled(
         self, newest: Keyframe, pose: Array, waiting: Waiting, tilt: float, graph: Graph
     ) -> tuple[dict[int, KeyframeCamera], Array] | None:
-        """Return the adjusted camera poses of the last keyframes, by number, and the adjusted pose (3,) of the newest one.
+        """Return the adjusted camera poses of the last keyframes, by number, and the adjusted pose (3,) of ``newest``.
 
         ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the sightings of the points that are
         adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch.

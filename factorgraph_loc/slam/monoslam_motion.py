@@ -69,8 +69,8 @@ class Step:
     noise: Array
 
     def carried(self, covariance: Array) -> Array:
-        """Return the predicted covariance. ``covariance`` (12 + P + D, 12 + P + D): that of robot, P constants of the odometry, and
-        D values of points before the step."""
+        """Return the covariance after the step. ``covariance`` (12 + P + D, 12 + P + D): the covariance before the step, of the
+        robot, P constants of the odometry, and D values of points."""
         known = self.transition.shape[1]
         carried = self.transition @ covariance[:known]
         result = covariance.copy()
@@ -93,7 +93,7 @@ class Step:
 class Origin:
     """The start of a run without a map. Its uncertainty is not part of the state, but is added to estimates.
 
-    ``robot``: the state at the start. ``covariance`` (6, 6): of the start pose, in the robot's frame.
+    ``robot``: the state at the start. ``covariance`` (6, 6): the covariance of the start pose, in the robot's frame.
     """
 
     robot: RobotState
@@ -122,7 +122,7 @@ def standstill(robot: RobotState) -> Step:
 
 
 def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: Array, dt: float) -> Step:
-    """Return the step of a robot that moves as measured by odometry. Velocity and turn rate are set to those of the odometry.
+    """Return the step of a robot that moves as measured by odometry. The odometry also sets its velocity and turn rate.
 
     ``robot``: the state at the start. ``delta`` (3,): pose of the end in the frame of the start, as x [m], y [m], heading [rad].
     ``covariance`` (3, 3): of a perturbation of the end in its own frame. ``by_constants`` (3, P): the derivative of this
@@ -174,7 +174,7 @@ def heading_of(robot: RobotState) -> Array:
 def seen_from_above(robot: RobotState, covariance: Array) -> tuple[Array, Array]:
     """Return the planar pose (3,) of a robot, as x, y and heading, and its covariance (3, 3).
 
-    ``covariance`` (6, 6): that of the robot's pose in space, in the robot's frame.
+    ``covariance`` (6, 6): the covariance of the robot's pose in space, in the robot's frame.
     """
     rotation = robot.rotation
     x, y = rotation[0, 0], rotation[1, 0]

@@ -56,7 +56,7 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     gains = blocks @ np.linalg.inv(each)[None]
     corrected = residual[:, None] - np.einsum("jiab,ib->jia", gains, residual)
     covariances = each[:, None] - gains @ blocks.transpose(0, 1, 3, 2)
-    # despite rounding errors, the variances must not be smaller than those of the noise
+    # without rounding errors, the variances are at least as large as the noise
     covariances[..., 0, 0] = np.maximum(covariances[..., 0, 0], noise[:, None, 0, 0])
     covariances[..., 1, 1] = np.maximum(covariances[..., 1, 1], noise[:, None, 1, 1])
     distances = squared(corrected.reshape(-1, 2), covariances.reshape(-1, 2, 2)).reshape(count, count)
@@ -254,7 +254,7 @@ class FeatureMatcher:
     def _agreeing(
         self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Return those of the pairs ``ours`` (row of the image, point of the state) that are inliers."""
+        """Return the inliers among the pairs ``ours`` (row of the image, point of the state). ``pixels``: of all rows."""
         if not ours:
             return ours
         sights = eye.mapped(state, [p for _, p in ours])
@@ -264,7 +264,7 @@ class FeatureMatcher:
     def _agreeing_known(
         self, pixels: Array, known: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Return those of the pairs ``known`` (row of the image, point of the map) that are inliers."""
+        """Return the inliers among the pairs ``known`` (row of the image, point of the map). ``pixels``: of all rows."""
         if len(known) < FEWEST:
             return known
         points = self._map.positions[[p for _, p in known]]

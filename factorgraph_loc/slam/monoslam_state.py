@@ -36,7 +36,7 @@ from factors.motion import ChainState
 from factors.se2 import Array, Integers
 from factors.update import GATE
 
-POSE = 6  # the first six values of the error state are those of the pose
+POSE = 6  # number of components of the pose, which are the first components of the error state
 VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s: standard deviations at the start
 
 
@@ -243,7 +243,8 @@ class Eye:
         return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + state.base, sizes, noise)
 
     def all(self, state: SlamState, which: Sequence[int], points: Array, covariances: Array | None) -> Sights:
-        """Return the predicted pixels of the points ``which`` of the state, followed by those of map points as in :meth:`known`."""
+        """Return the predicted pixels of the points ``which`` of the state, followed by the pixels of map points (see
+        :meth:`known`)."""
         first, second = self.mapped(state, which), self.known(state.robot, points, covariances)
         if not len(first) or not len(second):
             return first if len(first) else second

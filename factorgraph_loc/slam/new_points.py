@@ -112,7 +112,7 @@ class NewPoints:
         return {name: sightings for name, sightings in self.waiting.items() if trusted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
-        """Drop the points ``wrong``, and those without a sighting in the last :data:`PATIENCE` keyframes before number
+        """Drop the points ``wrong``, and all points without a sighting in the last :data:`PATIENCE` keyframes before number
         ``keyframe``."""
         since = keyframe - PATIENCE
         self.waiting = {k: v for k, v in self.waiting.items() if v[-1].keyframe >= since and k not in wrong}

@@ -336,7 +336,7 @@ class UnknownPoints(Mapper):
         observed = positions[recent], pixels[recent], covariances[recent], noise[recent]
         guess = unless_slipped(replace(model, tilt=sigma), keyframe, guess, graph.motion.slip, observed)
         since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
-        near = guess if since is None else (guess[0], since)  # with the covariance relative to recent points
+        near = guess if since is None else (guess[0], since)  # odometry since these points were observed
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
         # a named point needs one other point that confirms it
         revisited = max(2 if named else REVISITED, math.ceil(LEAST_INLIERS * np.count_nonzero(~recent & ~known)))

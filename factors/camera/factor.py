@@ -31,7 +31,7 @@ NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 @dataclass(frozen=True, slots=True)
 class ReprojectionFactor:
-    """A factor on the robot's pose from K known points in one image. The pose may be that of a slightly earlier time.
+    """A factor on the robot's pose from K known points in one image. The pose may be the pose at a slightly earlier time.
 
     ``points`` (K, 3): world positions. ``pixels`` (K, 2): their measured pixels.
     ``offset`` (3,): the robot's pose at the image's time, in the frame of the pose variable. Odometry measures it. None if both

@@ -341,7 +341,7 @@ def log_likelihood(
     """The compiled part of :func:`factors.camera.model.log_likelihood`.
 
     ``whiteners`` (K, 2, 2): the matrices that whiten the pixel errors. ``tilts`` (K, 2, 2): the Jacobian of the whitened errors by
-    roll and pitch in standard deviations. ``scale``: that of Huber's loss. The tilt of each pose is fitted by least squares,
+    roll and pitch in standard deviations. ``scale``: the scale of Huber's loss. The tilt of each pose is fitted by least squares,
     without robust weights.
     """
     place, count = mounting(position, rotation), len(points)

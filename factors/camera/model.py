@@ -261,7 +261,7 @@ def log_likelihood(
 
     ``poses`` (N, 3): robot poses. ``points`` (K, 3): world points. ``pixels`` (K, 2): their measured pixels.
     ``tilts`` (K, 2, 2): the Jacobian of the pixels by roll and pitch, from :func:`by_tilt`.
-    ``covariances`` (K, 2, 2) [px^2]: covariance of each pixel, including that of an inexact map. None means pixel noise only.
+    ``covariances`` (K, 2, 2) [px^2]: covariance of each pixel, including the error of an inexact map. None means pixel noise only.
     """
     if covariances is None:
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
@@ -277,7 +277,7 @@ def lens_of(model: CameraModel) -> Lens:
     """The camera's intrinsic constants as a tuple for compiled code.
 
     One element limits the radius up to which the distortion is valid. This is the radius where the radial part stops growing, and
-    at most that of :data:`WIDEST` or :data:`WIDEST_FISHEYE`.
+    at most the radius of :data:`WIDEST` or :data:`WIDEST_FISHEYE`.
     """
     focal = model.fx, model.fy, model.cx, model.cy
     if not any(model.distortion) and not model.fisheye:

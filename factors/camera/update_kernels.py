@@ -225,7 +225,7 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
 def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
     """The covariances (K, 2, 2) of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian of the pixels by the
     points.
-    ``covariances`` (K, 3, 3): of the points. ``sigma`` [px]: the pixel noise."""
+    ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel noise."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):
         of = covariances[k]

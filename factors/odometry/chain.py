@@ -211,7 +211,7 @@ class OdometryChain:
         state.
 
         Returns five values: the odometry state at ``t``; the predicted pose (3,); the first three rows (3, S) of the transition
-        matrix, whose remaining rows are those of the identity; the covariance (3, 3) of the motion; the predicted covariance
+        matrix, whose remaining rows equal an identity matrix; the covariance (3, 3) of the motion; the predicted covariance
         (S, S).
         """
         size = len(covariance)

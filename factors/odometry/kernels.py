@@ -134,8 +134,8 @@ def predicted(
     ``constants`` (P,), ``indices`` (P,): corrections of the estimated odometry constants, and their indices among all constants.
     ``first``: the index of the first of these constants in the error state.
     ``at`` (3,): output, the predicted pose.
-    ``transition`` (3, S): output, the first three rows of the transition matrix. The remaining rows are those of the identity.
-    ``out`` (S, S): output, the predicted covariance.
+    ``transition`` (3, S): output, the first three rows of the transition matrix. The remaining rows are rows of an identity
+    matrix. ``out`` (S, S): output, the predicted covariance.
     """
     size, count = len(covariance), len(constants)
     columns = np.arange(3 + count)  # the columns of the transition that are not zero

@@ -19,7 +19,7 @@ class PositionFactor:
 
     ``position`` (2,) [m]: the measured position in the world frame, with ``covariance`` (2, 2).
     ``arm`` (2,) [m]: the measured point in the robot frame, such as the place of the antenna.
-    ``offset``: the robot's motion from the time of the pose to that of the measurement. None if the times are equal.
+    ``offset``: the robot's motion from the time of the pose to the time of the measurement. None if the times are equal.
     ``robust``: scale of the Geman-McClure loss in standard deviations.
 
     Methods with ``values`` take a list of one pose (3,).
@@ -86,7 +86,7 @@ class PositionFactor:
         return replace(self, robust=width * self.robust)
 
     def _covariances(self, poses: Array) -> Array:
-        """The covariances (N, 2, 2) of the errors in the world frame: the sum of those of the measurement and of ``offset``."""
+        """The covariances (N, 2, 2) of the errors in the world frame, caused by the measurement and by ``offset``."""
         if self.offset is None:
             return np.broadcast_to(self.covariance, (len(poses), 2, 2))
         x, y = self.arm

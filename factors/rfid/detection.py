@@ -109,8 +109,8 @@ class TagReadCounts:
 
 
 def merged(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Merge several counts with the same reference pose into one. ``parts``: counts in order of time. The ``odds`` of a tag are
-    those of the first part that lists it. Its ``elsewhere`` is the sum over all parts."""
+    """Merge several counts with the same reference pose into one. ``parts``: counts in order of time. A tag has the ``odds``
+    from the first part that lists it. Its ``elsewhere`` is the sum over all parts."""
     first = parts[0]
     if len(parts) == 1:
         return first
@@ -258,7 +258,7 @@ class RfidLikelihood:
         """The tempered log-likelihood (N,) of particles at poses (N, 3), from tables (:mod:`factors.rfid.weighing`,
         :mod:`factors.rfid.places`).
 
-        ``parameters`` (N, Q): the parameters of each particle. None means those of the likelihood. If particles differ in their
+        ``parameters`` (N, Q): the parameters of each particle, by default :attr:`parameters`. If particles differ in their
         time offset, the velocity of the first measurement is used for all measurements.
         """
         poses = np.ascontiguousarray(poses, dtype=float)

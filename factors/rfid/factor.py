@@ -309,7 +309,7 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
 
 @compiled
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """The covariance (D, D) after an update, and the logarithm of the ratio of its determinant to that before the update."""
+    """The covariance (D, D) after an update, and the change of the logarithm of the covariance's determinant by the update."""
     size, both = len(information), prior_information.copy()
     for i in range(size):
         for j in range(size):

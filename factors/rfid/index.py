@@ -120,8 +120,8 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 
 @compiled
 def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
-    """Select the tags that matter for poses (N, 3): those within ``reach`` [m] of any pose, those in the same cells, and those
-    listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
+    """Select the tags that may change the likelihood of poses (N, 3): all tags within ``reach`` [m] of any pose, other tags in the
+    same cells, and the tags listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
     _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)

@@ -19,7 +19,7 @@ from factors.se2 import Array, Integers
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
 ROW = 8  # numbers per antenna in the result of `_place_antennas`
-OF_READ, PLACE = 5, 7  # numbers of derivatives of one read probability, without and with those by the tag's position
+OF_READ, PLACE = 5, 7  # numbers of derivatives of one read probability, without and with the two by the tag's position
 MOST_COLUMNS = 8  # largest number of components of pose and parameters that one measurement depends on
 
 
@@ -183,7 +183,7 @@ def _add_tag(
     Writes, for each measurement, the derivative ``slope`` (K,) by the read probability and the Fisher information ``curve`` (K,) on
     that probability, both 0 out of reach. Writes the derivatives ``by`` (K, 7) of the probability by the antenna's position in the
     frame of the pose (2), its yaw, the parameters ``a`` and ``b`` of its model, and the tag's position in the world (2). ``at``:
-    the result of :func:`_place_antennas`. ``far``: that of :func:`_unread`.
+    the result of :func:`_place_antennas`. ``far``: the result of :func:`_unread`.
     """
     nll = mean = variance = 0.0
     for k in range(len(antennas)):
@@ -198,7 +198,7 @@ def _add_tag(
         q, by_z, by_rate = detection(packed, z, rate)
         e, slope[k], curve[k], expected, own_variance = outcome(q, hits[k], rounds[k])
         nll, mean, variance = nll + e, mean + expected, variance + own_variance
-        # the derivatives by a motion of the antenna are opposite to those by a motion of the tag
+        # a motion of the antenna has the opposite effect of the same motion of the tag
         by[k, 0] = by_z * (at[k, 5] * by_q - at[k, 4] * by_p)
         by[k, 1] = -by_z * (at[k, 5] * by_p + at[k, 4] * by_q)
         by[k, 2], by[k, 3] = by_z * by_heading, by_z * by_range

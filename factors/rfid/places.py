@@ -29,7 +29,8 @@ from factors.se2 import Array, Integers
 MOST = 1 << 25  # maximum number of elements of a table; cells are made larger if necessary
 # Poses are far apart if the area within their reach exceeds this multiple of the area within reach of one pose.
 WIDE = 2.0
-# Costs in units of the cost of a table look-up for one tag: of a pose without its tags, and of a tag and antenna without tables.
+# Costs in units of the cost of a table look-up for one tag: the fixed cost of a pose, and the cost of a tag and antenna if there is
+# no table.
 PLACED = 25
 BY_ANTENNA = 7
 
@@ -204,7 +205,7 @@ class Places:
         return self._last[key]
 
     def _scan(self, counts: Counts) -> Scan:
-        """Convert counts to a :class:`Scan` of the exceptional tags: those that were read, and those with unusual odds."""
+        """Convert counts to a :class:`Scan` of the exceptional tags, which were read or have other odds than most tags."""
         _, antennas, rounds, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
         rows = np.arange(len(odds))
         if len(odds) == len(self.points) > 0:
@@ -232,7 +233,7 @@ def _log_likelihood(
 ) -> None:
     """Add the tempered log-likelihood of poses (N, 3), relative to that of poses without tags in reach, to ``out`` (N,).
 
-    ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): those of :class:`Places`. ``missed``: the table of misses.
+    ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): fields of :class:`Places`. ``missed``: the table of misses.
     """
     far, tabled, reach = _far(tables, scan, tempering), tables.gain.size > 0, model.reach
     rows, base, size = (len(index.start) - 1) // index.columns, far.sum(), missed.surveyed.shape[1]

@@ -76,7 +76,7 @@ class RssiReads(TagReads):
 
 @dataclass(frozen=True, eq=False)
 class PhaseReads(TagReads):
-    """Reads with phases. ``phase`` (R,) [rad]: as reported. ``frequency`` (R,) [Hz]: of the carrier. ``windows`` (R,): the number
+    """R reads with phases. ``phase`` (R,) [rad]: as reported. ``frequency`` (R,) [Hz]: of the carrier. ``windows`` (R,): the number
     of each read's time window."""
 
     phase: Array
@@ -208,8 +208,8 @@ class PhaseLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of signal strengths as a function of the robot's pose, for a map of tags. It is relative to that of zero
-    residuals."""
+    """The likelihood of signal strengths as a function of the robot's pose, for a map of tags. It is relative to its value for
+    residuals of zero."""
 
     model: RssiModel
     tags: TagArray

@@ -34,7 +34,7 @@ CELL = 0.05  # m; size of a cell of a table
 COARSE = 8  # number of cells along each side of a block, for which the largest value is stored
 FACINGS = 9  # number of layers, for evenly spaced cosines of the facing from -1 to 1
 NEGLIGIBLE = 15.0  # logarithm of the ratio of two likelihoods above which the smaller one is neglected
-NO_MATTER = 1e-3  # smaller differences of a log-likelihood from that of a tag out of reach are neglected
+NO_MATTER = 1e-3  # a tag is neglected if its log-likelihood differs by less from the value of a tag out of reach
 SCATTERED = 2.0  # m; if a tag's position relative to an antenna differs by more among particles, blocks are not used to exclude it
 STEP, LEVEL = 0.01, 0.04  # resolution of logits in the tables, and the height [m] within which tags have one table
 _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
@@ -176,7 +176,7 @@ def row_of(
     """The index in ``sigmoids`` of the logit of a tag in reach of an antenna.
 
     ``level``: the number of the table. ``along``, ``across``: the tag's position relative to the antenna's heading, divided by the
-    range scale of the model. ``height``: that of the tag above the floor. ``facing``: the cosine of the tag's facing.
+    range scale of the model. ``height`` [m]: of the tag above the floor. ``facing``: the cosine of the tag's facing.
     """
     m = packed.which[antenna]
     if packed.kinds[m] == LOGISTIC:
@@ -212,8 +212,8 @@ def relevant(
 ) -> NDArray[np.bool_]:
     """A mask (K, T) of measurements and tags that change the likelihood of any particle noticeably.
 
-    ``poses`` (N, 3), ``parameters`` (N or 1, Q): of the particles. ``packed``: models adjusted to the first row of ``parameters``.
-    ``near`` (T,): a mask of tags in reach.
+    ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models adjusted to the first
+    row of ``parameters``. ``near`` (T,): a mask of tags in reach.
 
     The mask is True for near tags that were read, and for near tags that have a relevant read probability according to the blocks
     of the tables. In a dense map most tags have none, which saves time.

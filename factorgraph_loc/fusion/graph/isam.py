@@ -34,7 +34,7 @@ ROUNDING = 1e-6  # s: rounding error of differences of times
 
 
 class Incremental:
-    """The backend of the smoother, which solves the graph during the run. See the module."""
+    """The backend of the smoother, which solves the graph incrementally during the run. See the module."""
 
     def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
@@ -132,7 +132,7 @@ class Incremental:
         if guess is None or not (self._waits or keyframe.t < self._solved + self._solve_every):
             self._update(addition)
             return
-        # the corrected covariance ignores correlations with estimated landmarks, so keep that of the solver
+        # the corrected covariance ignores correlations with estimated landmarks, so keep the solver's covariance
         if self._waits:
             guess = guess[0], self._graph.covariance
         self._wait(addition, guess)

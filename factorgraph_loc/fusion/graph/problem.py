@@ -334,8 +334,8 @@ class Problem:
         return graph
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
-        """The marginal covariances of variables at a solution, those of poses in the body frame. ``keys``: variables that are
-        needed; the result may have more. Raises IndeterminateError if the graph does not determine a variable."""
+        """The marginal covariances of the variables ``keys``, and possibly of further variables, at the solution ``values``. A
+        covariance of a pose is in the body frame. Raises IndeterminateError if the graph does not determine a variable."""
         marginals = None if self._chain is None else self._chain.covariances(values)
         if marginals is not None:
             return marginals

@@ -94,7 +94,7 @@ class FullHistory:
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
         """The information of all variables that have left the solver, or None if none has left. ``failed``: True if the last update
-        failed; then the information is that from before the update."""
+        failed, to return the information from before this update."""
         return None
 
     def value(self, key: int) -> Array:
@@ -105,7 +105,7 @@ class FullHistory:
         return retract(key, self._ours.at[key], np.asarray(step, dtype=float))
 
     def covariance(self, key: int) -> Array:
-        """The marginal covariance of a variable. That of a pose is in the body frame."""
+        """The marginal covariance of a variable. The covariance of a pose is in the body frame."""
         return np.asarray(self._solver.marginalCovariance(key))
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
@@ -140,7 +140,7 @@ class Window(FullHistory):
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
         stamps = dict.fromkeys(values, t)
         for node in nodes:
-            if is_point(node.keys[-1]):  # the time of a point is that of its last sighting
+            if is_point(node.keys[-1]):  # the time of a point is the time of its last observation
                 stamps[node.keys[-1]] = t
         self.begin((), nodes, values, stamps)
 

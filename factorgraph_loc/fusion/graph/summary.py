@@ -45,7 +45,7 @@ class MarginalSummary:
         values = to_gtsam(at)
 
         def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
-            """Move a marginal factor from the linearisation points of iSAM2 to those of the summary, and store these in it."""
+            """Convert a marginal factor from the linearisation points of iSAM2 to the linearisation points ``at``."""
             return gtsam.LinearContainerFactor(
                 gtsam.LinearContainerFactor(factor.factor(), points).linearize(values), values
             )
