@@ -1,3 +1,3 @@
 """Ranges and bearings of landmarks: measurement model and factor."""
 
-__all__ = ["factor", "kernels", "model"]
+__all__ = ["factor", "kernels", "late", "model"]

@@ -10,7 +10,8 @@ from functools import lru_cache
 import numpy as np
 
 from factors import se2
-from factors.landmarks import kernels
+from factors.landmarks import kernels, losses
+from factors.landmarks.late import LateRanges
 from factors.landmarks.model import (
     CONSTANTS,
     EXACT,
@@ -25,8 +26,9 @@ from factors.landmarks.model import (
     on_floor,
     recalibrated,
     widened,
+    with_late,
 )
-from factors.robust import geman_mcclure_loss, geman_mcclure_weight
+from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers
 from factors.sighting import delayed
 from factors.update import CONVERGED, GATE, Correction
@@ -78,14 +80,11 @@ class BearingRangeFactor:
             linear = kernels.weighted(self.model.packed, self.packed, values[0], constants, self.places)
             residual, by_pose, by_sensor = linear
             return residual, [by_pose, by_sensor] if self.estimated else [by_pose]
-        if not self.biased:
-            error, jacobian = self._whitened(values)
-            kernels.weigh(error, jacobian, self.model.robust)
-            return error.ravel(), [block.reshape(len(error) * 2, -1) for block in self._blocks(jacobian)]
-        error, blocks = self.whitened(values)
-        weight = np.sqrt(geman_mcclure_weight(np.einsum("ki,ki->k", error, error), self.model.robust))
-        weighted = [(weight[:, None, None] * block).reshape(-1, block.shape[2]) for block in blocks]
-        return (weight[:, None] * error).ravel(), weighted
+        error, blocks, slopes = self._linearized(values)
+        jacobian = np.concatenate(blocks, axis=2)
+        losses.weigh(self.model.packed, error, jacobian, slopes)
+        ends = np.cumsum([block.shape[2] for block in blocks])[:-1]
+        return error.ravel(), np.split(jacobian.reshape(error.size, -1), ends, axis=1)
 
     @property
     def kind(self) -> Hashable:
@@ -123,8 +122,8 @@ class BearingRangeFactor:
 
     def cost(self, values: Sequence[Array]) -> float:
         """The robust loss, summed over the landmarks."""
-        error, _ = self.whitened(values)
-        return float(np.sum(geman_mcclure_loss(np.sum(error**2, axis=-1), self.model.robust)))
+        error, _, slopes = self._linearized(values)
+        return float(losses.loss(self.model.packed, error, slopes))
 
     def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
         """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement. ``parameters`` (N, 6):
@@ -140,14 +139,42 @@ class BearingRangeFactor:
         """The factor with the scale of its robust loss multiplied by ``width``."""
         return self if width == 1.0 else replace(self, model=widened(self.model, width))
 
+    def with_late(self, late: LateRanges) -> BearingRangeFactor:
+        """The factor with these ``late`` ranges."""
+        return self if late == self.model.late else replace(self, model=with_late(self.model, late))
+
+    def predicted(self, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
+        """The arguments of :meth:`~factors.landmarks.late.LateShares.after` at a predicted ``pose`` (3,) with body-frame
+        ``covariance`` (3, 3). The factor must depend on the pose only."""
+        contiguous = np.ascontiguousarray(covariance)
+        return kernels.predicted(self.model.packed, self.packed, pose, contiguous)
+
+    def resolved(self, values: Sequence[Array], covariance: Array) -> ResolvedFactor:
+        """The factor for one correction of a Gaussian with these mean ``values`` and their joint ``covariance`` (D, D)."""
+        error, blocks, slopes = self._linearized(values)
+        jacobian, changed, weights = np.concatenate(blocks, axis=2), error.copy(), np.ones(len(error))
+        columns, contiguous = np.arange(len(covariance)), np.ascontiguousarray(covariance)
+        known = changed, jacobian, columns, contiguous, slopes
+        losses.resolve(self.model.packed, *known, GATE, weights, np.empty(len(error)))
+        return ResolvedFactor(self, (changed - error)[:, 0], np.sqrt(weights))
+
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        return self._linearized(values)[:2]
+
+    def _linearized(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
+        """The results of :meth:`whitened`, and the derivatives (K,) of :func:`~factors.landmarks.losses.slopes`."""
         error, jacobian = self._whitened(values)
-        blocks = self._blocks(jacobian)
+        blocks, slopes = self._blocks(jacobian), np.empty(len(error))
+        losses.slopes(error, jacobian, self._shortened(values), self.bearings, slopes)
         if self.biased:
             shorter, longer = (self._whitened(values, bias)[0] for bias in (SMALL_BIAS, -SMALL_BIAS))
             blocks.insert(1 + bool(self.estimated), ((shorter - longer) / (2.0 * SMALL_BIAS))[..., None])
-        return error, blocks
+        return error, blocks, slopes
+
+    def _shortened(self, values: Sequence[Array]) -> Array:
+        """The ranges (K,) without their bias."""
+        return self.ranges - values[1 + bool(self.estimated)][0] if self.biased else self.ranges
 
     def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
         """The whitened residual (K, 2) with ``bias`` [m] added to the range bias, and its Jacobian (K, 2, WIDTH) by the pose, the
@@ -158,7 +185,7 @@ class BearingRangeFactor:
         if self.free:
             packed = (self._placed(values[-1]), *packed[1:])
         if self.biased:
-            packed = (packed[0], packed[1] - values[1 + bool(self.estimated)][0] - bias, *packed[2:])
+            packed = (packed[0], self._shortened(values) - bias, *packed[2:])
         error, jacobian = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
         kernels.linearize(self.model.packed, values[0], changes, packed, error, jacobian)
         return error, jacobian
@@ -216,6 +243,30 @@ class BearingRangeFactor:
         return point, [-to_point @ block[0] for block in blocks[:-1]], to_point @ to_point.T
 
 
+@dataclass(frozen=True)
+class ResolvedFactor:
+    """A factor whose ranges that may be late are replaced by Gaussian measurements; a :class:`~factors.sighting.SightingFactor`.
+    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the weights."""
+
+    factor: BearingRangeFactor
+    shift: Array
+    root: Array
+
+    def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
+        """The whitened residual (K, 2) and its Jacobian (K, 2, d) by each value."""
+        error, blocks = self.factor.whitened(values)
+        error[:, 0] += self.shift
+        return self.root[:, None] * error, [self.root[:, None, None] * block for block in blocks]
+
+    def weight(self, squared: Array) -> Array:
+        """The robust weights of ``squared`` norms of whitened residuals."""
+        return self.factor.weight(squared)
+
+    def dof(self) -> int:
+        """Number of measured ranges and bearings."""
+        return self.factor.dof()
+
+
 def landmark_update(
     factor: BearingRangeFactor,
     pose: Array,
@@ -253,7 +304,6 @@ class BearingRangeStack:
     def __init__(self, factors: Sequence[BearingRangeFactor], pose_of: Sequence[int], column: int) -> None:
         first = factors[0]
         self._model, self._estimated, self._column = first.model.packed, list(first.estimated), column
-        self._robust = first.model.robust
         self._pose_of = np.array(pose_of, dtype=np.int64)
         sizes = np.array([len(f.points) for f in factors])
         self._ends = np.cumsum(sizes)
@@ -279,8 +329,8 @@ class BearingRangeStack:
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
         """Write the whitened residuals with robust weights into ``residual`` (2 K,), and their Jacobian into ``jacobian``
         (2 K, 6 + P). The columns are those of :mod:`factors.chain`."""
-        error, by_all = self._whitened(poses, parameters)
-        kernels.weigh(error, by_all, self._robust)
+        error, by_all, slopes = self._whitened(poses, parameters)
+        losses.weigh(self._model, error, by_all, slopes)
         by_all = by_all.reshape(len(residual), WIDTH)
         residual[:], jacobian[:, :3] = error.ravel(), by_all[:, :POINT]
         end = self._column + len(self._estimated)
@@ -288,17 +338,19 @@ class BearingRangeStack:
 
     def cost(self, poses: Array, parameters: Array) -> float:
         """The robust loss, summed over all factors."""
-        error, _ = self._whitened(poses, parameters)
-        return float(np.sum(geman_mcclure_loss(np.einsum("ki,ki->k", error, error), self._robust)))
+        error, _, slopes = self._whitened(poses, parameters)
+        return float(losses.loss(self._model, error, slopes))
 
-    def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array]:
-        """The whitened residuals (K, 2) and their Jacobian (K, 2, WIDTH), without robust weights."""
+    def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array, Array]:
+        """The whitened residuals (K, 2) and their Jacobian (K, 2, WIDTH), without robust weights, and their slopes (K,)."""
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2
         changes[self._estimated] = parameters[self._column : self._column + len(self._estimated)]
         out = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
         sightings = self._flags, self._offsets, self._covariances, self._counts, self._twists, self._spreads
         kernels.linearize_all(self._model, poses, self._pose_of, changes, self._ends, self._seen, *sightings, *out)
-        return out
+        slopes = np.empty(count)
+        losses.slopes(*out, *self._seen[1:], slopes)
+        return *out, slopes
 
 
 @lru_cache(maxsize=64)

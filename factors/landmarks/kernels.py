@@ -8,6 +8,7 @@ import numpy as np
 
 from factors.compiled import compiled
 from factors.gaussian import cholesky, invert_covariance
+from factors.landmarks.losses import resolve, reweigh, slopes, weigh
 from factors.landmarks.model import (
     BEARING_SIGMA,
     CONSTANTS,
@@ -16,13 +17,11 @@ from factors.landmarks.model import (
     POINT,
     RANGE_SIGMA,
     RELATIVE,
-    ROBUST,
     TIME_OFFSET,
     TURN,
     WIDTH,
     whitened_into,
 )
-from factors.robust import geman_mcclure_weight
 from factors.se2 import Array, Integers, compose_scalars, exp_scalars, moved
 from factors.update import corrected, normalised
 
@@ -39,7 +38,7 @@ Sighting = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Arr
 def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error: Array, jacobian: Array) -> None:
     """Linearise one measurement as :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` does.
 
-    ``model`` (11,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
+    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
     ``changes`` (6,): corrections of the sensor constants.
     ``error`` (K, 2): output, the whitened residual. Must contain zeros before the call.
     ``jacobian`` (K, 2, WIDTH): output, its Jacobian. Must contain zeros before the call.
@@ -131,18 +130,6 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
     return a, b, d
 
 
-@compiled
-def weigh(error: Array, jacobian: Array, robust: float) -> None:
-    """Multiply residuals (K, 2) and their Jacobian (K, 2, D), in place, by the square roots of the robust weights. ``robust``:
-    scale of the loss in standard deviations."""
-    for k in range(len(error)):
-        root = math.sqrt(geman_mcclure_weight(error[k, 0] ** 2 + error[k, 1] ** 2, robust))
-        for i in range(2):
-            error[k, i] *= root
-            for j in range(jacobian.shape[2]):
-                jacobian[k, i, j] *= root
-
-
 @compiled(error_model="numpy")
 def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
     """The number of landmarks whose normalised innovation squared exceeds ``limit``, at a ``pose`` (3,) with body-frame
@@ -213,7 +200,7 @@ def updated(
 ) -> tuple[Array, Array, Array, float, int]:
     """The robust, iterated Kalman update by one measurement of landmarks. See :func:`factors.update.update_state`.
 
-    ``model`` (11,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
+    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
     ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components of the error state are the pose.
     ``values`` (P,): corrections of the estimated sensor constants at the prediction.
     ``indices`` (P,): the indices of these constants in :data:`~factors.landmarks.model.PARAMETERS`.
@@ -227,8 +214,8 @@ def updated(
     columns = np.empty(3 + len(values), np.int64)
     for j in range(len(columns)):
         columns[j] = j if j < 3 else first + j - 3
-    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, len(columns)))
-    _linearized(model, packed, pose, values, indices, residual, jacobian)
+    residual, jacobian, slope = np.empty((count, 2)), np.empty((count, 2, len(columns))), np.empty(count)
+    _linearized(model, packed, pose, values, indices, residual, jacobian, slope)
     measured = 0
     for k in range(count):
         measured += (not math.isnan(packed[1][k])) + (not math.isnan(packed[2][k]))
@@ -244,16 +231,17 @@ def updated(
     for i in range(len(columns)):
         for j in range(len(columns)):
             nis -= pull[i] * posterior[columns[i], columns[j]] * pull[j]
-    if widest > 1.0:
-        delta, posterior, _ = corrected(prior, residual, jacobian, columns, weights, previous)
-    now = residual.copy()
+    now, expected = residual.copy(), squared.copy()
+    mixed = resolve(model, now, jacobian, columns, covariance, slope, gate, weights, expected)
+    nis += (expected - squared).sum()  # a late range is no contradiction
+    if widest > 1.0 or mixed:
+        delta, posterior, _ = corrected(prior, now, jacobian, columns, weights, previous)
     for _ in range(iterations - 1):
         if np.abs(delta - previous).max() < converged:
             break
         previous = delta
-        _linearized(model, packed, moved(pose, delta), values + delta[columns[3:]], indices, now, jacobian)
-        for k in range(count):
-            weights[k] = geman_mcclure_weight(now[k, 0] ** 2 + now[k, 1] ** 2, model[ROBUST])
+        _linearized(model, packed, moved(pose, delta), values + delta[columns[3:]], indices, now, jacobian, slope)
+        reweigh(model, now, slope, weights)
         delta, posterior, _ = corrected(prior, now, jacobian, columns, weights, previous)
     if not (np.all(np.isfinite(delta)) and cholesky(posterior)[1]):
         raise np.linalg.LinAlgError(
@@ -269,11 +257,29 @@ def weighted(
     """The whitened residual (2K,) with robust weights, and its Jacobians by the pose (2K, 3) and by the estimated constants
     (2K, P). The arguments are those of :func:`updated`."""
     count, wide = len(packed[0]), len(indices)
-    residual, jacobian = np.empty((count, 2)), np.empty((count, 2, 3 + wide))
-    _linearized(model, packed, pose, values, indices, residual, jacobian)
-    weigh(residual, jacobian, model[ROBUST])
+    residual, jacobian, slope = np.empty((count, 2)), np.empty((count, 2, 3 + wide)), np.empty(count)
+    _linearized(model, packed, pose, values, indices, residual, jacobian, slope)
+    weigh(model, residual, jacobian, slope)
     by_all = jacobian.reshape(2 * count, 3 + wide)
     return residual.reshape(2 * count), by_all[:, :3].copy(), by_all[:, 3:].copy()
+
+
+@compiled(error_model="numpy")
+def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
+    """The whitened errors (K,) of ranges at a predicted pose with body-frame ``covariance`` (3, 3), their :func:`slopes` (K,), and
+    the variances (K,) of the predicted ranges in units of the noise."""
+    count = len(packed[0])
+    error, jacobian, slope, variances = (
+        np.zeros((count, 2)),
+        np.zeros((count, 2, WIDTH)),
+        np.empty(count),
+        np.empty(count),
+    )
+    linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, jacobian)
+    slopes(error, jacobian, packed[1], packed[2], slope)
+    for k in range(count):
+        variances[k] = _carried(jacobian[k], covariance)[0]
+    return error[:, 0].copy(), slope, variances
 
 
 @compiled(error_model="numpy")
@@ -296,16 +302,24 @@ def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -
 
 @compiled(error_model="numpy")
 def _linearized(
-    model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers, residual: Array, jacobian: Array
+    model: Array,
+    packed: Sighting,
+    pose: Array,
+    values: Array,
+    indices: Integers,
+    residual: Array,
+    jacobian: Array,
+    slope: Array,
 ) -> None:
-    """Write the whitened residuals (K, 2) and their Jacobian (K, 2, 3 + P) by the pose and the estimated constants. The arguments
-    are those of :func:`updated`."""
+    """Write the whitened residuals (K, 2), their Jacobian (K, 2, 3 + P) by the pose and the estimated constants, and their
+    :func:`slopes` (K,). The arguments are those of :func:`updated`."""
     count = len(residual)
     changes = np.zeros(len(PARAMETERS))
     for j in range(len(values)):
         changes[indices[j]] = values[j]
     by_all = np.zeros((count, 2, WIDTH))
     linearize(model, pose, changes, packed, residual, by_all)
+    slopes(residual, by_all, packed[1], packed[2], slope)
     for k in range(count):
         for i in range(2):
             for j in range(3):

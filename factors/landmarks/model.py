@@ -4,7 +4,7 @@ The sensor's pose in the robot frame is ``mounting``. The sensor reports ``range
 direction in the sensor frame + bearing_bias + noise`` (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 6.40). The distance
 is the slant distance if a landmark has a height above the sensor. A camera that measures range by apparent size reports the depth
 instead: the distance times the cosine of the direction. The noise is Gaussian. The range and bearing of a landmark together have
-one robust loss, that of Geman and McClure.
+one robust loss, that of Geman and McClure. A range without a bearing may be late (:mod:`factors.landmarks.late`).
 """
 
 import math
@@ -16,6 +16,7 @@ import numpy as np
 
 from factors import se2
 from factors.compiled import compiled
+from factors.landmarks.late import NONE, LateRanges, mixture
 from factors.robust import geman_mcclure_loss
 from factors.se2 import Array
 
@@ -27,7 +28,7 @@ TIME_OFFSET = PARAMETERS.index("time_offset")
 POINT, CONSTANTS, WIDTH = 3, 5, 11
 EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
 # indices in ``BearingRangeModel.packed``, which begins with the first five PARAMETERS
-TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST = range(TIME_OFFSET, TIME_OFFSET + 6)
+TURN, RANGE_SIGMA, RELATIVE, BEARING_SIGMA, DEPTH, ROBUST, LATE = range(TIME_OFFSET, TIME_OFFSET + 7)
 HEIGHT = 2  # column of the height above the sensor in points that have one
 MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
 
@@ -43,7 +44,8 @@ class BearingRangeModel:
     range_sigma_relative * r)``.
     ``bearing_bias``, ``bearing_sigma``: offset and standard deviation of bearings [rad].
     ``robust``: the scale of the Geman-McClure loss in standard deviations.
-    ``packed``: the model as an array (11,) for compiled code.
+    ``late``: the late ranges among those without a bearing.
+    ``packed``: the model as an array (14,) for compiled code.
     """
 
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -55,12 +57,13 @@ class BearingRangeModel:
     bearing_bias: float = 0.0
     bearing_sigma: float = 0.05
     robust: float = 4.0
+    late: LateRanges = NONE
     packed: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         constants = *self.mounting[:2], self.bearing_bias, self.range_scale, self.depth_axis
         noise = self.range_sigma, self.range_sigma_relative, self.bearing_sigma
-        packed = np.array((*constants, self.mounting[2], *noise, float(self.depth), self.robust))
+        packed = np.array((*constants, self.mounting[2], *noise, float(self.depth), self.robust, *self.late))
         object.__setattr__(self, "packed", packed)
 
 
@@ -132,6 +135,12 @@ def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> Beari
 def widened(model: BearingRangeModel, width: float) -> BearingRangeModel:
     """The model with the scale of its robust loss multiplied by ``width``."""
     return replace(model, robust=width * model.robust)
+
+
+@lru_cache(maxsize=64)
+def with_late(model: BearingRangeModel, late: LateRanges) -> BearingRangeModel:
+    """The model with these ``late`` ranges."""
+    return replace(model, late=late)
 
 
 def _constants(model: BearingRangeModel, parameters: Array) -> Array:
@@ -256,39 +265,36 @@ def log_likelihood(
     changes = np.zeros((1, len(PARAMETERS))) if parameters is None else parameters
     constants = np.broadcast_to(_constants(model, changes), (len(poses), TIME_OFFSET))
     noise = (model.range_sigma, model.range_sigma_relative, model.bearing_sigma)
-    squared = np.empty((len(poses), len(points)))
-    sensor = (model.mounting[2], noise, model.depth)
-    if point_covariances is None:
-        _squared(poses, constants, *sensor, points, ranges, bearings, EXACT, squared, np.empty((0, 0)))
-        return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust), axis=-1))
-    widths = np.empty_like(squared)
-    covariances = np.ascontiguousarray(point_covariances, dtype=float)
-    _squared(poses, constants, *sensor, points, ranges, bearings, covariances, squared, widths)
-    return -np.asarray(np.sum(geman_mcclure_loss(squared, model.robust) + widths, axis=-1))
+    losses = np.empty((len(poses), len(points)))
+    sensor = (model.mounting[2], noise, model.depth, (model.robust, *model.late))
+    covariances = EXACT if point_covariances is None else np.ascontiguousarray(point_covariances, dtype=float)
+    _losses(poses, constants, *sensor, points, ranges, bearings, covariances, losses)
+    return -np.asarray(np.sum(losses, axis=-1))
 
 
 @compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
-def _squared(
+def _losses(
     poses: Array,
     constants: Array,
     turn: float,
     noise: tuple[float, float, float],
     depth: bool,
+    tails: tuple[float, float, float, float],
     points: Array,
     ranges: Array,
     bearings: Array,
     covariances: Array,
-    squared: Array,
-    widths: Array,
+    losses: Array,
 ) -> None:
-    """Compute squared norms of whitened residuals of K landmarks at N poses.
+    """Compute the negative log-likelihoods of K landmarks at N poses.
 
     ``constants`` (N, 5): sensor constants for each pose. ``turn``: heading of the sensor in the robot frame.
-    ``noise``: range sigma, relative range sigma, bearing sigma.
+    ``noise``: range sigma, relative range sigma, bearing sigma. ``tails``: scale of the robust loss, and the late ranges.
     ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
-    ``squared`` (N, K): output. ``widths`` (N, K): output if there are covariances. It is half the logarithm of the determinant of
-    the noise covariance with the points' part relative to that without. The negative log-likelihood contains it.
+    ``losses`` (N, K): output. With covariances it contains half the logarithm of the determinant of the noise covariance with the
+    points' part relative to that without.
     """
+    robust, share, mean, spread = tails
     range_sigma, range_sigma_relative, bearing_sigma = noise
     axis = ahead_x = ahead_y = 0.0
     for i in range(len(poses)):
@@ -304,7 +310,7 @@ def _squared(
             range_error, bearing_error, distance, vx, vy, _, weight = _whitened(
                 sx, sy, height, turn, model, depth, ahead_x, ahead_y, ranges[k], bearings[k]
             )
-            squared[i, k] = range_error**2 + bearing_error**2
+            squared, width, shrunk = range_error**2 + bearing_error**2, 0.0, 1.0
             if len(covariances):
                 # (ax, ay), (bx, by): gradients of the whitened range and bearing by the point's world position. The range
                 # grows along (vx, vy), the bearing perpendicular to the line of sight.
@@ -319,5 +325,9 @@ def _squared(
                 # the exact determinant is at least half the trace, but rounding may cancel the difference completely
                 determinant = max(rr * bb - rb * rb, 0.5 * (rr + bb))
                 mixed = bb * range_error**2 - 2.0 * rb * range_error * bearing_error + rr * bearing_error**2
-                squared[i, k] = mixed / determinant
-                widths[i, k] = 0.5 * math.log(determinant)
+                squared, width, shrunk = mixed / determinant, 0.5 * math.log(determinant), 1.0 / math.sqrt(rr)
+            if share > 0.0 and math.isnan(bearings[k]):
+                tail = robust, share, mean, spread
+                losses[i, k] = width + mixture(shrunk * range_error, shrunk * weight, *tail)[0]
+            else:
+                losses[i, k] = width + geman_mcclure_loss(squared, robust)

@@ -11,7 +11,8 @@ from factorgraph_loc.model.setup import MapUse
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import BearingRange, BearingRangeSettings, points_of
 from factors.landmarks.factor import BearingRangeFactor
-from factors.landmarks.model import HEIGHT
+from factors.landmarks.late import NONE, LateRanges
+from factors.landmarks.model import HEIGHT, with_late
 from factors.motion import Increment
 from factors.se2 import Array
 
@@ -65,7 +66,11 @@ class KnownLandmarks:
         return self.factors(m)[0]
 
     def factors(
-        self, m: BearingRange, offset: Increment | None = None, twist: Array | None = None
+        self,
+        m: BearingRange,
+        offset: Increment | None = None,
+        twist: Array | None = None,
+        late: LateRanges = NONE,
     ) -> tuple[BearingRangeFactor | None, list[NamedFactor], list[NamedFactor], list[NamedFactor]]:
         """Return the factors of a measurement, in four groups.
 
@@ -78,11 +83,12 @@ class KnownLandmarks:
         ``twist`` (3,): the robot's velocity at the measurement. It is required if the sensor's time offset is estimated.
         """
         fixed, single, surveyed, unknown = self._usable(m)
+        model = with_late(self._model, late)
         count = len(fixed) + len(single) + len(surveyed) + len(unknown)
 
         def of_rows(rows: list[int], points: Array) -> BearingRangeFactor:
             return BearingRangeFactor(
-                self._model,
+                model,
                 points,
                 m.range[rows],
                 m.bearing[rows],

@@ -133,6 +133,8 @@ class BearingRangeSettings(SensorSettings):
     """standard deviation of a bearing"""
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
     """scale of the Geman-McClure loss, in standard deviations"""
+    late: Annotated[float, Field(ge=0.0, le=0.99)] = 0.1
+    """prior probability that some ranges without a bearing are late, which means too long; their share and excess are learnt"""
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
     """standard deviations of constants; a constant is estimated if its value is above 0"""
 
@@ -159,6 +161,12 @@ class SightingSettings(FileModel):
     """largest distance at which a landmark is visible"""
     field_of_view: Annotated[float, Field(ge=0.01, le=6.3), InUnit("rad")] = 6.3
     """full angle of the field of view, centred on the sensor's axis"""
+    bearings: bool = True
+    """whether bearings are measured; a radio measures ranges alone"""
+    late: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """share of late ranges, which are too long"""
+    late_by: Metres = 0.5
+    """excess of a late range"""
 
 
 class Landmark(FileModel):

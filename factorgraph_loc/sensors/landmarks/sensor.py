@@ -23,6 +23,7 @@ from factors import positive, se2
 from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.kernels import innovations
+from factors.landmarks.late import LateShares
 from factors.landmarks.model import PARAMETERS, TIME_OFFSET, on_floor
 from factors.se2 import Array
 from factors.update import GATE, Correction
@@ -86,7 +87,22 @@ class LandmarkObservation(ResidualObservation):
             update = landmark_update(factor, pose, covariance, held, first, iterations, self.settled)
             if update is not None:
                 return update
-        return super().correct(pose, covariance, values, columns, iterations)
+        if not self.measured.model.late.share:
+            return super().correct(pose, covariance, values, columns, iterations)
+        terms = []
+        for term in self.terms:
+            rows = [slice(0, 3), *(columns[name] for name in term.blocks)]
+            indices = np.concatenate([np.arange(part.start, part.stop) for part in rows])
+            at = [pose, *(values[name] for name in term.blocks)]
+            resolved = cast(BearingRangeFactor, term.factor).resolved(at, covariance[np.ix_(indices, indices)])
+            terms.append(replace(term, factor=cast(Factor, resolved)))
+        observation = ResidualObservation(self.t, tuple(terms))
+        correction = observation.correct(pose, covariance, values, columns, iterations)
+        at_prediction = [
+            cast(BearingRangeFactor, term.factor).whitened([pose, *(values[name] for name in term.blocks)])[0]
+            for term in self.terms
+        ]
+        return replace(correction, residual=np.concatenate(at_prediction))
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
         total = np.zeros(len(poses))
@@ -205,13 +221,15 @@ class LandmarkSensor(Sensor):
         self._shared = (self.name,) if constants.names else ()
         self._new: NewLandmarks = NewLandmarks()
         self._before: deque[tuple[float, NewLandmarks]] = deque()
+        self._late: LateShares = LateShares(settings.late)
+        self._late_before: deque[tuple[float, LateShares]] = deque()
         self._finder: LandmarkFinder | None = None
         if use == "known" and world.landmarks:
             self.finder = self._finder = LandmarkFinder(self._sought.factor, motion, world.positions())
 
     def observe(self, m: BearingRange, view: View) -> Iterator[LandmarkObservation | NewVariable]:
         twist = self._motion.twist(m.t) if TIME_OFFSET in self.constants.indices else None
-        known, single, inexact, unknown = self._landmarks.factors(m, view.offset, twist)
+        known, single, inexact, unknown = self._landmarks.factors(m, view.offset, twist, self._late.expected)
         terms = [] if known is None else [Term(known, self._shared, 2 * len(known.points))]
         for name, factor in single:
             yield from self._new_bias(name, view)
@@ -310,7 +328,19 @@ class LandmarkSensor(Sensor):
         ranges, bearings = innovations(factor.model.packed, correction.residual, factor.ranges, factor.bearings)
         self._diagnostics.add_residuals(f"{self.name}.range", ranges.tolist())
         self._diagnostics.add_residuals(f"{self.name}.bearing", bearings.tolist())
+        self._learn(observation, view)
         return True
+
+    def _learn(self, observation: LandmarkObservation, view: View) -> None:
+        """Learn the share and the excess of late ranges."""
+        if not self._late.probability or np.isfinite(observation.measured.bearings).all():
+            return
+        self._late_before.append((observation.t, self._late))
+        while self._late_before[0][0] < observation.t - GOING_BACK:
+            self._late_before.popleft()
+        values = {name: value for name in observation.blocks if (value := view.value(name)) is not None}
+        alone = observation.on_pose(values, {name: view.block_covariance(name) for name in values})
+        self._late = self._late.after(*alone.measured.predicted(view.pose, view.covariance))
 
     @property
     def suspicious_since(self) -> float | None:
@@ -325,13 +355,17 @@ class LandmarkSensor(Sensor):
         return None if factor is None else LandmarkObservation(m.t, (Term(factor, (), 2 * len(factor.points)),))
 
     def at_end(self, factor: Factor, width: float) -> Factor:
-        return cast(BearingRangeFactor, factor).widened(width)
+        return cast(BearingRangeFactor, factor).with_late(self._late.expected).widened(width)
 
     def rewind(self, t: float) -> None:
         while self._before and self._before[-1][0] > t:
             _, self._new = self._before.pop()
+        while self._late_before and self._late_before[-1][0] > t:
+            _, self._late = self._late_before.pop()
 
     def restart(self, t: float) -> None:
+        self._late = LateShares(self._late.probability)
+        self._late_before.clear()
         self._new = NewLandmarks()
         self._before.clear()
 

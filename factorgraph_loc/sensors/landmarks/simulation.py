@@ -67,8 +67,12 @@ def sighting_stream(
     sigma = bearing_range.sigmas(model, ranges)
     noise = sigma * rng.standard_normal((len(n), 2))
     # noise must not make a range negative
-    ranges = np.maximum(ranges + noise[:, 0], 1e-3)
-    return BearingRangeStream(times[n], [names[i] for i in k.tolist()], ranges, se2.wrap(bearings + noise[:, 1]))
+    ranges, bearings = np.maximum(ranges + noise[:, 0], 1e-3), se2.wrap(bearings + noise[:, 1])
+    if settings.late:
+        ranges += settings.late_by * (rng.random(len(n)) < settings.late)
+    if not settings.bearings:
+        bearings = np.full(len(n), np.nan)
+    return BearingRangeStream(times[n], [names[i] for i in k.tolist()], ranges, bearings)
 
 
 def in_sight(

@@ -1,0 +1,208 @@
+"""Late ranges: a radio wave that arrives by a reflection has travelled further than the line of sight.
+
+A range without a bearing is either direct or late. The noise of a direct range is Gaussian. A late range has an additional excess,
+which is Gaussian with a positive mean. Both parts have the robust loss of Geman and McClure, so that gross errors have little
+influence. The likelihood is the sum of both parts, weighted by the share of late ranges.
+
+:class:`LateShares` learns the share and the excess of a sensor from innovations. Other hypotheses compete for the same
+innovations: a larger or smaller noise, a bias of all ranges, and gross errors. All hypotheses have prior probabilities.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import register_jitable
+
+from factors.compiled import compiled
+from factors.robust import geman_mcclure_loss, geman_mcclure_weight
+from factors.se2 import Array
+
+# Each combination of these values is a hypothesis. Another one, for each noise, is that no range is late.
+NOISES = (0.6, 1.0, 1.6)  # factors of the standard deviation of ranges
+SHARES = (0.02, 0.05, 0.12, 0.25, 0.45, 1.0)  # of late ranges; 1 is a bias of all ranges
+MEANS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # m, of the excess; the prior probability is proportional to the inverse
+SPREADS = (0.2, 0.7)  # standard deviation of the excess divided by its mean
+BIASED = 0.05  # prior probability of a bias, if no range is late
+OUTLIERS, FAR = 0.02, 10.0  # share of gross errors, and their standard deviation in units of that of an innovation
+LARGEST = 1e4  # squares of normalised innovations are limited to this value
+LEAST = 0.002  # a smaller share of late ranges is replaced by 0
+EXACT = 1e-9  # a smaller variance of a predicted range, in units of the noise, is replaced by 0
+LEAST_GAIN = 1e-6  # minimum relative reduction of a variance by a range
+LEAST_INFORMATION = (
+    0.2  # minimum information of a range, in units of that of a range that is known to be direct or late
+)
+
+
+class LateRanges(NamedTuple):
+    """The late ranges of a sensor. ``share``: the probability that a range is late. ``mean``, ``spread``: the mean and the standard
+    deviation of the excess of a late range [m]."""
+
+    share: float = 0.0
+    mean: float = 0.0
+    spread: float = 0.0
+
+
+NONE = LateRanges()
+
+
+@register_jitable
+def mixture(
+    error: float, slope: float, robust: float, share: float, mean: float, spread: float
+) -> tuple[float, float, float]:
+    """Returns the negative log-likelihood of a range, its derivative by ``error``, and the information about ``error``.
+
+    ``error``: the predicted minus the measured range in standard deviations.
+    ``slope``: the inverse of the standard deviation [1/m].
+    ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``spread``: those of :class:`LateRanges`.
+
+    The information is that of a range known to be direct or late, averaged over both, minus the variance of the derivative (Louis,
+    Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
+    """
+    widening = 1.0 + (slope * spread) ** 2
+    beyond = error + slope * mean
+    squared, squared_late = error * error, beyond * beyond / widening
+    loss = geman_mcclure_loss(squared, robust)
+    log_odds = math.log(share / (1.0 - share)) - 0.5 * math.log(widening)
+    log_odds += loss - geman_mcclure_loss(squared_late, robust)
+    late = 1.0 / (1.0 + math.exp(-log_odds))  # the probability that the range is late
+    both = log_odds + math.log1p(math.exp(-log_odds)) if log_odds > 0.0 else math.log1p(math.exp(log_odds))
+    weight, weight_late = geman_mcclure_weight(squared, robust), geman_mcclure_weight(squared_late, robust) / widening
+    slope_direct, slope_late = weight * error, weight_late * beyond
+    derivative = (1.0 - late) * slope_direct + late * slope_late
+    known = (1.0 - late) * weight + late * weight_late
+    information = known - late * (1.0 - late) * (slope_direct - slope_late) ** 2
+    return loss - both - math.log(1.0 - share), derivative, max(information, LEAST_INFORMATION * known)
+
+
+@register_jitable
+def moments(
+    error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, spread: float
+) -> tuple[float, float, float]:
+    """Returns the error and the weight of a Gaussian measurement that has the effect of a range on a prediction, and the normalised
+    innovation squared, averaged over both parts.
+
+    The prediction is corrected by a direct and by a late range. The mixture of both results is replaced by a Gaussian with the same
+    mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian inference", 2001, 3.1).
+    A variance above that of the prediction is reduced to it.
+
+    ``variance``: that of the predicted range in units of the noise. ``gate``: the noise is increased if a normalised innovation
+    squared exceeds this limit, as in :func:`factors.update.update_state`. The other arguments are those of :func:`mixture`.
+    """
+    widening = 1.0 + (slope * spread) ** 2
+    beyond = error + slope * mean
+    squared, squared_late = error * error / (variance + 1.0), beyond * beyond / (variance + widening)
+    log_odds = math.log(share / (1.0 - share)) - 0.5 * math.log((variance + widening) / (variance + 1.0))
+    log_odds += geman_mcclure_loss(squared, robust) - geman_mcclure_loss(squared_late, robust)
+    late = 1.0 / (1.0 + math.exp(-log_odds))
+    weight, weight_late = max(1.0, squared / gate) ** -2, max(1.0, squared_late / gate) ** -2 / widening
+    # the posterior of the predicted range, as a change of the prediction
+    gain, gain_late = 1.0 / (1.0 + variance * weight), 1.0 / (1.0 + variance * weight_late)
+    change, change_late = -variance * gain * weight * error, -variance * gain_late * weight_late * beyond
+    changed = (1.0 - late) * change + late * change_late
+    left = variance * ((1.0 - late) * gain + late * gain_late) + late * (1.0 - late) * (change - change_late) ** 2
+    left = min(left, (1.0 - LEAST_GAIN) * variance)
+    information = 1.0 / left - 1.0 / variance
+    return -changed / (left * information), information, (1.0 - late) * squared + late * squared_late
+
+
+def _grid() -> tuple[Array, Array, Array]:
+    """The shares, the means and the standard deviations of the hypotheses with an excess, as arrays (H,)."""
+    shares, means, spreads = (part.ravel() for part in np.meshgrid(SHARES, MEANS, SPREADS, indexing="ij"))
+    return shares, means, spreads * means
+
+
+_SHARES, _MEANS, _SPREADS = _grid()
+_IS_LATE = _SHARES < 1.0
+_PARTS = len(MEANS) * len(SPREADS)  # successive hypotheses with one share
+
+
+@lru_cache(maxsize=16)
+def _prior(probability: float) -> Array:
+    """The logarithms of the prior probabilities of all hypotheses (noises, 1 + H). The first column is that no range is late."""
+    biased = BIASED * (1.0 - probability)
+    excess = np.where(_IS_LATE, probability, biased) / _MEANS
+    for group in (_IS_LATE, ~_IS_LATE):
+        excess[group] /= np.sum(1.0 / _MEANS[group])
+    row = np.concatenate(((1.0 - probability - biased,), excess)) / len(NOISES)
+    return np.log(np.tile(row, (len(NOISES), 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class LateShares:
+    """What is known about the late ranges of a sensor. Immutable.
+
+    ``probability``: the prior probability that the sensor has late ranges.
+    ``log_weights`` (noises, 1 + H): the logarithms of the posterior probabilities of all hypotheses. None means the prior.
+    ``expected``: the late ranges, averaged over all hypotheses.
+    """
+
+    probability: float
+    log_weights: Array | None = None
+    expected: LateRanges = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "expected", self._expected())
+
+    def _expected(self) -> LateRanges:
+        """The share of late ranges, and the moments of their excess, averaged over all hypotheses."""
+        if self.probability == 0.0:
+            return NONE
+        logs = _prior(self.probability) if self.log_weights is None else self.log_weights
+        weights = np.exp(logs[:, 1:]).sum(axis=0)[_IS_LATE] * _SHARES[_IS_LATE]
+        share = float(weights.sum())
+        if share < LEAST:
+            return NONE
+        means, spreads = _MEANS[_IS_LATE], _SPREADS[_IS_LATE]
+        mean = float(weights @ means) / share
+        variance = float(weights @ (spreads**2 + means**2)) / share - mean**2
+        return LateRanges(_rounded(share), _rounded(mean), _rounded(math.sqrt(variance)))
+
+    def after(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
+        """The posterior after K ranges.
+
+        ``errors`` (K,): the predicted minus the measured ranges in standard deviations. ``slopes`` (K,): the inverse standard
+        deviations [1/m], 0 for measurements that cannot be late. ``variances`` (K,): those of the predicted ranges, in units of the
+        noise.
+        """
+        if self.probability == 0.0 or not slopes.any():
+            return self
+        logs = _prior(self.probability) if self.log_weights is None else self.log_weights
+        return LateShares(self.probability, _learnt(logs, _SHARES, _MEANS, _SPREADS, errors, slopes, variances))
+
+
+def _rounded(value: float) -> float:
+    """The value with two significant digits. Factors with equal models are linearised together."""
+    return float(f"{value:.2g}")
+
+
+@compiled(error_model="numpy")
+def _learnt(
+    logs: Array, shares: Array, means: Array, spreads: Array, errors: Array, slopes: Array, variances: Array
+) -> Array:
+    """The normalised logarithms of the probabilities of all hypotheses after K ranges. ``logs`` (noises, 1 + H): those before.
+    ``shares``, ``means``, ``spreads`` (H,): the hypotheses with an excess. The other arguments are those of
+    :meth:`LateShares.after`."""
+    out, late = logs.copy(), np.empty(_PARTS)
+    for k in range(len(errors)):
+        if slopes[k] == 0.0:
+            continue
+        for n in range(len(out)):
+            noise = NOISES[n] * NOISES[n] + variances[k]
+            squared = min(errors[k] * errors[k] / noise, LARGEST)
+            direct = math.exp(-0.5 * squared) / math.sqrt(noise)
+            floor = OUTLIERS / FAR * math.exp(-0.5 * squared / FAR**2) / math.sqrt(noise)
+            for j in range(_PARTS):
+                width = noise + (slopes[k] * spreads[j]) ** 2
+                beyond = errors[k] + slopes[k] * means[j]
+                late[j] = math.exp(-0.5 * beyond * beyond / width) / math.sqrt(width)
+            out[n, 0] += math.log((1.0 - OUTLIERS) * direct + floor)
+            for j in range(len(shares)):
+                both = (1.0 - shares[j]) * direct + shares[j] * late[j % _PARTS]
+                out[n, 1 + j] += math.log((1.0 - OUTLIERS) * both + floor)
+    largest = out.max()
+    return np.asarray(out - (largest + math.log(np.exp(out - largest).sum())))
