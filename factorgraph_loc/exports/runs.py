@@ -37,7 +37,10 @@ class _Learnt(FileModel, extra="ignore"):
 
 
 class RunFolder(FileModel, extra="ignore"):
-    """The folder of a run, and those keys of its effective configuration, ``config.toml``, that are needed here."""
+    """The folder ``path`` of a run, and some keys of its file ``config.toml``: log, estimator, sensors and seed of the run.
+
+    Other keys of the file are ignored.
+    """
 
     path: Path
     log: Annotated[str, Field(min_length=1)]

@@ -54,7 +54,8 @@ class TagFile(FileModel):
 
 
 class BundledTag(FileModel):
-    """A tag of the file: its number, its side [m], and its pose in the bundle."""
+    """A tag of the file. ``id``: its number. ``size``: side of its black square [m]. ``x``, ``y``, ``z`` [m] and the quaternion
+    ``qw``, ``qx``, ``qy``, ``qz``: its pose in the frame of the bundle."""
 
     id: Annotated[int, Field(ge=0, le=1_000_000)]
     size: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("m")]
@@ -69,7 +70,7 @@ class BundledTag(FileModel):
 
 
 class TagBundle(FileModel):
-    """A bundle of tags."""
+    """A bundle of tags: several tags (``layout``) with known poses in a common frame."""
 
     name: str = ""
     layout: tuple[BundledTag, ...]
@@ -121,7 +122,8 @@ def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict
 
 
 def _marker(path: Path, tag: BundledTag, rotation: Array, position: Array) -> dict[str, float]:
-    """Return the keys of the marker of a ``tag`` in a bundle with ``rotation`` (3, 3) and ``position`` (3,) in the world."""
+    """Return the marker of a ``tag``, as keys and values of a world file. ``rotation`` (3, 3), ``position`` (3,): the pose of its
+    bundle in the world. ``path``: the file to name in errors."""
     quaternion = np.array((tag.qx, tag.qy, tag.qz, tag.qw))
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT:
         raise bad_field(path, f"tag {tag.id}: qx, qy, qz, qw", quaternion.tolist(), "a unit quaternion")

@@ -99,7 +99,8 @@ class Observation(Protocol):
 class NewVariable:
     """A new block of the state: the position of a landmark that is seen for the first time, or a variable with a prior.
 
-    ``mean`` (d,): initial estimate. ``by_pose`` (d, 3) and ``by_block`` (d, P): its Jacobians by the pose and by other blocks.
+    ``name``: the name of the block. ``mean`` (d,): initial estimate. ``by_pose`` (d, 3) and ``by_block`` (d, P): Jacobians of the
+    mean by the pose and by other blocks.
     ``noise`` (d, d): the covariance that results from measurement noise alone. ``sightings``: the observations that the
     estimate consists of, each with the time [s] of its pose. Without sightings, ``mean`` and ``noise`` are a prior.
     """

@@ -42,7 +42,8 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
 
     ``use_gyro``: bias and noise of the heading are those of the gyro.
     ``constants_as_noise``: for an estimator that does not estimate the uncertain constants. Their errors are added to the noise
-    as a random walk. It reaches the variance of a constant's effect after :data:`WAY`, :data:`TURN` or :data:`TIME`.
+    as a random walk. Its variance equals that of the error after the distance :data:`WAY`, the rotation :data:`TURN` or the time
+    :data:`TIME`.
     """
     s = rig.of(OdometrySettings)
     along, heading = s.noise.along.model(), s.noise.heading.model()

@@ -116,7 +116,8 @@ class _File:
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag. ``type``: its message type in ROS 2 notation (``nav_msgs/msg/Odometry``). ``count``: its messages."""
+    """A topic of a bag. ``type``: its message type in ROS 2 notation (``nav_msgs/msg/Odometry``). ``count``: the number of its
+    messages."""
 
     name: str
     type: str

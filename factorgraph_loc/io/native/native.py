@@ -46,7 +46,7 @@ class RunFile(RowRules):
     """The content of ``run.toml``.
 
     ``rig``, ``world``: a table, or a file name relative to the folder. ``has_heading``: False if the headings of the reference are
-    meaningless.
+    meaningless. ``start``: a known start. ``metadata``: further values of any kind, which are stored with the log.
     """
 
     PLACE: ClassVar[str] = RUN_FILE

@@ -237,7 +237,7 @@ def _read(source: _Source, rig: Rig | None, world: World | None, options: Mappin
         if log.rig.name == DEFAULT_RIG.name:
             log = replace(log, rig=log.rig.model_copy(update={"sensors": (*log.rig.sensors, "imu")}))
         else:
-            warnings.append(notice("unused_gyro", "the gyro is not used, because the rig's sensors do not include imu"))
+            warnings.append(notice("unused_gyro", "the log has a gyro that is not used: add imu to sensors in the rig"))
     if log.rig.name == DEFAULT_RIG.name:
         sentence = "no rig is given: the default rig lacks this robot's noise and the mounting of its sensors"
         warnings.append(notice("default_rig", sentence))

@@ -36,7 +36,7 @@ class StartSettings(FileModel):
 
 
 class Manifest(FileModel):
-    """A manifest, the description of one or several logs.
+    """A manifest, the description of one or several logs. ``title``, ``licence``, ``origin``: texts about the data, for the user.
 
     ``reader``: name of the reader of the log. ``options``: its options; a list of values gives several logs.
     ``path``, ``rig``, ``world``: the data, the rig and the map, below the folder of the manifest or the data folder.
@@ -60,7 +60,7 @@ class Manifest(FileModel):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A shipped data set. ``present``: True if its files exist."""
+    """A shipped data set. ``present``: True if its files exist. The other fields are those of its manifest."""
 
     name: str
     title: str

@@ -56,7 +56,7 @@ class AntennaSummary:
 
 @dataclass(frozen=True)
 class RfidSummary:
-    """A summary of all reads of a log.
+    """A summary of all reads of a log. ``reads``, ``scans``, ``rounds``: their numbers. ``antennas``: a summary of each by name.
 
     ``known``: number of tags of the map that are read. ``unread``: tags of the map that are never read. ``unknown``: number of
     reads of each EPC that the map lacks. ``late``: number of rounds with an earlier timestamp than a previous one, and the

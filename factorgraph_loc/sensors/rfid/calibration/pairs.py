@@ -117,7 +117,8 @@ def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: 
 
 @dataclass(frozen=True)
 class Floor:
-    """Probabilities that do not depend on the position: of a false read, and of a miss."""
+    """Lower bounds of two probabilities at any position of a tag: ``false_read`` of the probability of a read, and ``miss`` of the
+    probability of a miss."""
 
     false_read: float = 0.02
     miss: float = 0.02

@@ -79,8 +79,8 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
 
 @dataclass(frozen=True)
 class _Focus:
-    """The agreement of phases along references as a function of a state (5,): x, y, heading of the survey, x and y of the lever
-    arm."""
+    """The agreement of phases along references as a function of a state (5,): x, y, heading of the survey transform, and x, y of
+    the lever arm. ``reads``: the reads with a phase. ``model``: the model of phases. ``initial``: the survey transform at first."""
 
     reads: PhaseReads
     model: PhaseModel
