@@ -48,7 +48,7 @@ def require(
 ) -> None:
     """Raise the error of :func:`bad_field` at the first invalid value, if any.
 
-    ``valid`` (N,): a mask of the valid ones of ``values`` (N, ...). ``rows`` (N,): line numbers of the values in ``file``.
+    ``valid`` (N,): a mask of the ``values`` (N, ...) that are valid. ``rows`` (N,): line numbers of the values in ``file``.
     """
     if not valid.all():
         i = int(valid.argmin())

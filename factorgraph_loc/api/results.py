@@ -70,9 +70,10 @@ def _listed(results: LogLike | Sequence[LogLike]) -> list[LogLike]:
 
 
 def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, list[StoredRun]]:
-    """Return the log and the runs in ``results``. Without a log in ``results``, it is the known data set with the name in the runs.
+    """Return the log and the runs in ``results``. If ``results`` has no log, the known data set is read whose name the runs
+    contain.
 
-    ``read``: reads a log. Raises InputError if there are several logs, or if no known data set has the name of the log of the runs.
+    ``read``: reads a log. Raises InputError if there are several logs, or if no known data set has the name that the runs contain.
     """
     places = [Path(name) for name in results if not isinstance(name, Log) and is_results(Path(name))]
     logs = [name for name in results if isinstance(name, Log) or Path(name) not in places]

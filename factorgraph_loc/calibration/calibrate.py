@@ -108,9 +108,9 @@ def check(logs: Sequence[Log], *, blind: bool = False) -> None:
         if not any(_has(log, name) for name in moving(log.streams)):
             raise InputError(f"{log.name}: has no odometry, expected odometry in every log to calibrate from")
         if not any(_has(log, sensor) for sensor in senses(log.rig)) and not has_heading(log):
-            lacking = " and ".join(f"no {sensor}" for sensor in senses(log.rig))
+            lacking = " or ".join(senses(log.rig)) or "a sensor other than odometry"
             raise InputError(
-                f"{log.name}: has {lacking}, expected one of these, or headings in the reference to calibrate only the wheels"
+                f"{log.name}: has no measurements of {lacking}, expected some, or headings in the reference to calibrate the wheels"
             )
         _check_alike(logs[0], log)
     names = [log.name for log in logs]

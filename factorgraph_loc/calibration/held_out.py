@@ -132,8 +132,8 @@ def growth(trials: Sequence[Trial]) -> float:
 def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
     """Return the ratio of a loss with the learnt rig to that with the input rig.
 
-    ``loss``: a function of trials, the rig and "causal" or "final". The ratio is the geometric mean over the estimators and over
-    causal and final trajectories, or NaN if no trial has scores of both rigs.
+    ``loss``: a function (trials, rig, kind) that returns a number, where kind is "causal" or "final". The ratio is the geometric
+    mean over the estimators and over causal and final trajectories, or NaN if no trial has scores of both rigs.
     """
     ratios = [
         loss(mine, "learnt", kind) / max(loss(mine, "input", kind), 1e-9)
@@ -145,7 +145,7 @@ def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], 
 
 
 def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    """Return the ratio (at least 1) between the ANEES and its ideal value, the number of dimensions, or its reciprocal."""
+    """Return the factor (at least 1) by which the ANEES is above or below its ideal value, the number of dimensions."""
     dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
     factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
     return max(factor, 1.0 / factor)

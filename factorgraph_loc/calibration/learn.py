@@ -94,7 +94,8 @@ def learn(
 
 
 def sensing(rig: Rig, log: Log) -> Rig:
-    """Return ``rig`` with a new list of used sensors: of the exteroceptive sensors those that the log has, and all others."""
+    """Return ``rig`` with another list ``sensors``: exteroceptive sensors are listed if the log has their measurements. Other
+    sensors stay in the list."""
     sensed = senses(rig)
     kept = [name for name in rig.sensors if name not in sensed or name in log.streams]
     added = [name for name in sensed if name in log.streams and name not in kept]
@@ -131,8 +132,8 @@ def learn_by_turns(
         knowledge = learn(smoothed, rig, start, grids)
         if not knowledge.constants and not knowledge.notes:
             raise InputError(
-                f"{logs[0].name}: nothing of the rig {start.name} can be learnt without a reference: for the sensors of the log it "
-                "has no detection model, and no constant with an uncertainty"
+                f"{logs[0].name}: nothing can be learnt without a reference, because the rig {start.name} has neither a detection "
+                "model nor a constant with an uncertainty for the sensors of the log"
             )
         rig = knowledge.rig
         turns.append(max((_change(constant, fitted) for constant in knowledge.constants), default=0.0))

@@ -67,7 +67,7 @@ def summary(calibration: Calibration) -> list[str]:
     if more := [_name(c) for c in clear[MOST:]]:
         lines.append(f"learnt, see the report: {listed(more)}")
     if same:
-        lines.append(f"as in the input rig, within chance: {listed(same)}")
+        lines.append(f"no significant change from the input rig: {listed(same)}")
     if vague := [_name(c) for c in constants if not c.is_determined]:
         lines.append(f"not determined by the logs, near the input rig: {listed(vague)}")
     if alike := [f"{a} and {b} ({rho:+.2f})" for a, b, rho in _correlations(calibration)]:

@@ -104,7 +104,7 @@ def run(
     show.line()
     show.line(f"results are in {out}")
     if (out / MAP).exists():
-        show.line(f"a map of the {len(result.learnt.points or ())} points that were found is in {out / MAP}")
+        show.line(f"a map with the {len(result.learnt.points or ())} points that the run estimated is in {out / MAP}")
 
 
 @takes_options
@@ -174,7 +174,7 @@ def _print_rig(learnt: Sequence[FittedConstant]) -> None:
     if learnt:
         from factorgraph_loc.calibration.report import constants_table
 
-        show.line("learnt from the log; only the final trajectory uses these:")
+        show.line("values learnt from the log, which only the final trajectory uses:")
         show.table(*constants_table(learnt))
 
 
@@ -245,7 +245,7 @@ def _print_effort(scores: Mapping[str, Any]) -> None:
     if images := scores["timing.images"]:
         seconds = scores["timing.frontend_seconds"]
         show.line(
-            f"images: features of {images} in {seconds:.1f} s, {images / seconds:.0f} per second, including the cache"
+            f"images: features of {images} computed or loaded from the cache in {seconds:.1f} s, {images / seconds:.0f} per second"
         )
     final = f"{number(scores['timing.final_seconds'], 1)} s for the final trajectory"
     if scores["time_to_localized"] is None:  # a batch estimator has no causal updates

@@ -18,7 +18,7 @@ from factorgraph_loc.cli import show
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import error_text
 
-RETRY_INTERVAL = 0.05  # s until a signal is sent again whose exception was lost
+RETRY_INTERVAL = 0.05  # s; a signal whose exception Python has dropped is sent again after this time
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
 PIPE_CLOSED = 141  # exit code: 128 plus the number of SIGPIPE, as in shells
 

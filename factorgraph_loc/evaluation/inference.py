@@ -69,7 +69,7 @@ class Contrast:
     ``units``: "logs", or "seeds" of a single log. ``count``: number of units. Interval and test are over the units; they are None
     if there are too few.
     ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs that
-    have no partner.
+    cannot be paired with a run of the other method on the same log and seed.
     """
 
     difference: float
@@ -146,10 +146,11 @@ def contrast(
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the table of differences between the RMSEs of all pairs of estimators ``a`` and ``b``, with :data:`DIFFERENCES`.
 
-    ``rows``: runs with log, estimator, seed and scores. A row of the table has the RMSEs on one log, pooled over pairs of seeds,
-    and their difference, which is negative if ``a`` is better. With enough logs for an interval there is a row with log "(all)".
-    ``pairs``: number of compared pairs of runs. ``left_out``: number of runs without a partner that has a score. Values are None
-    if there are no pairs.
+    ``rows``: runs with log, estimator, seed and scores. A row of the table has the RMSEs on one log, pooled over pairs of
+    seeds, and their difference, which is negative if ``a`` is better. With enough logs for an interval there is a row with log
+    "(all)".
+    ``pairs``: number of compared pairs of runs. ``left_out``: number of runs that cannot be paired, because the other estimator
+    has no score for the same seed. Values are None if there are no pairs.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -182,7 +183,7 @@ def signed_rank(differences: Array) -> float:
     ranks = _ranks(differences)
     doubled = np.rint(2.0 * ranks[differences != 0.0]).astype(
         int
-    )  # whole numbers: ranks of ties are multiples of a half
+    )  # the ranks of ties are multiples of 0.5, so their doubles are whole numbers
     if not len(doubled):
         return 1.0
     total = int(doubled.sum())
@@ -263,7 +264,8 @@ def _ranks(differences: Array) -> Array:
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """Return the scores (K, C) of each log that has any, in one array for the variants of a log (``alike``)."""
+    """Return one array (K, C) of scores for each log. Logs with the same name in ``alike`` have one array together, and logs
+    without scores have none."""
     merged: dict[str, list[Array]] = {}
     for log, values in scores.items():
         if len(values):

@@ -159,10 +159,11 @@ def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: floa
       :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`. ``rpe_pieces``: number of these pieces.
     - ``rpe_position_per_s``, ``rpe_heading_per_s``: the same over pieces of one second.
     - ``anees``: mean NEES, ideally 3, or 2 if the reference has no heading.
-    - ``nees_bounds``: 95 % interval of the mean of as many independent NEES. Errors along a trajectory are correlated, so the
-      ANEES of a consistent estimator is outside of the interval more often.
+    - ``nees_bounds``: 95 % interval of the ANEES of a consistent estimator with independent errors. Errors along a trajectory
+      are correlated, so a consistent estimator is outside of the interval in more than 5 % of runs.
     - ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 % ellipse.
-    - ``invalid_covariances``: number of scored poses whose covariance is not positive definite. The previous three exclude them.
+    - ``invalid_covariances``: number of scored poses whose covariance is not positive definite. The three scores above exclude
+      them.
     - ``scored``: number of compared poses.
     """
     figures: dict[str, Any] = dict.fromkeys(ACCURACY)

@@ -48,8 +48,8 @@ class Pairs:
 
 
 def thinned(t: Array) -> Integers:
-    """Return the indices of the scored ones of ascending timestamps (N,) [s]: the first, and each at least 0.1 s after the
-    previous scored one."""
+    """Return the indices of those timestamps (N,) [s] at which poses are scored. They are the first timestamp, and then each
+    first timestamp that is at least 0.1 s after the previously selected one. ``t`` is ascending."""
     kept: list[int] = []
     stamps, i = t.tolist(), 0
     while i < len(stamps):

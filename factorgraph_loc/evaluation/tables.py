@@ -38,10 +38,10 @@ def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ..
 def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the table of a comparison. ``shown``: keys of the scores in it, empty for :data:`TABLE`.
 
-    RMSEs are pooled over seeds by the root mean square, and other scores by the mean. With several seeds a cell has the standard
-    deviation after ±. The last rows pool each estimator over the logs with equal weights. The column "runs" has the number of
-    successful runs; a pooled row with failures is not comparable with others. The column "poses scored" has the number of scored
-    poses as a range over runs, and summed over logs. There is a column for the time to localization if it is not always 0.
+    RMSEs are pooled over seeds by the root mean square, and other scores by the mean. With several seeds a cell has the
+    standard deviation after ±. The last rows pool each estimator over the logs with equal weights. The column "runs" has the
+    number of successful runs; a pooled row with failures is not comparable with others. The column "poses scored" has the
+    numbers of scored poses (see :func:`counted`). There is a column for the time to localization if it is not always 0.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -142,7 +142,10 @@ def _figure(row: Row, key: str) -> float | None:
 
 
 def _cell(metric: Metric, values: Sequence[float | None]) -> str:
-    """Return a cell with a score pooled over seeds, and its standard deviation if there are several. None: a run without it."""
+    """Return a cell with a score pooled over seeds, and its standard deviation if several runs have it, such as "0.12 ±0.01".
+
+    ``values``: the score of each run, None for a run without it.
+    """
     known = [v for v in values if v is not None]
     if not known:
         return "-"
@@ -158,7 +161,11 @@ def _pooled(metric: Metric, by_log: Sequence[Sequence[Row]]) -> str:
 
 
 def counted(*by_log: Sequence[Row]) -> str:
-    """Return the number of scored poses as text: a range over the runs of a log, summed over logs. "" without a reference."""
+    """Return the number of scored poses on all logs as text, such as "840", or "800 to 840" if the runs of a log differ.
+
+    ``by_log``: the runs on each log. The first number is the sum over logs of the smallest number, the second of the largest.
+    "" if no log has a reference.
+    """
     counts = [[c for row in runs if (c := scored_of(row)) is not None] for runs in by_log]
     known = [of_log for of_log in counts if of_log]
     least, most = sum(map(min, known)), sum(map(max, known))

@@ -65,8 +65,8 @@ class ActiveJob:
         return digest_of(given + [model.model_dump(mode="json") for model in (self.simulation, self.settings)])
 
     def make(self) -> Files:
-        """Execute the run. Return the content of its files by name: the figures, and the plot. If the input is invalid, return the
-        files of a failed run."""
+        """Execute the run. Return the content of its files by name: the scores as JSON, and the plot as PNG. If the input is
+        invalid, return the file that describes the failure."""
         try:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)
         except InputError as error:
@@ -166,7 +166,7 @@ def _write(table: pl.DataFrame, jobs: Sequence[ActiveJob], out: Path) -> None:
 def _settings(
     world: str | Path | SimulationSettings, changes: Mapping[str, Any]
 ) -> tuple[SimulationSettings, ActiveSettings]:
-    """Return the settings of the simulated world and of the run, with ``changes``. A key of ``changes`` belongs to one of them."""
+    """Return the settings of the simulated world and of the run. Each key of ``changes`` replaces a setting of one of the two."""
     of_run, of_world = ActiveSettings.model_fields, SimulationSettings.model_fields
     for key in changes:
         if key not in of_run and key not in of_world:
@@ -182,7 +182,7 @@ def _settings(
 
 
 def figures_of(run: ActiveRun) -> dict[str, float | None]:
-    """Return the figures of a run that are stored and shown in tables."""
+    """Return the numerical results of a run by name, such as ``metres`` and ``planning_ms``, for the stored table of results."""
     times = run.planning_ms
     return {
         "localized": run.localized,

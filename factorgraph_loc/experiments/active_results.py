@@ -68,7 +68,8 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
     - ``failures``, ``failures_low``, ``failures_high``: number of runs that did not end localized, and the 95 % interval of their
       fraction.
     - ``claimed_wrong``: number of runs that at any time reported a wrong pose as localized.
-    - ``error_position`` [m], ``error_heading`` [rad], ``seconds``: median errors, and median simulated time, of the other runs.
+    - ``error_position`` [m], ``error_heading`` [rad], ``seconds``: median errors, and median simulated time, of the runs that
+      ended localized.
     - ``planning_ms``: median over runs of the median computing time of a planning step.
     """
     results = []

@@ -36,7 +36,11 @@ GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_thresho
 
 @dataclass
 class CausalEstimates:
-    """The estimates at the ticks of a run, as columns. ``t`` [s]: times of the ticks."""
+    """The estimates of a run, which are recorded at regular times (ticks). Each field is a list with one entry per tick.
+
+    ``t``: times [s]. ``poses``, ``covariances``: (3,) and (3, 3), of (x, y, heading) [m, rad]. ``doubts_model``: whether
+    measurements contradict the model of their sensor.
+    """
 
     t: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
@@ -57,10 +61,10 @@ class CausalEstimates:
 class CausalRun:
     """The main loop of one run of an estimator on a log.
 
-    ``guard``: converts errors of the estimator. ``sensors``: names of the used sensors. ``prior``: prior of the start, None if it
-    is unknown. ``ticks``: times of recorded estimates. ``frame``: frame of the map. ``progress``: called with the fraction done.
-    ``watch``: called with the time and the estimator after each tick. ``end`` [s]: later measurements are not processed.
-    ``estimates``: the recorded estimates.
+    ``guard``: converts exceptions of the estimator to RunFailedError. ``sensors``: names of the used sensors. ``prior``: prior of
+    the start, None if it is unknown. ``ticks``: times at which estimates are recorded. ``frame``: converts estimates from the frame
+    of the map to the world frame. ``progress``: called with the fraction done. ``watch``: called with the time and the estimator
+    after each tick. ``end`` [s]: later measurements are not processed. ``estimates``: the recorded estimates.
     """
 
     guard: Guard
@@ -122,13 +126,15 @@ class CausalRun:
         )
 
     def _measurements(self) -> Iterator[Measurement]:
-        """Return the measurements until ``end``. For estimators that accept it, successive rows of odometry are one object."""
+        """Return the measurements until ``end``. Successive rows of odometry are joined in one ``Rows`` object, if the estimator
+        has the attribute ``takes_rows``."""
         joined = getattr(self.estimator, "takes_rows", False)
         steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
         return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
-        """Initialize the estimator if it is time, and process the ticks before a measurement at ``t`` [s]."""
+        """Record the estimates at the ticks before a measurement at ``t`` [s]. Initialize the estimator first if ``t`` is later
+        than the start and it is not initialized."""
         if not self._initialized and t > self._start:
             self._initialize()
         for tick in self.ticks.advance(t):

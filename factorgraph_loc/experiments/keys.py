@@ -198,7 +198,7 @@ def _facts(log: Any) -> LogFacts:
 
 
 def _of_estimator(name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
-    """Compute facts about an estimator, which imports it."""
+    """Return facts about an estimator. This imports the estimator, which takes time."""
     from factorgraph_loc.fusion import registry  # noqa: PLC0415
 
     effective = registry.settings_of(name, settings).model_dump(mode="json")

@@ -67,8 +67,8 @@ class MapOptions:
     ``estimator``, ``settings``: the estimator of landmarks, and its settings.
     ``points``: settings of a map of points, fields of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`.
     ``extend``: whether to keep the log's map and to add what it lacks.
-    ``poses``: robot poses for a map of tags: reference, or odometry, with which the poses are estimated too. None: the reference if
-    the log has one, else odometry.
+    ``poses``: source of the robot poses for a map of tags: "reference", or "odometry" to estimate the poses together with the tags.
+    None: "reference" if the log has one, else "odometry".
     ``tag_height`` [m]: height of tags that the log's map lacks, None for the height of the antennas.
     ``drop_dead``: if set, nothing is mapped, and the log's map is written without the tags that are believed dead.
     ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.

@@ -55,11 +55,12 @@ def write_run(
     in ``out`` are not changed. Raises InputError if ``out`` contains results and ``overwrite`` is not set. The files are:
 
     - ``final.tum``, ``causal.tum``: trajectories. The latter starts when the robot is localized first.
-    - ``estimates.parquet``: a row for each tick and ``kind`` (causal, final), with the timestamp ``t_ns``, ``x``, ``y`` [m],
-      ``heading`` [rad] and covariances in the world frame. ``error_position`` [m], ``error_heading`` [rad, absolute] and ``nees``
-      are those at the timestamp of the reference nearest to the tick, null if another tick is nearer. ``update_ms`` is the slowest
-      update since the previous tick, null if there was none or for the kind final. ``status`` and ``doubts_model`` (whether
-      measurements contradict the model of their sensor) are those of the causal estimate.
+    - ``estimates.parquet``: a row for each tick (time of an estimate, every 0.1 s) and ``kind`` (causal, final), with the timestamp
+      ``t_ns``, ``x``, ``y`` [m], ``heading`` [rad] and covariances in the world frame. ``error_position`` [m],
+      ``error_heading`` [rad, absolute] and ``nees`` are those at the timestamp of the reference that is nearest to the tick. They
+      are null if this timestamp is nearer to another tick. ``update_ms`` is the slowest update since the previous tick, null if
+      there was none or for the kind final.
+      ``status`` and ``doubts_model`` (whether measurements contradict the model of their sensor) are those of the causal estimate.
     - ``learnt.json``: ``constants`` by name with ``value`` and ``sigma``; ``landmarks`` by name with ``x``, ``y`` [m] and
       ``covariance`` (xx, xy, yy) [m^2] in the world frame.
     - ``events.csv``: the timestamp ``t_ns``, the time ``t`` [s] since the log's start, and the event.
@@ -136,7 +137,7 @@ def map_of(result: RunResult, log: Log) -> World | None:
     if points is None or not len(points):
         return None
     if known is not None and result.config["settings"].get("landmarks") == "extended":
-        from factorgraph_loc.mapping.point_maps import merged  # noqa: PLC0415 - other runs need no trees of scipy
+        from factorgraph_loc.mapping.point_maps import merged  # noqa: PLC0415 - imports scipy.spatial, which other runs do not need
 
         points, _ = merged(known, points)
     return log.world.model_copy(update={"name": f"{log.name}-map", "points": points})

@@ -176,7 +176,8 @@ def _check_count(count: int, experiment: Experiment) -> None:
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
-    """Return combinations of swept settings of an estimator and of simulated logs, grouped by the values of the latter."""
+    """Return the combinations of swept settings of an estimator and of simulated logs. Combinations with equal settings of the
+    simulation form a group, whose key is the tuple of their values."""
     points: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
         points.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)

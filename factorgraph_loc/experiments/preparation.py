@@ -98,8 +98,8 @@ def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """Return the names of the sensors that a run uses.
 
-    ``asked``: the requested sensors, None for those of the rig that the log has. Raises InputError if a requested sensor is not
-    available, or no sensor is.
+    ``asked``: the requested sensors, None for all sensors of the rig whose measurements the log has. Raises InputError if a
+    requested sensor is not available, or if no sensor is available.
     """
     available = (*log.streams, *_filled_columns(log))
     asked = None if asked is None else log.rig.expanded(asked)
@@ -108,7 +108,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
         if parent and parent not in (asked or ()):
             raise InputError(f"{log.name}: {sensor} is a column of {parent}, expected {parent} among the sensors too")
         if parent and sensor not in available:
-            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: no row of {parent} has a value of it")
+            raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: this column of {parent} is missing or empty")
         if sensor not in available:
             raise InputError(f"{log.name}: has no sensor {quoted(sensor)}{nearest(sensor, list(available))}")
         if section := lacking_section(log.rig, sensor):
@@ -143,16 +143,17 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
 
 
 def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel, given: Collection[str] = ()) -> Use:
-    """Return a description of a run, which the packages of the sensors check. ``given``: settings that the user has set."""
+    """Return the description of a run for :func:`checked_use`. ``given``: names of the settings that the user has set."""
     kind = registry.estimator_type(estimator)
     modalities = getattr(kind, "modalities", frozenset[str]())
     return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False), given)
 
 
 def checked_use(use: Use) -> Use:
-    """Check a run by the packages of its sensors. Return it with settings that they may have changed.
+    """Check that the settings of a run fit its log, by the function ``check`` of each sensor package. Return the run with the
+    settings and warnings that these functions have changed.
 
-    Raises InputError if the settings do not fit the log.
+    Raises InputError if a setting does not fit the log.
     """
     for _, check in functions("check"):
         use = check(use)

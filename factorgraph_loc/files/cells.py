@@ -32,10 +32,10 @@ class Cells:
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file.
     ``columns``: for each field N texts, or numbers (N,) with NaN for empty cells.
     ``labels``: by field, the name of the column in the file, if it differs from the field.
-    ``units``: by field, the name of the unit in the file, or the factor to the unit of streams. ``decimal``: the decimal mark.
+    ``units``: by field, the name of the unit in the file, or the factor from it to ``Column.unit``. ``decimal``: the decimal mark.
     ``left_out``: columns of the file that are not read. ``passed``: number of JSON objects that lack needed columns.
-    ``unwanted``: number of rows that the mapping excludes.
-    ``rules``: what a manifest says about invalid and late rows, None without a manifest.
+    ``unwanted``: number of rows that ``where`` of the manifest excludes.
+    ``rules``: whether the manifest permits to skip invalid rows and to sort late rows, None without a manifest.
     ``unread``: number and error of each row that could not be split into cells.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """
@@ -68,7 +68,7 @@ class Cells:
         return texts
 
     def numbers(self, name: str, column: Column) -> Array:
-        """Return the numbers (N,) in a field, converted to the unit of streams of ``column``. Empty cells become NaN.
+        """Return the numbers (N,) in a field, converted to ``column.unit``. Empty cells become NaN.
 
         Raises InputError at the first cell that is no finite number, is out of bounds, or is empty although ``column`` forbids it.
         """
@@ -93,10 +93,10 @@ class Cells:
     def usable(
         self, columns: Mapping[str, Column], warnings: list[Notice], *, offset: float = 0.0, more: Sequence[Fault] = ()
     ) -> "Cells":
-        """Return the valid rows in order of time, as the rules say. Warnings count the skipped and the sorted rows.
+        """Return the cells without invalid rows if the manifest skips them, and in order of time if the manifest sorts them.
 
-        ``columns``: the description of each field, that of the timestamps first. ``offset`` [s]: added to the timestamps.
-        ``more``: faults that the descriptions do not cover.
+        ``columns``: the description of each field, the timestamps first. ``offset`` [s]: is added to the timestamps. ``more``:
+        further invalid cells. The numbers of skipped and of sorted rows are appended to ``warnings``.
         """
         rules = self.rules
         if rules is None or rules.refuse:
@@ -112,8 +112,9 @@ class Cells:
         return kept
 
     def without(self, faults: Sequence[Fault], warnings: list[Notice]) -> "Cells":
-        """Return the rows without ``faults``. A warning counts the other rows. Raises InputError at the first fault if the
-        rules do not skip invalid rows.
+        """Return the cells of the rows that have no fault. A warning has the number of rows with ``faults``.
+
+        Raises InputError at the first fault if the manifest does not skip invalid rows.
         """
         if self.rules is None or self.rules.bad_rows == "refuse":
             self.require(faults)
@@ -124,7 +125,7 @@ class Cells:
         return replace(out, resumed=out.resumed | (np.diff(kept, prepend=-1) > 1) | (np.diff(later, prepend=0) > 0))
 
     def rows_at(self, which: Integers) -> "Cells":
-        """Return the rows with indices ``which`` (M,), in that order."""
+        """Return the cells of the rows with the indices ``which`` (M,), in the order of ``which``."""
         columns = {
             name: cells[which] if isinstance(cells, np.ndarray) else [cells[i] for i in which.tolist()]
             for name, cells in self.columns.items()
@@ -132,18 +133,19 @@ class Cells:
         return replace(self, rows=self.rows[which], columns=columns, unread=(), resumed=self.resumed[which])
 
     def require(self, faults: Sequence[Fault]) -> None:
-        """Raise InputError at the first of ``faults``. If few rows are invalid, the message names the key that skips them."""
+        """Raise InputError at the first invalid cell of ``faults``. If few rows are invalid, the message names the key of the
+        manifest that skips them."""
         for fault in faults:
             if fault.wrong.any():
                 is_few = self.rules is not None and fault.wrong.mean() <= MOST_SKIPPED
                 raise fault.error(self.path, self.rows, self.rules.skipping if self.rules and is_few else "")
 
     def fault(self, name: str, wrong: NDArray[np.bool_], expected: str) -> Fault:
-        """Return the fault of the cells of a field that are ``wrong`` (N,). ``expected``: a description of valid cells."""
+        """Return a Fault for the field ``name``. ``wrong`` (N,): mask of its invalid cells. ``expected``: describes valid cells."""
         return Fault(self.labels.get(name, name), self.columns[name], wrong, expected)
 
     def _faults(self, name: str, column: Column) -> Sequence[Fault]:
-        """Return the faults of a field."""
+        """Return the faults of the field ``name``, which ``column`` describes: one for each reason why cells are invalid."""
         if column.kind in NAMES:
             return self._names(name, column)[1]
         if column.kind in NUMBERS:
@@ -153,7 +155,7 @@ class Cells:
         return *faults, self.fault(name, away, f"a time at most {MAX_SPAN / 86_400.0:g} days from most of the file")
 
     def _known(self, stamps: tuple[Integers, Sequence[Fault]]) -> Integers:
-        """Return the first of ``stamps``, the timestamps. Raises InputError if the second has a fault."""
+        """Return the timestamps [ns] in the first element of ``stamps``. Raises InputError if the second element has a fault."""
         self.require(stamps[1])
         return stamps[0]
 
@@ -235,9 +237,8 @@ class Cells:
 
 
 def _converted(cells: Iterable[Any], convert: Callable[[Any], T], blank: T) -> tuple[list[T], NDArray[np.bool_]]:
-    """Convert N cells. Returns the values, with ``blank`` for each cell that ``convert`` refuses, and a mask (N,) of these
-    cells.
-    """
+    """Convert N cells by the function ``convert``. Return the N results, and a mask (N,) of the cells for which ``convert`` raises
+    an exception. The result of such a cell is ``blank``."""
     out: list[T] = []
     wrong: list[int] = []
     for cell in cells:

@@ -37,8 +37,8 @@ def in_order(
 ) -> Integers:
     """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last one.
 
-    ``rules``: what a manifest says about the rows, None without a manifest. Raises InputError if a timestamp is older than the one
-    before it.
+    ``rules``: the rules of the manifest, from which the message names a remedy; None without a manifest. Raises InputError if a
+    timestamp is older than the one before it.
     """
     _require_order(source, rows, t_ns, rules)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
@@ -60,8 +60,7 @@ def increments_in_order(
 
     ``moves`` (N, 3): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there. A fourth column, the
     time [s] in which the motion is unknown, is summed. Returns distinct timestamps (M,) and the motion (M, 3 or 4) since the
-    timestamp before. ``rules``: what a manifest says about the rows, None without a manifest. Raises InputError if a timestamp
-    is older than the one before it.
+    timestamp before. ``rules``: see :func:`in_order`. Raises InputError if a timestamp is older than the one before it.
     """
     _require_order(source, rows, t_ns, rules)
     last, out = composed(t_ns, moves[:, :3])

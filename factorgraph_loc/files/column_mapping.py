@@ -60,7 +60,7 @@ class ColumnMapping(FileModel):
     """which rows to read: by column of the file, the value or the list of possible values"""
 
     def chosen(self) -> dict[str, set[str]]:
-        """Return ``where`` as texts: for each of its columns, the set of cells that the rows to read may have."""
+        """Return the setting ``where`` as texts: by column of the file, the set of permitted cells. Other rows are not read."""
         return {
             column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
             for column, values in self.where.items()
@@ -106,7 +106,7 @@ def read_mapped(
     read = _read_json_lines if path.suffix.lower() in JSON_SUFFIXES else _read_csv
     cells = read(path, mapping, needed)
     if not len(cells.rows):
-        raise InputError(f"{path}: contains no rows{' as chosen by where' if mapping.where else ''}")
+        raise InputError(f"{path}: contains no rows{' that where selects' if mapping.where else ''}")
     return cells
 
 
@@ -135,7 +135,7 @@ def _mapped(
 
 
 def _rules(mapping: ColumnMapping) -> RowRules | None:
-    """Return the rules for the rows of a table with timestamps; None for tables of names and maps, whose rows must be valid."""
+    """Return the rules for invalid rows of a mapped table. Return None for tables of names and maps, whose rows must be valid."""
     return mapping if isinstance(mapping, TimedMapping) else None
 
 
@@ -319,7 +319,9 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
     for alternatives in needed:
         if len(whole) < len(chosen) and not known.intersection(alternatives):
             first = listed(sorted(chosen[0][1]))
-            raise InputError(f"{path}: no object has {quoted(alternatives[0])}, the first has {first}")
+            raise InputError(
+                f"{path}: no object has the key {quoted(alternatives[0])}, the first object has the keys {first}"
+            )
     passed, fields = len(chosen) - len(whole), sorted(known.intersection(mapping.columns.values()))
     texts = {column for field, column in mapping.columns.items() if field in TEXT_FIELDS}
     errors = [_wrong_value(path, row, o, fields, texts) for row, o in whole]
@@ -334,9 +336,9 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
 
 
 def _wrong_value(path: Path, row: int, entry: Mapping[str, Any], fields: Sequence[str], texts: Collection[str]) -> str:
-    """Return the error about the first of the ``fields`` of an object that has a value of a wrong type, "" if there is none.
+    """Return an error message about the first of the ``fields`` of the object ``entry`` whose value has a wrong type, or "".
 
-    ``texts``: the fields that must be texts.
+    ``texts``: names of the fields whose values must be texts. ``row``: line number of the object.
     """
     for name in fields:
         value = entry.get(name)

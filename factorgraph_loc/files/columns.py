@@ -32,13 +32,13 @@ DURATION = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 STAMPS = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9}
 PIXELS = {"px": 1.0}
 PURE = {"1": 1.0}
-LEAST_UNIT = 1e-12  # minimum factor from a unit of a file to the unit of streams; the maximum is its reciprocal
+LEAST_UNIT = 1e-12  # minimum factor from a unit of a file to ``Column.unit``; the maximum is its reciprocal
 
 LATEST = 4_600_000_000_000_000_000  # ns, 145 years: differences of two timestamps fit into 64 bits
 MAX_SPAN = 30 * 86_400.0  # s; maximum time between two timestamps of one log
 FASTEST = 100.0  # m/s; most speeds that are in mm/s by mistake exceed this bound
 FASTEST_TURN = 100.0  # rad/s: gyros measure up to 70
-LONGEST_WAY, MOST_TURNED = 1000.0, 100.0  # m and rad from one row of odometry to the next, also across a pause
+LONGEST_WAY, MOST_TURNED = 1000.0, 100.0  # m, rad; maximum motion between two rows of odometry, also after a pause
 NEAREST, LONGEST_RANGE = 1e-3, 1e5  # m; bounds of measured ranges
 FULL_TURN = 2.0 * math.pi
 LARGEST_PIXEL = 1e5  # px; bound of pixel coordinates
@@ -60,9 +60,9 @@ def symmetric(upper: Sequence[Array]) -> Array:
 class Column:
     """Description of a column of a table.
 
-    ``units``: names of the units that a file may use, with the factors to the first one, which is the unit of streams.
-    ``low``, ``high``: inclusive bounds in the unit of streams. ``may_lack``: whether a cell may be empty.
-    ``doc``: meaning of the column. ``field``: name of the values in the stream, if it differs from ``name``.
+    ``units``: names of the units that a file may use, with the factors to the first one. Values are converted to the first one.
+    ``low``, ``high``: inclusive bounds of converted values. ``may_lack``: whether a cell may be empty.
+    ``doc``: meaning of the column. ``field``: name of the values in a stream object, if it differs from ``name``.
     ``left_out_below``: smaller values are treated as empty cells, with a warning.
     """
 
@@ -78,12 +78,13 @@ class Column:
 
     @cached_property
     def measured(self) -> Column:
-        """The description of the values in a stream, under the name that they have there. ``left_out_below`` is a lower bound."""
+        """The description of the values in a stream object: ``name`` is the name of its field, and ``low`` is at least
+        ``left_out_below``."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property
     def unit(self) -> str:
-        """The unit of the values in streams. Empty for dimensionless numbers and names."""
+        """The unit to which values of files are converted. Empty for dimensionless numbers and names."""
         return "" if self.units is PURE else next(iter(self.units), "")
 
     @property
@@ -105,7 +106,7 @@ class Column:
         return f"{what}{of} in {self.low:.6g} to {self.high:.6g}"
 
     def in_unit(self, unit: str | float, source: object = "") -> tuple[Column, float]:
-        """Return the column with bounds in another unit, and the factor from that unit to the unit of streams.
+        """Return the column with bounds in another unit, and the factor from that unit to :attr:`unit`.
 
         ``unit``: a name in ``units``, or the factor. Raises InputError with the file ``source`` for an unknown unit.
         """
@@ -118,7 +119,7 @@ class Column:
         return (self if factor == 1.0 else replace(self, units={name: 1.0}, low=low, high=high)), factor
 
     def outside(self, values: Array | Integers) -> NDArray[np.bool_]:
-        """Return a mask of the invalid ``values``, given in the unit of streams. NaN is invalid unless ``may_lack`` is set."""
+        """Return a mask of the invalid ``values``, given in :attr:`unit`. NaN is invalid unless ``may_lack`` is set."""
         bad = ~((values >= self.low) & (values <= self.high))
         if self.kind == "whole":
             bad |= values != np.floor(values)
@@ -127,9 +128,10 @@ class Column:
     def require(
         self, source: object, rows: Sequence[int] | Integers, values: Array | Integers, name: str | None = None
     ) -> None:
-        """Raise InputError at the first invalid one of ``values`` (N,), given in the unit of streams.
+        """Raise InputError if any of the ``values`` (N,) is invalid. The message names the first one.
 
-        ``rows`` (N,): row numbers in the file ``source``. ``name``: name of the column in the file, None for ``self.name``.
+        ``rows`` (N,): row numbers in the file ``source``. ``values`` are given in :attr:`unit`, which may differ from the unit in
+        the file. ``name``: name of the column in the file, None for ``self.name``.
         """
         expected = self.expected + (", or nothing" if self.may_lack else "")
         require(~self.outside(values), source, rows, name or self.name, values, expected)
@@ -194,7 +196,7 @@ def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Intege
         raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
-# a timestamp since 1970 above one of these bounds has the unit of that bound; times after 1973 exceed the bound of their unit
+# the unit of a timestamp since 1970 is the first whose bound it exceeds; this is correct for times after 1973
 SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
 
 

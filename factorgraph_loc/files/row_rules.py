@@ -16,7 +16,7 @@ from factorgraph_loc.files.models import FileModel
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Integers
 
-MOST_SKIPPED = 0.5  # share of the rows; more invalid rows have another cause, such as a wrong unit
+MOST_SKIPPED = 0.5  # maximum fraction of rows to skip; if more are invalid, a setting such as a unit is wrong
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,8 @@ class Fault:
     expected: str
 
     def error(self, source: object, rows: Integers, remedy: str = "") -> InputError:
-        """Return the error for the first invalid cell. ``rows`` (N,): row numbers in ``source``. ``remedy``: the end of the
-        message.
-        """
+        """Return the error for the first invalid cell. ``rows`` (N,): row numbers in the file ``source``. ``remedy``: the end of
+        the message."""
         i = int(self.wrong.argmax())
         value = self.values[i]
         value = value.tolist() if hasattr(value, "tolist") else value
@@ -59,10 +58,10 @@ class RowRules(FileModel):
         warnings: list[Notice],
         unread: Sequence[tuple[int, str]] = (),
     ) -> Integers:
-        """Return the indices of the rows without a fault, out of N. A warning counts the other rows and names the first of them.
+        """Return the indices of the rows without a fault, and append a warning with the number of invalid rows and the first error.
 
-        ``rows`` (N,): row numbers in ``source``. ``faults``: the invalid cells. ``unread``: number and error of further rows,
-        which could not be split into cells. Raises InputError at the first fault if invalid rows are refused, or if more than
+        ``rows`` (N,): row numbers in the file ``source``. ``faults``: the invalid cells. ``unread``: number and error of further
+        rows that could not be split into cells. Raises InputError at the first fault if ``bad_rows`` is "refuse", or if more than
         half of all rows are invalid.
         """
         wrong = np.zeros(len(rows), dtype=bool)
@@ -85,9 +84,8 @@ class RowRules(FileModel):
         return np.flatnonzero(~wrong)
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
-        """Return the indices of the N rows, in order of their timestamps ``t_ns`` (N,) if the rules sort rows. A warning counts
-        the late rows. ``rows`` (N,): row numbers in ``source``.
-        """
+        """Return indices (N,) that sort the rows by their timestamps ``t_ns`` (N,). If ``order`` is "refuse", the indices are 0 to
+        N - 1. If rows are sorted, a warning has the number of late rows."""
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))
@@ -106,18 +104,19 @@ class RowRules(FileModel):
 
     @property
     def skipping(self) -> str:
-        """The end of an error, which says how to skip invalid rows."""
+        """The end of an error message that names the key for skipping invalid rows."""
         return f'; bad_rows = "skip" in {self.PLACE} skips such rows'
 
     @property
     def sorting(self) -> str:
-        """The end of an error, which says how to sort rows."""
+        """The end of an error message that names the key for sorting rows."""
         return f'; order = "sort" in {self.PLACE} sorts the rows'
 
 
 def require_read(unread: Sequence[tuple[int, str]], count: int, rules: RowRules | None) -> None:
-    """Raise the first error of ``unread`` rows (number, error), unless ``rules`` skip them and they are at most half of ``count``
-    rows.
+    """Raise InputError with the first error of ``unread``: row number and error of each row that could not be split into cells.
+
+    No error is raised if ``rules.bad_rows`` is "skip" and at most half of the ``count`` rows of the file are unread.
     """
     if not unread:
         return
@@ -128,9 +127,8 @@ def require_read(unread: Sequence[tuple[int, str]], count: int, rules: RowRules 
 
 
 def require_none(source: object, rows: Integers, faults: Sequence[Fault], remedy: str = "") -> None:
-    """Raise InputError at the first invalid cell of ``faults``. ``rows`` (N,): row numbers in ``source``. ``remedy``: the end
-    of the message.
-    """
+    """Raise InputError at the first invalid cell of ``faults``. ``rows`` (N,): row numbers in the file ``source``. ``remedy``: the
+    end of the message."""
     for fault in faults:
         if fault.wrong.any():
             raise fault.error(source, rows, remedy)

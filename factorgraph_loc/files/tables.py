@@ -45,8 +45,9 @@ def rows_of_length(
 ) -> tuple[Integers, dict[str, list[str]], tuple[tuple[int, str], ...]]:
     """Collect the rows of a CSV file by column. ``rows``: line number and cells of each row.
 
-    Returns the line numbers (N,), by name in ``header`` the N cells of a column, and line number and error of each row that has
-    not as many cells as the header. Raises InputError at the first such row, unless ``rules`` skip them and they are few.
+    Returns the line numbers (N,), the N cells of each column by its name in ``header``, and line number and error of each row with
+    a wrong number of cells. Raises InputError at the first such row, unless ``rules`` skip invalid rows and at most half of the
+    rows are invalid.
     """
     numbers: list[int] = []
     table: list[list[str]] = []
@@ -152,7 +153,9 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
         raise InputError(f"{source}: {name} is of type {kind}, expected texts")
     with foreign(source, f"{name} is no column of texts"):
         texts = column.cast(pl.String)
-        if len(texts) * texts.estimated_size() > DATA:  # the estimate counts a text once that many rows share
+        if (
+            len(texts) * texts.estimated_size() > DATA
+        ):  # a text that many rows share is counted once in the estimated size
             length = int(texts.str.len_bytes().sum())
             require_size(source, f"the length of all texts of {name}", length, DATA)
         return [text or "" for text in texts.to_list()]
@@ -163,9 +166,9 @@ class TableRows:
     """The parsed values of N rows of a table.
 
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps [ns].
-    ``numbers``: by column, numbers (N,) in the unit of streams, NaN for empty cells. ``names``: by column, N texts.
+    ``numbers``: by column, numbers (N,) in ``Column.unit``, NaN for empty cells. ``names``: by column, N texts.
     ``left_out``: columns of the file that are not read.
-    ``rules``: what a manifest says about invalid and late rows, None without a manifest.
+    ``rules``: whether the manifest permits to skip invalid rows and to sort late rows, None without a manifest.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """
 

@@ -22,7 +22,10 @@ FEW = 30  # maximum number of values that a Python loop checks faster than NumPy
 
 
 def seconds_of(where: str, value: object, name: str = "t") -> float:
-    """Return a time [s] as a float. Raises InputError if it is not a number or out of range."""
+    """Return the time ``value`` [s] as a float. Raises InputError if it is not a number or out of range.
+
+    ``where``, ``name``: the object and its field that have the value, for the message. See :func:`numbers`.
+    """
     if type(value) is float and SECONDS.low <= value <= SECONDS.high:
         return value
     seconds = math.nan
@@ -35,7 +38,10 @@ def seconds_of(where: str, value: object, name: str = "t") -> float:
 
 
 def numbers(where: str, field: str, value: object) -> Array:
-    """Return ``value`` as a new array of floats. Raises InputError if it does not consist of real numbers."""
+    """Return ``value`` as a new array of floats. Raises InputError if it does not consist of real numbers.
+
+    The message starts with ``where``, such as the name of a log, and names the ``field`` that has the value.
+    """
     try:
         array = np.array(value)
         if array.dtype.kind == "O" and all(
@@ -50,9 +56,9 @@ def numbers(where: str, field: str, value: object) -> Array:
 
 
 def within(where: str, column: Column, value: object, shape: tuple[int, ...]) -> Any:
-    """Return numbers of a given shape, or a float if ``shape`` is ().
+    """Return ``value`` as an array of floats, or as a float if ``shape`` is ().
 
-    Raises InputError if ``value`` has another shape or exceeds the bounds of ``column``.
+    Raises InputError, starting with ``where``, if ``value`` has another shape or exceeds the bounds of ``column``.
     """
     column, field = column.measured, column.field or column.name
     array = numbers(where, field, value)

@@ -97,8 +97,8 @@ def adjust(
 
 
 def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
-    """Return a mask (N,) of the observations whose residual is at most ``limit`` standard deviations. A point with fewer than two
-    such observations has none."""
+    """Return a mask (N,) of the observations whose residual is at most ``limit`` standard deviations. If a point has only one such
+    observation, the mask is False for it too, because one observation does not determine the point."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     count = np.bincount(tracks.track[right], minlength=tracks.count)

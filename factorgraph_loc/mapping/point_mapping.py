@@ -43,7 +43,7 @@ from factors.positive import worst_sigma
 from factors.se2 import Array, Integers
 
 MOST_KEYFRAMES = 600
-WIDER = 1.3  # while there are more keyframes, the distance between keyframes is multiplied by this factor
+WIDER = 1.3  # factor by which the distance between keyframes is increased while there are more than MOST_KEYFRAMES
 DEPTH = 2.0  # m: typical depth of points, for the pixel error that a wrong camera position causes
 GATE = 3.0  # matches must be nearer to the epipolar line than so many standard deviations
 NARROW, WIDE = 3.0, 25.0  # px: bounds of this gate
@@ -174,7 +174,8 @@ def map_points(
 
 
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
-    """Return the indices of the frames that become keyframes. The spacing of the settings is increased if there are too many."""
+    """Return the indices of the frames that become keyframes. Their least distances are ``settings.distance`` and
+    ``settings.angle``, which are increased until there are at most :data:`MOST_KEYFRAMES`."""
     filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])
     distance, angle = settings.distance, settings.angle
     while True:

@@ -21,7 +21,7 @@ from factors.se2 import Array, Integers
 
 GATE = 16.27  # 99.9 % of chi-square with three degrees of freedom
 FARTHEST = 0.5  # m: largest distance of two estimates of the same point
-PERCENTILE = 90.0  # of the differences between views of one point: the limit for views of the same point in two maps
+PERCENTILE = 90.0  # views that differ by more than this percentile of the views of one point show different points
 COMPARED = 2000  # number of points from which this percentile is estimated
 CELL = 0.5  # m: size of the cells of space; thinning keeps points in as many cells as possible
 LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact points can be compared
@@ -30,9 +30,9 @@ LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact
 def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
     """Merge two maps. Returns the merged map, and the number of points that both maps have in common.
 
-    A common point has its name of the map ``first``. The other points of ``second`` get new names, except points without a view.
-    Raises InputError if the maps have features of different kinds, or if a point without a view of ``second`` has a name of
-    ``first``.
+    A view is a descriptor of a point, with the camera position from which it was observed. Common points are recognised by their
+    views and keep the names of ``first``. The other points of ``second`` get new names, unless they have no view. Raises InputError
+    if the maps have features of different kinds, or if a point of ``second`` without a view has the name of a point of ``first``.
     """
     kinds = {points.feature for points in (first, second) if points.feature}
     if len(kinds) > 1:
@@ -107,8 +107,8 @@ def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers
 
 
 def _common(first: PointMap, second: PointMap) -> Array | None:
-    """Return the covariances of the errors that all points of a view have in common, for the views of both maps, or None if neither
-    map has them. They are zero for a map that was made with a reference."""
+    """Return the field ``common`` of the joined map: for each view of ``first`` and then of ``second``, the covariance of the error
+    that the points observed from there share. It is zero for a map without this field. Returns None if neither map has it."""
     if first.common is None and second.common is None:
         return None
     return np.concatenate([np.zeros((len(p.owners), 3, 3)) if p.common is None else p.common for p in (first, second)])

@@ -260,7 +260,9 @@ class _Problem:
         try:
             covariances = self._problem().covariances(self._values, keys).by_key
         except IndeterminateError as error:
-            raise RunFailedError(f"{len(tags)} tags were located, but the reads do not determine how well") from error
+            raise RunFailedError(
+                f"{len(tags)} tags were located, but the reads do not determine their accuracy"
+            ) from error
         learnt = {i: LearntPoint(self._values[key], covariances[key]) for i, key in zip(tags, keys, strict=True)}
         return TagSlam(self.t, self._poses(), learnt, self._facing, posteriors)
 

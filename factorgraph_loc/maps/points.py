@@ -300,9 +300,9 @@ class CommonError:
 
 
 def carried(covariances: Array, arms: Array) -> Array:
-    """Return ``covariances`` (N, 3, 3) of (x, y, heading) of a rigid body, moved to other points of the body.
+    """Return ``covariances`` (N, 3, 3) of (x, y, heading) [m, rad] of a rigid body, moved to other points of the body.
 
-    ``arms`` (N, 2): the vectors from the old points to the new ones [m].
+    ``arms`` (N, 2): the vectors from the old points to the new ones [m]. Both are in the world frame.
     """
     lever = np.repeat(np.eye(3)[None], len(arms), axis=0)
     lever[:, 0, 2], lever[:, 1, 2] = -arms[:, 1], arms[:, 0]

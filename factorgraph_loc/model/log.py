@@ -103,9 +103,8 @@ class Log:
         yield from _pieces(rows, late, first, len(arrived))
 
     def alone(self, sensor: str) -> Log:
-        """Return the log without the other sensors of the same kind as ``sensor``, which gets the name of the kind.
-
-        Example: ``bearing_range.front`` becomes ``bearing_range``. A name without a dot returns the log unchanged.
+        """Return the log with ``sensor`` as the only sensor of its kind. It is renamed to the kind: ``bearing_range.front`` becomes
+        ``bearing_range``. Sensors of other kinds do not change. If ``sensor`` has no dot, the log is returned unchanged.
         """
         if kind_of(sensor) == sensor:
             return self

@@ -145,7 +145,8 @@ class Stream:
         return (column for name, column in columns_of(self).items() if name != "t")
 
     def begun_anew(self) -> Self:
-        """Return the stream without motion before its first row, for a robot that was carried to the place of that row."""
+        """Return the stream with zero motion in its first row, for a log in which the robot is carried to the pose of this row.
+        Streams that do not measure motion are returned unchanged."""
         return self
 
     def scans(self) -> Iterator[tuple[int, int]]:
@@ -166,7 +167,8 @@ class ScanStream(Stream):
 
 
 def of_sensor(stream: Stream, name: str) -> Stream:
-    """Return the stream with the ``name`` of the sensor as its source, if the name is that of one of several sensors of a kind."""
+    """Return the stream with the sensor's ``name`` as its ``source``. If the name has no dot, the stream is returned unchanged,
+    because the sensor is then the only one of its kind."""
     return stream if kind_of(name) == name else replace(stream, source=name)
 
 

@@ -18,7 +18,7 @@ RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a
 TILT = math.radians(10.0)  # angle between the z axes of the robot and the world: limit for a warning
 NEGLIGIBLE = 1e-9  # component of a unit vector below which an axis does not contribute
 UNIT = 0.01  # tolerance of the norm of a quaternion
-# m^2: variance of a placeholder; and its least ratio to the median, as the variance of odometry grows
+# a variance marks a null pose if it is at least HUGE [m^2] and at least ABOVE_USUAL times the median, because odometry is uncertain
 HUGE, ABOVE_USUAL = 1000.0, 100.0
 NAMED = {"body": "x y z", "optical": "z -x -y"}  # axes that point forward, left and up, by name
 
@@ -92,7 +92,8 @@ AS_IT_IS = Turned()
 
 
 def not_unit(quaternions: Array) -> Fault:
-    """Return the fault of the quaternions (N, 4) that are not unit quaternions."""
+    """Return a :class:`Fault`, from which readers make an error message, with a mask of the ``quaternions`` (N, 4) whose length is
+    not 1."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")

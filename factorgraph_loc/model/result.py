@@ -88,7 +88,7 @@ class RunResult:
 
     @property
     def max_gap(self) -> float:
-        """The longest time [s] between two estimates between which scoring interpolates."""
+        """The longest gap [s] between two estimates in which scoring interpolates poses."""
         return float(self.config.get("max_gap", MAX_GAP))
 
     def first_localized(self) -> int | None:

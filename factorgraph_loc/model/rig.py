@@ -64,9 +64,8 @@ class Rig(FileModel):
         return tuple(dict.fromkeys(each for name in sensors for each in self.names(name) or (name,)))
 
     def alone(self, sensor: str) -> Self:
-        """Return the rig without the other sensors of the same kind as ``sensor``, which gets the name of the kind.
-
-        Example: ``bearing_range.front`` becomes ``bearing_range``. A name without a dot returns the rig unchanged.
+        """Return the rig with ``sensor`` as the only sensor of its kind. It is renamed to the kind: ``bearing_range.front`` becomes
+        ``bearing_range``. Sensors of other kinds do not change. If ``sensor`` has no dot, the rig is returned unchanged.
         """
         if kind_of(sensor) == sensor:
             return self

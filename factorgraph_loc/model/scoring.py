@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
 
 KINDS = ("causal", "final")  # kinds of estimates of a run
-MAX_GAP = 0.5  # s: longest time between two estimates between which scoring interpolates
+MAX_GAP = 0.5  # s: longest gap between two estimates in which scoring interpolates poses
 MAX_DIFF = 0.01  # s: largest difference of two timestamps that scoring treats as equal
 Alignment = Literal["none", "origin", "se2", "yaw", "se3", "sim3"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "yaw", "se3", "sim3")
@@ -22,11 +22,11 @@ ASSOCIATIONS: tuple[Association, ...] = ("nearest", "interpolate")
 NAMED_PRIORS = ("reference", "log", "unknown")
 PRIORS = f"{', '.join(NAMED_PRIORS)}, X,Y or X,Y,HEADING"
 RATE = 10  # Hz
-TICK_GAP = 60.0  # s: default of tick_gap; a longer gap between measurements has no ticks
+TICK_GAP = 60.0  # s: default of tick_gap; in a longer gap between measurements no estimates are recorded
 SHORTEST, LONGEST = 1.0, 86400.0  # s: bounds of tick_gap
 MOST_SEEDS = 10_000
 LARGEST_SEED = 2**63 - 1  # the largest integer that a table of results can store
-TOLERANCE = 1e-6  # fraction of a tick by which a tick may follow the last measurement, for rounding
+TOLERANCE = 1e-6  # a tick may follow the last measurement by this fraction of a tick interval, because of rounding
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class RunConfig:
     ``sensors``: names of the sensors to use, None for those in the rig; ``rssi`` and ``phase`` are optional parts of ``rfid``.
     ``prior``: the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     ``seed``: the seed of the estimator's random generator.
-    ``max_gap``: the longest time between two estimates between which scoring interpolates [s].
+    ``max_gap``: the longest gap between two estimates in which scoring interpolates poses [s].
     ``tick_gap``: the longest gap between measurements in which estimates are recorded [s].
     ``align``: an alignment with the reference, after which scores are computed again. Estimates do not change.
     """

@@ -89,9 +89,9 @@ def kind_of(name: str) -> str:
 
 
 def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
-    """Return the ``names`` of sensors, by their new names, without the other sensors of the same kind as ``chosen``.
+    """Select and rename sensors so that ``chosen`` is the only one of its kind. Return the old names by the new names.
 
-    The new name of ``chosen`` is the name of its kind. Other names do not change.
+    The new name of ``chosen`` is the name of its kind. Names of other kinds do not change.
     """
     kind = kind_of(chosen)
     return {kind if name == chosen else name: name for name in names if name == chosen or kind_of(name) != kind}

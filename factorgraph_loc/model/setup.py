@@ -30,7 +30,7 @@ class Setup:
     rng: np.random.Generator
 
     def alone(self, sensor: str) -> Setup:
-        """Return the arguments without the other sensors of the same kind as ``sensor``, see
+        """Return the arguments with ``sensor`` as the only sensor of its kind, see
         :meth:`~factorgraph_loc.model.rig.Rig.alone`."""
         return replace(self, rig=self.rig.alone(sensor), sensors=tuple(as_only(self.sensors, sensor)))
 

@@ -30,7 +30,7 @@ from factors.se2 import Array
 
 RATIO, GLOBAL_RATIO = 0.85, 0.8  # ratio tests with and without a prediction
 NEAREST, FARTHEST = 0.2, 50.0  # m: depths of points that are searched
-# a viewpoint is similar to another if angle and ratio of distances to the point are smaller
+# two viewpoints of a point are similar if the angle between them and the ratio of their distances to the point are smaller
 LARGEST_ANGLE, LARGEST_RATIO = math.radians(50.0), 2.0
 GATE = float(chi_squared.quantile(0.99, 2))
 CELL = 20.0  # px, cells for sorting features
@@ -39,7 +39,7 @@ SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
 MARGIN = 20.0  # px: points that are predicted this far outside the image are still searched
 SAME_PIXEL = 4.0  # px: closer points and features may be the same
 SAME_POINT = 0.15  # m: closer points may be the same
-CHANCE = 0.02  # descriptors of a match must be more similar than this fraction of pairs of different map points
+CHANCE = 0.02  # a match must be so similar that only this fraction of pairs of different map points is more similar
 MANY = 5000  # views of a map: with more, only the most similar keyframes are compared with an image
 # least number of matches, and least fraction of the visible points that must match. In an office that the map does not contain,
 # up to 2 % of the features match by chance

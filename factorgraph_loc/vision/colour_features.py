@@ -57,8 +57,8 @@ class ColourExtractor:
     """Extractor of colour features (see :class:`~factorgraph_loc.vision.keypoints.Extractor`).
 
     The descriptors (N, 35) are ``float32`` and of unit length. ``count``: the largest number of features per image.
-    ``everywhere``: choose features in all parts of an image, not only the strongest. ``paper_literal``: use the neighbours of the
-    paper (:func:`~factorgraph_loc.vision.descriptor.records`), for comparison.
+    ``everywhere``: choose features in all parts of an image, not only the strongest. ``paper_literal``: compute descriptors exactly
+    as Raoui et al. 2011, for comparison (see :func:`~factorgraph_loc.vision.descriptor.records`).
     An extractor must be used by one thread only, because the memory for an image is reused for the next image of the same size.
     """
 

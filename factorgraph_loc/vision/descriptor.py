@@ -37,7 +37,7 @@ LOG_ARMS = (2.0, 4.0, 6.0, 8.0)
 GRADIENT_SCALE = 3.3
 GRADIENT_ARM = 6.0
 WAVELENGTHS = (3.5, 7.0, 14.0)
-ENVELOPE = 0.4  # standard deviation over wavelength
+ENVELOPE = 0.4  # standard deviation of a Gabor wavelet's envelope, divided by the wavelength
 
 _FLAT = 1e-6  # grey levels: norm of a patch's responses below which they are set to 0
 
@@ -45,8 +45,9 @@ _FLAT = 1e-6  # grey levels: norm of a patch's responses below which they are se
 def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = False) -> NDArray[np.void]:
     """Compute the values of N ``keypoints`` of an image, as records (N,) of the type :data:`RECORD`.
 
-    ``space``: the scale space of the image. ``keypoints`` must have directions. ``paper_literal``: as in the paper, use the four
-    nearest other keypoints as neighbours. In another image the neighbours often are others, which makes the values less repeatable.
+    ``space``: the scale space of the image. ``keypoints`` must have directions. By default four places around a point are described
+    too. ``paper_literal``: describe the four nearest keypoints instead, as Raoui et al. 2011. The nearest keypoints often differ
+    between images, which makes the values less repeatable.
     """
     sigmas = keypoints.sizes / 2.0
     answers = space.patches(keypoints.points, sigmas, keypoints.angles, LATTICE) @ FILTERS
@@ -98,7 +99,7 @@ def cross(arm: float) -> Array:
 
 def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
     """Return the weights (M,) of a Gaussian at the M places of the lattice, their offsets (M, 2) from ``centre`` (2,), and the
-    variance of the Gaussian. Its blur is added to that of the samples, 1, so that the result has the blur ``scale``."""
+    variance of the Gaussian. It is ``scale``**2 - 1, because the samples already have a blur with the variance 1."""
     variance = scale**2 - 1.0
     away = LATTICE - centre
     return np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2.0 * np.pi * variance), away, variance

@@ -33,7 +33,7 @@ REACH = 3.0  # a pixel is an inlier of a sample within so many standard deviatio
 CONFIDENCE, MOST_SAMPLES = 0.9999, 5000
 REFINEMENTS = 10  # largest number of iterations
 CONVERGED = 1e-6  # m, rad: step below which the refinement ends
-# m, rad: the estimated pose of a robot on the floor may have this height and tilt, by its errors and those of the mounting
+# m, rad: largest height and tilt of the estimated pose of a robot on the floor, due to errors of the estimate and of the mounting
 LARGEST_HEIGHT, LARGEST_TILT = 0.3, 0.15
 LARGEST_SIGMA = 0.5  # m, rad: a pose with larger standard deviations is not accepted
 WORDS = 64  # words of the vocabulary
@@ -200,8 +200,8 @@ class KeyframeIndex:
         return np.flatnonzero(alike[self._of])
 
     def _described(self, values: Array, of: Integers) -> Array:
-        """Return the descriptions (K, WORDS * D) of K images. ``values`` (M, D): the descriptors of all images. ``of`` (M,): the
-        image of each descriptor."""
+        """Return the VLAD vectors (K, WORDS * D) of K images, by which images are compared. ``values`` (M, D): the descriptors of
+        all images. ``of`` (M,): the index of each descriptor's image."""
         (nearest, _), count = vq(values, self._words), len(self._words)
         descriptions = np.zeros((int(of.max()) + 1, count, values.shape[1]))
         np.add.at(descriptions, (of, nearest), values - self._words[nearest])

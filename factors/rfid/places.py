@@ -86,8 +86,9 @@ class Scan(NamedTuple):
 
 
 class Antennas(NamedTuple):
-    """An adjusted model and its tables. ``logs`` (M, Z, 2): the logarithms of read and miss probability of each detection model, at
-    the logits of the tables. ``reach`` [m]: the largest distance from the robot's origin at which an antenna can read a tag."""
+    """The detection models of all antennas, and their tables. ``logs`` (M, Z, 2): the logarithms of read and miss probability of M
+    models, at the Z logits of the tables. ``reach`` [m]: the largest distance from the robot's origin at which a tag can be
+    read."""
 
     packed: Packed
     tables: Tables
@@ -96,7 +97,7 @@ class Antennas(NamedTuple):
 
 
 def antennas_of(packed: Packed, tables: Tables) -> Antennas:
-    """Combine an adjusted model and the ``tables`` of its antennas."""
+    """Return the detection models ``packed`` with their ``tables``, and with ``logs`` and ``reach`` computed from ``packed``."""
     return Antennas(packed, tables, logs_of(packed), reach_of(packed, np.zeros((0, 3))))
 
 

@@ -149,8 +149,8 @@ class TagStates:
             self._evidence.popleft()
 
     def forget(self, since: float) -> None:
-        """Remove the evidence since the time ``since`` [s], of at most the last :data:`KEPT` seconds. This is necessary if the
-        robot was at another pose then, or if the scans will be processed again. Tags that were read remain known as not dead."""
+        """Undo :meth:`learn` for all scans since the time ``since`` [s]. Scans more than :data:`KEPT` seconds old are not undone.
+        Call this if the robot's pose was wrong in these scans, or before they are processed again. :meth:`hear` is not undone."""
         kept: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         for row in self._evidence:
             if row[0] < since:

@@ -209,7 +209,5 @@ def test_a_reference_without_headings_calibrates_no_wheels(simulate, tmp_path):
     log = simulate(seconds=60.0)
     log = replace(log, streams={"odometry": log.streams["odometry"]})
     log = replace(log, reference=replace(log.reference, has_heading=False))
-    with pytest.raises(
-        fgloc.InputError, match="expected one of these, or headings in the reference to calibrate only the wheels"
-    ):
+    with pytest.raises(fgloc.InputError, match="expected some, or headings in the reference to calibrate the wheels"):
         fgloc.calibrate(log, tmp_path / "cart.rig.toml")

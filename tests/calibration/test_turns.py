@@ -157,7 +157,9 @@ def test_what_does_not_tell_enough_is_named(offices, blind, tmp_path):
     bare = blind[0].rig.model_copy(update={"sensors": ("odometry",)})
     known = bare.odometry.model_copy(update={"uncertainty": type(bare.odometry.uncertainty)()})
     certain = bare.model_copy(update={"odometry": known})
-    with pytest.raises(InputError, match=r"office-1: nothing of the rig rackham can be learnt without a reference"):
+    with pytest.raises(
+        InputError, match=r"office-1: nothing can be learnt without a reference, because the rig rackham"
+    ):
         learn_by_turns(blind[:1], certain, smoothed, tmp_path / "cart")
 
 

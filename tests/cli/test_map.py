@@ -208,7 +208,10 @@ def test_a_run_without_a_map_writes_one(fgloc, gallery, gallery_on_disk, tmp_pat
     result = fgloc("run", log, *UNKNOWN, "-o", out)
     assert result.exit_code == 0, result.output
     world = read_world(out / "map.world.toml")
-    assert f"a map of the {len(world.points)} points that were found is in {out / 'map.world.toml'}" in result.stdout
+    assert (
+        f"a map with the {len(world.points)} points that the run estimated is in {out / 'map.world.toml'}"
+        in result.stdout
+    )
     assert set(world.landmarks) == {"door"}
     off = world.points.positions[:, 0] - WALL
     assert np.median(np.abs(off)) < 0.05

@@ -215,7 +215,7 @@ def test_rssi_and_phase_are_sensors_of_the_reads(reading, fake):
     run(reading, RunConfig("fake", sensors=ALL[:3]))
     assert fake.made.setup.sensors == ALL[:3]
     assert sum(kind == "RfidScan" for kind, _ in fake.made.calls) == 2
-    with pytest.raises(InputError, match="has no sensor 'phase': no row of rfid has a value of it"):
+    with pytest.raises(InputError, match="has no sensor 'phase': this column of rfid is missing or empty"):
         run(reading, RunConfig("fake", sensors=ALL))
     stream = replace(reading.streams["rfid"], phase=np.array((np.nan, 0.5)))
     run(replace(reading, streams=dict(reading.streams) | {"rfid": stream}), RunConfig("fake", sensors=ALL))

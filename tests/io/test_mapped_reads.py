@@ -66,7 +66,10 @@ def test_events_of_an_r700_with_epcs_in_base64(hall, with_options, one, refused)
     ]
     refused(manifest({"epc": "a"}), "events.json:1", "tagInventoryEvent.epc is 'a', expected an EPC in base64")
     refused(manifest({}, {"epc": ""}), "events.json:2", "tagInventoryEvent.epc is '', expected the EPC of a tag")
-    refused(manifest({"epc": None}), "no object has 'tagInventoryEvent.epcHex', the first has eventType, hostname")
+    refused(
+        manifest({"epc": None}),
+        "no object has the key 'tagInventoryEvent.epcHex', the first object has the keys eventType",
+    )
 
 
 @pytest.mark.parametrize("value", [True, 12])

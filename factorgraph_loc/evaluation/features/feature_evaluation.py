@@ -40,7 +40,7 @@ class MatchScores(NamedTuple):
 
     ``matching_score``: number of correct mutual matches divided by the smaller number of features in the common part of the images.
     ``matches``: number of mutual matches with a distance ratio below :data:`~factorgraph_loc.vision.matching.RATIO`.
-    ``precision``: fraction of the latter that is correct.
+    ``precision``: fraction of these ``matches`` that is correct.
     """
 
     matches: int = 0
@@ -51,13 +51,13 @@ class MatchScores(NamedTuple):
 def evaluate(
     sequence: Sequence, what: Feature, progress: Callable[[], None] = lambda: None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the scores of a feature on each pair of images of a sequence: the first image and a later one.
+    """Yield the scores of the feature ``what`` for each pair of the first image and a later image of a sequence.
 
     The keys are ``feature``, ``sequence``, ``image`` (number of the later image), ``change`` and ``amount`` (see
-    :class:`~factorgraph_loc.evaluation.features.sequences.Sequence`), ``features`` (number in the later image), ``milliseconds``
-    (time to detect and describe these), and the fields of :class:`MatchScores` and
-    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`. Each image is processed on one thread. ``progress``
-    is called after each image.
+    :class:`~factorgraph_loc.evaluation.features.sequences.Sequence`), ``features`` (number in the later image),
+    ``milliseconds`` (time to detect and describe the features of the later image), and the fields of :class:`MatchScores` and
+    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`. Each image is processed on one thread.
+    ``progress`` is called after each image.
     """
     with _one_thread():
         what.find(sequence.first)  # compilation and allocation at first use are not part of the measured time
@@ -92,8 +92,8 @@ def match_scores(
     """Return the scores of the matches between two images. A match is correct if both points lie in the common part of the images
     and their regions overlap.
 
-    ``mutual``: mutual nearest neighbours. ``clear``: those with a small distance ratio. ``homography``: from the first image to the
-    second. ``shapes``: shapes of both images.
+    ``first``, ``second``: points of the images. ``mutual``: mutual nearest neighbours. ``clear``: the mutual matches with a
+    small distance ratio. ``homography``: from the first image to the second. ``shapes``: (height, width, ...) of both images.
     """
     in_first, in_second = common(first, second, homography, shapes)
     features = min(int(np.count_nonzero(in_first)), int(np.count_nonzero(in_second)))

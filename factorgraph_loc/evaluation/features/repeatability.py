@@ -23,8 +23,8 @@ from factors.se2 import Array
 
 OVERLAP_ERROR = 0.4  # regions correspond below this error: 1 - intersection / union
 RADIUS = 30.0  # px; radius of a scaled region in the first image
-MEASUREMENT = 3.0  # radius of the region that describes a point, in units of half its size
-SCALE_RATIO = 1.2  # maximum ratio of sizes in the strict score
+MEASUREMENT = 3.0  # radius of the region that describes a point, divided by half the point's size (its diameter)
+SCALE_RATIO = 1.2  # maximum ratio between the sizes of two points that correspond in the score ``strict``
 
 _NODES = 64  # number of nodes of the integration over a disc
 _CHUNK = 20_000  # number of pairs that are compared at once, to limit memory
@@ -34,9 +34,10 @@ Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both i
 
 
 class Repeatability(NamedTuple):
-    """Repeatability scores of a pair of images, from 0 to 1.
+    """Repeatability scores of a pair of images, from 0 to 1. Both are 0 if ``regions`` is 0.
 
-    ``regions``: the smaller of the numbers of regions in the common part of both images. If it is 0, the scores are 0.
+    ``regions``: number of regions in the common part of the images, in the image that has fewer. ``repeatability``: number of
+    corresponding regions (:func:`overlaps`) divided by ``regions``. ``strict``: the same with :func:`alike_regions`.
     """
 
     regions: int
@@ -90,7 +91,8 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 
 def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
-    """Return one-to-one pairs of points whose regions overlap without scaling, with a ratio of sizes below :data:`SCALE_RATIO`."""
+    """Return one-to-one pairs of points whose regions overlap at their own size (see ``magnified`` of :func:`overlaps`). The
+    ratio between the sizes of the two points is below :data:`SCALE_RATIO`."""
     pairs = overlaps(first, second, homography, magnified=False)
     alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
     return pairs.best((pairs.error < OVERLAP_ERROR) & alike)
@@ -108,8 +110,8 @@ def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shape
 def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Candidates:
     """Return the pairs of points whose regions may have an overlap error below :data:`OVERLAP_ERROR`.
 
-    ``magnified``: if set, regions are scaled so that the first has the radius :data:`RADIUS`, but the distance of the centres is
-    not scaled. Otherwise the radius of a region is :data:`MEASUREMENT` times half the size of its point.
+    ``magnified``: if true, both regions are scaled by one factor, so that the first has the radius :data:`RADIUS`. The distance
+    of the centres is not scaled. If false, the radius of a region is :data:`MEASUREMENT` times half the size of its point.
     """
     if len(first) == 0 or len(second) == 0:
         none = np.empty(0, dtype=np.int64)

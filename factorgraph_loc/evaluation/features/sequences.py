@@ -192,9 +192,10 @@ def warped(photograph: Image, source: Path) -> list[Sequence]:
     """Make two sequences from a photograph: one with the photograph reduced by :data:`ZOOMS`, one with it rotated by
     :data:`ROTATIONS`.
 
-    A reduced photograph (area averaging) is placed in the middle of the mirrored original. This imitates a more distant camera,
-    which has many points outside of the scene. Rotated images, and their first image, are cropped to the largest square that has no
-    border in any of them. Raises InputError with the file ``source`` if the photograph is too small.
+    A reduced photograph (area averaging) is pasted onto the centre of its mirror image at full size. This imitates a more
+    distant camera, which sees many points outside of the scene. Rotated images, and their first image, are cropped to the
+    largest square without empty corners in any of them. Raises InputError with the file ``source`` if the photograph is too
+    small.
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:

@@ -109,7 +109,8 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
 
 
 def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
-    """Return the values of the page that are read from the files of the runs. ``metric``: selects the drawn run among seeds."""
+    """Return the values of the page that are read from the files of the runs. Of runs that differ only in the seed, the page
+    shows the trajectory of the one with the median of the score ``metric``."""
     read = read_runs(results, metric, runs)
     return {
         "tracks": read.tracks,

@@ -57,7 +57,7 @@ def associate(
         if how != "nearest":
             without = estimate if estimate.t_ns is None else reference
             raise InputError(
-                f"{without.name}: has no timestamps, which associate interpolate requires: use associate nearest"
+                f"{without.name}: has no timestamps, which --associate interpolate requires: use --associate nearest"
             )
         if len(estimate) != len(reference):
             raise InputError(
@@ -186,7 +186,7 @@ def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similari
     for path, places in ((estimate, points), (reference, targets)):
         if np.abs(places - places[0]).max() <= _DEGENERATE * max(1.0, float(np.abs(places).max())):
             raise InputError(
-                f"{path.name}: all positions are equal, so --align {how} has no heading, expected a robot that moves"
+                f"{path.name}: all positions are equal, so --align {how} cannot find a rotation, expected a path of some length"
             )
     x, y, angle = se2.align_points(points, targets)
     rise = float(np.mean(reference.positions[:, 2] - estimate.positions[:, 2])) if how == "yaw" else 0.0
