@@ -94,7 +94,7 @@ def _subtract(left: Array, right: Array, out: Array) -> None:
 
 @compiled
 def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Array, Array]:
-    """Eliminate one pose after the other. The diagonal of the information matrix is multiplied by ``1 + damping`` first.
+    """Eliminate one pose of ``system`` after the other. The diagonal of the information is multiplied by ``1 + damping`` first.
 
     Returns five values: False if a pose is not determined, otherwise True; the inverse of the remaining block of each pose
     (N, 3, 3); its products with the block of the next pose (N, 3, 3), and with the block of parameters and gradient (N, 3, P + 1);
@@ -123,7 +123,7 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """Solve for one damped step. The diagonal of the information matrix is multiplied by ``1 + damping``.
+    """Solve the equations ``system`` for one damped step. The diagonal of the information is multiplied by ``1 + damping``.
 
     Returns True if the poses are determined, the step of the poses (N, 3), and the step of the parameters (P,). The steps are zero
     if the first value is False. Raises LinAlgError if the parameters are not determined.
@@ -151,7 +151,7 @@ def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
 
 @compiled
 def covariances(system: System) -> tuple[bool, Array, Array]:
-    """The marginal covariances. Returns True if the poses are determined, the covariances of the poses (N, 3, 3), and the
+    """Invert the equations ``system``. Returns True if the poses are determined, the covariances of the poses (N, 3, 3), and the
     covariance of the parameters (P, P). Raises LinAlgError if the parameters are not determined."""
     solvable, out, by_next, by_side, left = _eliminated(system, 0.0)
     shared = len(left) - 1

@@ -69,32 +69,32 @@ def leaving_key(index: int) -> int:
 
 
 def is_point(key: int) -> bool:
-    """True if the variable is a point in space."""
+    """True if ``key`` is the key of a point in space."""
     return key >> _CHARACTER == _POINT
 
 
 def is_landmark(key: int) -> bool:
-    """True if the variable is a landmark."""
+    """True if ``key`` is the key of a landmark."""
     return key >> _CHARACTER == _LANDMARK
 
 
 def is_pose(key: int) -> bool:
-    """True if the variable is a pose."""
+    """True if ``key`` is the key of a pose."""
     return key >> _CHARACTER == _POSE
 
 
 def is_place(key: int) -> bool:
-    """True if the first two components of the variable are a position (x, y) in the world frame."""
+    """True if the first two components of the variable ``key`` are a position (x, y) in the world frame."""
     return key >> _CHARACTER in (_POSE, _POINT, _LANDMARK)
 
 
 def is_of_keyframe(key: int) -> bool:
-    """True if the variable is a pose or a tilt. A fixed-lag smoother removes these together with their keyframe."""
+    """True if ``key`` is the key of a pose or a tilt. A fixed-lag smoother removes these together with their keyframe."""
     return key >> _CHARACTER in (_POSE, _TILT)
 
 
 def is_constant(key: int) -> bool:
-    """True if the variable is a landmark or a vector of sensor constants. A smoother never removes these."""
+    """True if ``key`` is the key of a landmark or of a vector of sensor constants. A smoother never removes these."""
     return not is_of_keyframe(key) and not is_point(key)
 
 
@@ -190,7 +190,7 @@ def jacobian_factors(
 
 
 def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:
-    """A linear factor from the whitened ``residual`` (m,) and a Jacobian (m, d) for each of its variables."""
+    """A linear factor on the variables ``keys``, from the whitened ``residual`` (m,) and a Jacobian (m, d) for each variable."""
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)
@@ -269,7 +269,7 @@ def _zeros(size: int) -> Array:
 
 
 def retract(key: int, value: Array, step: Array) -> Array:
-    """The value of a variable after a step in its tangent space: a body-frame twist of a pose, or a change of a vector."""
+    """The value of the variable ``key`` after a step in its tangent space: a body-frame twist of a pose, a change of a vector."""
     return se2.moved(value, step) if is_pose(key) else value + step
 
 
@@ -301,7 +301,7 @@ def to_gtsam(values: Values) -> gtsam.Values:
 
 
 def read(solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, key: int) -> Array:
-    """The solver's estimate of a variable: a pose (3,) or a vector (P,)."""
+    """The solver's estimate of the variable ``key``: a pose (3,) or a vector (P,)."""
     if is_pose(key):
         return pose_array(solver.calculateEstimatePose2(key))
     return np.asarray(solver.calculateEstimateVector(key), dtype=float)

@@ -108,7 +108,7 @@ def descended(
     ``cost_of(state)``: returns the cost.
     ``moved(state, damping)``: returns the state after one damped step, and the largest absolute component of the step. Returns None
     if the step is not determined. ``damping`` is relative to the diagonal of the curvature.
-    ``state``: the initial state.
+    ``state``: the initial state. ``max_iterations``: maximum number of steps.
 
     The problem is solved when a step is at most :data:`CONVERGED_STEP`, or when it reduces the cost by at most the fraction
     :data:`CONVERGED_GAIN`. Returns the state at the minimum, its cost, and the number of iterations.

@@ -266,7 +266,7 @@ class ParticleFilter(Filter):
         return pose, se2.body_to_world_one(pose, body)
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
-        """Move particles by an odometry increment, each with its own constants, and with body-frame ``noise`` (N, 3) if not None.
+        """Move the particles of ``cloud`` by an odometry increment, each with its own constants, and with body-frame ``noise``.
 
         Returns the poses (N, 3), and the transition (3, 3+P) from body-frame perturbation and constants to the pose. Constants are
         linearised at their mean. The effect of a particle's difference from the mean is added to the noise.

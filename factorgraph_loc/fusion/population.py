@@ -192,7 +192,7 @@ class Population:
         return float(self._cloud.weights[near].sum()) < NEGLIGIBLE
 
     def _processed(self, new: WeighedObservation) -> Steps[None]:
-        """Predict the particles to the time of an observation and apply it, in steps."""
+        """Predict the particles to the time of the observation ``new`` and weigh them by it, in steps."""
         odometry, observation = new.odometry, new.observation
         if self._cloud is None or self.newest is None:
             count = int(np.clip(DENSITY * self._volume, FEWEST_AT_FIRST, MOST))
@@ -265,8 +265,8 @@ class Population:
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:
-        """Draw poses (N, 3) without any information from observations. They are around the known start position moved to ``now``,
-        or uniform over free space, or uniform over the bounds as a Latin hypercube."""
+        """Draw ``count`` poses (N, 3) without any information from observations: around the known start position, moved by odometry
+        to ``now``; if there is none, uniform over free space; otherwise uniform over the bounds as a Latin hypercube."""
         if self._start is not None:
             return self._start.drawn(self._rng, count, now)
         if self._space is not None:
@@ -278,12 +278,12 @@ class Population:
 
 
 def _cloud(poses: Array, log_weights: Array) -> Cloud:
-    """Make a cloud of particles that have no sensor constants and may have several modes."""
+    """Make a cloud of particles from poses (N, 3) and log-weights (N,), without constants, and with possibly several modes."""
     return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
 
 
 def _likelihood(observation: Evidence, cloud: Cloud) -> Steps[Array]:
-    """The log-likelihood (N,) of the particles, computed in steps of about equal cost."""
+    """The log-likelihood (N,) of an observation at the particles of ``cloud``, computed in steps of about equal cost."""
     each = PARTICLE + observation.work
     count = max(1, CHUNK // each)
     parts = []

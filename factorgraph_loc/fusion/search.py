@@ -101,6 +101,7 @@ class Search:
 
     def queue(self, observation: Evidence, odometry: ChainState) -> None:
         """Queue an observation that does not come from the search's sensors, such as the free distances of a proximity sensor.
+        ``odometry``: the integrated odometry at its time.
 
         :meth:`advance` then weighs the particles by it. The observation is ignored before the particles have processed their first
         one.
@@ -135,7 +136,7 @@ class Search:
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """True if the particles reject this pose, or have not yet processed the measurement that it came from."""
+        """True if the particles reject the pose ``place`` of a finder, or have not yet processed the measurement it came from."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:

@@ -119,7 +119,7 @@ class Timeline(ABC):
             self._seek_start(m, self._seeking)
 
     def _seek_heading(self, prior: PosePrior, search: Tracking) -> None:
-        """Begin a search for the heading at a known position."""
+        """Begin ``search`` for the heading. ``prior``: the known position, without a heading."""
         self._t, self._seeking = prior.t, search
         search.begin(KnownPosition(prior, self._motion))
 
@@ -163,7 +163,7 @@ class Timeline(ABC):
             self._process(m)
 
     def _remember(self, taken: Taken, span: float) -> None:
-        """Keep a processed measurement, and delete kept ones that are more than ``span`` [s] older."""
+        """Store the processed measurement ``taken``, and delete stored ones that are more than ``span`` [s] older."""
         self._taken.append(taken)
         while self._taken[0].measurement.t < taken.measurement.t - span:
             self._taken.popleft()
@@ -178,7 +178,7 @@ class Timeline(ABC):
         return sorted((taken.measurement for taken in undone), key=lambda m: m.t)
 
     def _go_back(self, taken: Taken) -> None:
-        """Restore the estimator's state from before a measurement."""
+        """Restore the estimator's state from before the measurement ``taken``."""
         return
 
     def _drop_late(self, m: Measurement) -> None:

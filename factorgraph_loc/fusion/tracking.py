@@ -69,7 +69,7 @@ SPARE = 1e-3  # s: a gap exceeds MAX_GAP by at least this much
 
 
 def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
-    """A mask (N,) of the times ``t`` (N,) [s] at which the robot's pose is known: False while the robot was carried."""
+    """A mask (N,) of the times ``t`` (N,) [s] at which the pose is known: False in ``changes``, when the robot was carried."""
     known = np.ones(len(t), dtype=bool)
     for last, first in changes:
         more = 0.5 * max(MAX_GAP + SPARE - (first - last), 0.0)
@@ -201,7 +201,7 @@ class Tracking(Search):
         return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at), FOUND)
 
     def brought(self, best: PosePrior, now: ChainState) -> PosePrior:
-        """Move a pose of the search by odometry to the later time of the odometry state ``now``."""
+        """Move ``best``, a pose of the search, by odometry to the later time of the odometry state ``now``."""
         if best.t >= now.t:
             return best
         since = self._motion.relative(self._motion.state(best.t), now)

@@ -194,8 +194,8 @@ class _ClosedLoop:
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
     def _take(self, reports: Iterator[Measurement]) -> bool:
-        """Process measurements of the robot. Stops and returns True as soon as the robot is localized correctly, otherwise returns
-        False at their end."""
+        """Process the measurements ``reports`` of the robot. Stops and returns True as soon as the robot is localized correctly,
+        otherwise returns False at their end."""
         for report in reports:
             self._feed(report)
             if isinstance(self._estimator, ActiveMcl) and self.robot.metres >= self._proximity_at + READING_DISTANCE:
@@ -279,7 +279,7 @@ class _ClosedLoop:
 
 
 def _rates(simulation: SimulationSettings) -> Iterator[tuple[str, float]]:
-    """Yield the rate [Hz] of each of the robot's sensors, with the name of its setting."""
+    """Yield for each of the robot's sensors the name of the setting of its rate, and the rate [Hz]."""
     yield "rounds_per_second", simulation.rounds_per_second
     for sensor in sensors().values():
         for section in sensor.simulation if sensor.on_robot else ():

@@ -178,8 +178,8 @@ class SimulatedRobot:
                 yield m if kind_of(channel) == channel else replace(m, source=channel)  # type: ignore[type-var]
 
     def _reported_motions(self, path: Array, metres: float) -> Array:
-        """Return the motions (N, 3) of N control periods along a path, as odometry reports them. Each is in the frame of the robot
-        before the motion."""
+        """Return the motions (N, 3) of N control periods along at most ``metres`` [m] of a path, as odometry reports them. Each is
+        in the frame of the robot before the motion."""
         twists = se2.log(se2.between(path[:-1], path[1:]))
         lengths = np.hypot(twists[:, 0], twists[:, 1])
         seconds = np.maximum(lengths / self._settings.speed, np.abs(twists[:, 2]) / self._settings.turn_rate)

@@ -34,12 +34,12 @@ def wood(rng: np.random.Generator) -> Colour:
 
 
 def filled(height: int, width: int, colour: Colour) -> Canvas:
-    """Return a picture (H, W, 3) of one colour."""
+    """Return a picture of one colour, with ``height`` and ``width`` in texels (pixels of a texture)."""
     return np.full((height, width, 3), colour, dtype=np.uint8)
 
 
 def clouds(rng: np.random.Generator, height: int, width: int, cell: float) -> NDArray[np.float32]:
-    """Return smooth noise (H, W) with a standard deviation of about 1 and a correlation length of about ``cell`` texels."""
+    """Return smooth noise (height, width) with a standard deviation of about 1 and a correlation length of ``cell`` texels."""
     coarse = rng.standard_normal((2 + int(height / cell), 2 + int(width / cell))).astype(np.float32)
     return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
 
@@ -62,7 +62,7 @@ def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, int], size: int, colour: Colour) -> None:
-    """Draw lines of random letters in ``box`` (x1, y1, x2, y2). A letter has 5 x 3 dots of ``size`` texels."""
+    """Draw lines of random letters on ``canvas``, in ``box`` (x1, y1, x2, y2). A letter has 5 x 3 dots of ``size`` texels."""
     x1, y1, x2, y2 = box
     letters, lines = (x2 - x1) // (4 * size), (y2 - y1) // (8 * size)
     for line in range(lines):

@@ -25,7 +25,8 @@ TILE = 0.6  # m: size of the tiles of floor and ceiling
 
 
 def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, windows: bool) -> Canvas:
-    """Return the texture of a painted wall with objects, most of them at eye level. ``windows``: some objects are windows."""
+    """Return the texture of a painted wall with objects, most of them at eye level. ``height``, ``width``: the size in texels
+    (pixels of a texture). ``texel`` [m]: the size of a texel. ``windows``: True if some objects are windows."""
     out = _painted(rng, height, width, texel)
     tall = height * texel
     x = rng.uniform(*GAP)
@@ -127,7 +128,7 @@ def _painted(rng: np.random.Generator, height: int, width: int, texel: float) ->
 
 
 def _hang(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
-    """Paste ``picture`` at texel (x, y), with a shadow to the right and below."""
+    """Paste ``picture`` on ``canvas`` at texel (x, y), with a shadow to the right and below."""
     height, width = picture.shape[:2]
     shadow = canvas[y + 3 : y + height + 3, x + 3 : x + width + 3]
     shadow[:] = (shadow * 0.7).astype(np.uint8)
@@ -135,7 +136,7 @@ def _hang(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def _low(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
-    """Draw sideboards and low shelves at the foot of a wall."""
+    """Draw sideboards and low shelves at the foot of a wall with the texture ``canvas``. ``texel`` [m]: the size of a texel."""
     height, width = canvas.shape[:2]
     x = rng.uniform(0.0, 1.0)
     while x < width * texel - 0.4:

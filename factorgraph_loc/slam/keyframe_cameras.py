@@ -228,7 +228,7 @@ class KeyframeCameras:
         self.anchored: dict[int, bool] = {}
 
     def add(self, keyframe: Keyframe, graph: Graph) -> None:
-        """Add a new keyframe, while ``graph`` still stores the odometry at its time."""
+        """Store the data of a new keyframe. Call this while ``graph`` still stores the odometry at its time."""
         if self._offset is not None:
             self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 
@@ -249,7 +249,8 @@ class KeyframeCameras:
         return self._moved(keyframe, guess, graph, 1.0)
 
     def at_stamp(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return the pose at the stamp of the image, from the pose ``guess`` at the time when the image was taken."""
+        """Return the pose at the stamp of the image, from the pose ``guess`` at the time when the image was taken. ``keyframe``:
+        the number of the image's keyframe."""
         return self._moved(keyframe, guess, graph, -1.0)
 
     def pose(self, keyframe: int, graph: Graph) -> Array:

@@ -187,8 +187,8 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
 
 
 def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> PointMap:
-    """Return the ``old`` points with the indices ``rows`` at their newest positions. The camera positions of their views are
-    shifted by the same amount."""
+    """Return the ``old`` points with the indices ``rows`` at their newest positions, which ``current(key)`` returns. The camera
+    positions of their views are shifted by the same amount."""
     points = old.points.chosen(rows)
     positions = np.array([current(old.keys[i]) for i in rows.tolist()])
     return replace(points, positions=positions, seen_from=points.seen_from + positions - points.positions)

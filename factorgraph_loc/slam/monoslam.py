@@ -313,7 +313,8 @@ class Monoslam(Filter):
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
-        """Return the state of a robot with the relocalized ``camera``. Returns None if this robot would not stand on the floor."""
+        """Return the state of a robot with the relocalized ``camera``, with the constants of ``lost_state``. Returns None if this
+        robot would not stand on the floor."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))

@@ -145,7 +145,7 @@ def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: A
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
-    """Return ``step`` followed by the return of height, roll and pitch towards zero, for a robot on a floor and small tilts.
+    """Return ``step`` with height, roll and pitch then drawn back towards zero, for a robot on a floor and small tilts.
 
     Height, roll and pitch follow a stationary process about zero and have no velocity. ``height_sigma`` [m] and ``tilt_sigma``
     [rad] are its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: the duration of ``step``.
@@ -193,7 +193,7 @@ def tilt_of(robot: RobotState) -> Array:
 
 
 def exp(turn: Array) -> Array:
-    """The rotation (3, 3) of a rotation vector (3,)."""
+    """The rotation (3, 3) of the rotation vector ``turn`` (3,) [rad]."""
     return np.asarray(gtsam.Rot3.Expmap(turn).matrix())
 
 

@@ -114,7 +114,7 @@ class SlamState:
         return replace(self, covariance=covariance)
 
     def moved(self, step: Step) -> SlamState:
-        """Return the state after a prediction. The points do not move."""
+        """Return the state after the prediction ``step``. The points do not move."""
         return replace(self, robot=step.robot, covariance=step.carried(self.covariance))
 
 
@@ -200,7 +200,7 @@ class Eye:
         return Eye(model, lift(model))
 
     def pose(self, robot: RobotState) -> tuple[Array, Array]:
-        """Return position (3,) and rotation (3, 3) of the camera in the world frame."""
+        """Return position (3,) and rotation (3, 3) of the camera on ``robot``, in the world frame."""
         return mounted(self.model, robot.position, robot.rotation)
 
     def predicted(self, state: SlamState) -> CameraPose:
@@ -208,8 +208,8 @@ class Eye:
         return CameraPose(*self.pose(state.robot), self.lift @ state.covariance[:POSE, :POSE] @ self.lift.T)
 
     def known(self, robot: RobotState, points: Array, covariances: Array | None) -> Sights:
-        """Return the predicted pixels of map points with positions ``points`` (K, 3) and ``covariances`` (K, 3, 3). None means
-        exact positions."""
+        """Return the predicted pixels of map points at the state ``robot``. ``points`` (K, 3), ``covariances`` (K, 3, 3): their
+        positions and the covariances of these; None means exact positions."""
         position, rotation = self.pose(robot)
         pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]
@@ -291,8 +291,8 @@ class Innovation:
         return positive.root(self.total(noise))
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
-        """Return the Cholesky factor L (2K, 2K) of the innovation covariance, and L^-1 times ``carried`` transposed. The gain of
-        the update is the transpose of the latter times L^-1."""
+        """Return L, the Cholesky factor (2K, 2K) of the innovation covariance with ``noise`` (K, 2, 2), and M, which is L^-1 times
+        the transpose of ``carried``. The gain of the update is the transpose of M times L^-1."""
         root = self.root(noise)
         return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
 

@@ -70,7 +70,8 @@ class KeyframeCamera:
 
     @classmethod
     def of(cls, model: CameraModel, pose: Array, slack: float, tilt: Array = UPRIGHT) -> KeyframeCamera:
-        """Return the camera pose of a robot at the planar ``pose`` (3,) with ``tilt`` (2,), its roll and pitch [rad]."""
+        """Return the camera pose of a robot at the planar ``pose`` (3,) with ``tilt`` (2,), its roll and pitch [rad]. ``slack``
+        [px]: the pixel error that the uncertainty of the pose causes."""
         return cls(*reprojection.camera_pose(model, pose, tilt), slack)
 
 
@@ -98,7 +99,7 @@ class NewPoints:
         self.waiting: dict[Hashable, list[PointSighting]] = {}
 
     def count(self, name: Hashable) -> int:
-        """Return the number of collected sightings of a point."""
+        """Return the number of collected sightings of the point ``name``."""
         return len(self.waiting.get(name, ()))
 
     def add(self, name: Hashable, sighting: PointSighting) -> None:

@@ -136,7 +136,8 @@ class UnknownPoints(Mapper):
     def _observe_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
-        """Add the observations of points of the graph. Returns the pose ``guess``, corrected by these points, and their number.
+        """Add the observations of points of the graph among the sightings ``chosen``. Returns the pose ``guess``, corrected by
+        these points, and their number.
 
         ``certain``: the rows whose points were recognized by a loop closure.
         """
@@ -303,7 +304,8 @@ class UnknownPoints(Mapper):
         return self._views.settled(points, tuple(keys.values()), values, covariances)
 
     def _add_tilt(self, image: _NewImage, tilt: Array, sigma: float) -> None:
-        """Add the robot's ``tilt`` (2,) at a new keyframe as a variable with prior zero and standard deviation ``sigma`` [rad]."""
+        """Add the robot's ``tilt`` (2,) at the keyframe of ``image`` as a variable, with a prior of mean zero and standard
+        deviation ``sigma`` [rad]."""
         keyframe, graph = image.keyframe, image.graph
         key = tilt_key(keyframe.index)
         if key in graph.values:
@@ -316,8 +318,8 @@ class UnknownPoints(Mapper):
     def _corrected(
         self, image: _NewImage, points: list[_Point], pixels: Array, guess: Guess, known: Truths
     ) -> tuple[Guess, Array, float, Truths]:
-        """Correct the pose ``guess`` by observed ``points`` of the graph. Returns pose, tilt (2,) of the robot, prior standard
-        deviation of the tilt, and a mask of the inliers.
+        """Correct the pose ``guess`` by ``points`` of the graph that are observed at ``pixels``. Returns pose, tilt (2,) of the
+        robot, prior standard deviation of the tilt, and a mask of the inliers.
 
         Recent points and old points are tested separately, because the track has drifted since the old ones. A few points cannot
         confirm each other. They are used only if they have names, because a wrong feature may agree with an uncertain pose.
@@ -369,7 +371,7 @@ class UnknownPoints(Mapper):
     def _add_observation(
         self, image: _NewImage, name: Hashable, sighting: PointSighting, agrees: bool, pose: Array
     ) -> None:
-        """Add an observation of the point ``name`` of the graph, or count an outlier if ``agrees`` is False."""
+        """Add the observation ``sighting`` of the point ``name`` of the graph, or count an outlier if ``agrees`` is False."""
         point = self._points[name]
         if not agrees:
             self.diagnostics.reject("camera: does not agree with the others")

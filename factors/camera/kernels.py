@@ -248,7 +248,8 @@ def project_planar(
 
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
-    """The pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobian (K, 2, WIDTH)."""
+    """The pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobian (K, 2, WIDTH).
+    ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
     for i in range(len(points)):

@@ -75,7 +75,8 @@ class PointFactor:
 
 
 def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
-    """The weighted residuals (N, 2), their Jacobian (N, 2, WIDTH), and the squared norms (N,) of the unweighted residuals."""
+    """Linearise N factors. Returns the robustly weighted residuals (N, 2), their Jacobian (N, 2, WIDTH), and the squared norms (N,)
+    of the unweighted residuals."""
     first = factors[0]
     model, lens, (_, *constants, _, _) = first.model, first.lens, values[0]
     if constants:
@@ -116,7 +117,7 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """The prior of a world ``point`` (3,) that was estimated from the robot's ``pose`` (3,)."""
+        """The prior of a world ``point`` (3,) that was estimated from the robot's ``pose`` (3,). ``sigma`` [m]: as of the class."""
         return cls(_from_robot(pose, point), sigma)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:

@@ -250,8 +250,8 @@ class OdometryChain:
         return at, body, world
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
-        """The motions between N pairs of states (N, 8) from :meth:`states`. ``constants`` (P,): corrections of the estimated
-        odometry constants. Returns relative poses (N, 3) and covariances (N, 3, 3)."""
+        """The motions from ``starts`` to ``ends``, N states (N, 8) each from :meth:`states`. ``constants`` (P,): corrections of the
+        estimated odometry constants. Returns relative poses (N, 3) and covariances (N, 3, 3)."""
         deltas, covariances = relatives(self._noise, starts, ends, constants, self._indices)
         return deltas, covariances
 
@@ -289,8 +289,8 @@ class OdometryChain:
 
 @compiled
 def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
-    """The integrated state at time ``t``, computed from the last of ``count`` knots (states at the odometry rows) before ``t``. The
-    elements are the fields of :class:`~factors.motion.ChainState`."""
+    """The integrated state at time ``t``, computed from the last of ``count`` knots (states at the odometry rows) before ``t``.
+    ``constants``: the model as an array. The elements of the result are the fields of :class:`~factors.motion.ChainState`."""
     if count == 0:
         return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
     i = np.searchsorted(knots[:count, T], t, side="right") - 1

@@ -31,7 +31,7 @@ _COS, _SIN, LAG, HOLD, _GYRO_BIAS, _USES_GYRO, SLIPPING = range(6, 13)
 
 @compiled
 def copy(row: Array, to: Array) -> None:
-    """Copy a vector (N,) into another."""
+    """Copy the vector ``row`` (N,) into ``to``."""
     for j in range(len(row)):
         to[j] = row[j]
 
@@ -68,7 +68,8 @@ def append(
     """Append velocities to the ``count`` existing rows, integrate them into ``knots`` (the state at each row), and delete old rows.
 
     ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the times.
-    Returns the new count. If the first new row is older than the last existing one, returns -1 and changes nothing.
+    ``constants``: the model as an array. Rows older than ``horizon`` [s] are old. Returns the new count. If the first new row is
+    older than the last existing one, returns -1 and changes nothing.
     """
     if count and t[0] + delay < knots[count - 1, T]:
         return -1
@@ -95,8 +96,9 @@ def insert(
 ) -> int:
     """Insert one row among the ``count`` existing rows, in order of time and after rows of equal time.
 
-    ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`, with the values ``a``, ``b``, ``c``. Old rows are deleted if the
-    new row is the newest. Returns the new count.
+    ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`, with the values ``a``, ``b``, ``c`` and, for an increment, the
+    time ``unknown`` [s] of unknown motion. The states ``knots`` are updated. If the new row is the newest, rows older than
+    ``horizon`` [s] are deleted. Returns the new count.
     """
     i = count
     if count and t < knots[count - 1, T]:

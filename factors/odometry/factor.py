@@ -52,7 +52,7 @@ class OdometryStack:
         linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """Half the sum of the squared residuals."""
+        """Half the sum of the squared residuals at ``poses`` (N, 3) and ``parameters`` of the graph."""
         return float(cost_of_all(poses, self._first, self._steps, self._constants(parameters), self._indices))
 
     def _constants(self, parameters: Array) -> Array:

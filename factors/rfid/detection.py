@@ -255,7 +255,7 @@ class RfidLikelihood:
         return tag_states.displaced(*self._tabled, counts.packed, poses, margin, odds, hypotheses, alpha, parameters)
 
     def log_likelihood(self, poses: Array, counts: TagReadCounts, parameters: Array | None = None) -> Array:
-        """The tempered log-likelihood (N,) of particles at poses (N, 3), from tables (:mod:`factors.rfid.weighing`,
+        """The tempered log-likelihood (N,) of ``counts`` for particles at poses (N, 3), from tables (:mod:`factors.rfid.weighing`,
         :mod:`factors.rfid.places`).
 
         ``parameters`` (N, Q): the parameters of each particle, by default :attr:`parameters`. If particles differ in their
@@ -323,7 +323,7 @@ class RfidLikelihood:
         return alpha * nll, alpha * slope[:, 3:], alpha * curve[:, 3:, 3:]
 
     def expected(self, pose: Array, counts: TagReadCounts, parameters: Array) -> ExpectedReads:
-        """Observed and predicted reads at a pose (3,) with ``parameters`` (Q,), of the tags that are in reach or listed."""
+        """Observed and predicted reads at a pose (3,) with ``parameters`` (Q,), of the tags in reach and of those in ``counts``."""
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:

@@ -163,7 +163,7 @@ def delayed(poses: Array, twists: Array, delays: Array) -> Array:
 
 @compiled
 def union(first: Integers, second: Integers) -> Integers:
-    """The union of two ascending arrays of numbers, ascending and without duplicates."""
+    """The union of the ascending arrays ``first`` and ``second``, ascending and without duplicates."""
     out = np.empty(len(first) + len(second), np.int64)
     i = j = count = 0
     while i < len(first) or j < len(second):

@@ -63,7 +63,7 @@ class TagReads:
         return replace(self, offsets=se2.compose(offset, self.offsets))
 
     def chosen(self, which: NDArray[np.bool_] | Integers) -> Self:
-        """The reads that a mask (R,) or indices select."""
+        """The reads that the mask (R,) or indices ``which`` select."""
         return type(self)(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
@@ -248,7 +248,7 @@ def mounting(antennas: Sequence[Antenna]) -> Array:
 
 
 def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: RssiReads) -> Array:
-    """The :data:`FEATURES` (R, 6) of each read for a robot at ``pose`` (3,), to fit the coefficients."""
+    """The :data:`FEATURES` (R, 6) of each read by ``antennas`` of ``tags`` on a robot at ``pose`` (3,), to fit the coefficients."""
     pose, rows = np.asarray(pose, dtype=float), mounting(antennas)
     return _all_features(rows, tags.points, tags.normals, pose, reads.offsets, reads.antennas, reads.tags)
 
@@ -301,7 +301,7 @@ def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tupl
 @compiled
 def _add_group(psi: Array, by: Array, offset: float, gradient: Array, information: Array) -> None:
     """Add the contribution of one group of reads to ``gradient`` (3,) and ``information`` (3, 3), for a concentration kappa of 1.
-    ``offset``: the common phase arg S in the formula of the module."""
+    ``psi``: the phase errors of the reads. ``by`` (..., 3): their derivatives by the pose. ``offset``: their common phase."""
     total, mean = 0.0, np.zeros(3)
     for r in range(len(psi)):
         sine, weight = math.sin(psi[r] - offset), max(math.cos(psi[r] - offset), 0.0)
@@ -320,7 +320,7 @@ def _add_group(psi: Array, by: Array, offset: float, gradient: Array, informatio
 
 @compiled(inline="always")
 def _mounted(antenna: Array, offset: Array) -> tuple[float, float, float, float]:
-    """An antenna's x, y and the horizontal part (x, y) of its boresight, in the frame of the reference pose."""
+    """An antenna's x, y and horizontal boresight (x, y) in the reference frame, in which the robot is at ``offset`` (3,)."""
     x, y = _on_robot(offset, antenna[0], antenna[1])
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return x, y, c * antenna[3] - s * antenna[4], s * antenna[3] + c * antenna[4]

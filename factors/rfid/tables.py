@@ -128,7 +128,7 @@ def _blocks(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
 
 @compiled
 def logit_row(z: float) -> int:
-    """The index of a logit in ``sigmoids`` of :class:`Tables`."""
+    """The index of the logit ``z`` in ``sigmoids`` of :class:`Tables`."""
     return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
 
 
@@ -159,7 +159,8 @@ def _fill_level(planes: Array, packed: Packed, model: int, height: float, table:
 
 @compiled
 def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray[np.uint16]) -> None:
-    """Compute a ``table`` of any model, for tags at ``height`` [m] above the antenna."""
+    """Compute a ``table`` of any model, for tags at ``height`` [m] above the antenna. ``half``: the number of cells from the middle
+    of the table to its edge."""
     facings = len(table)
     for f in range(facings):
         c = 2.0 * f / (facings - 1) - 1.0 if facings > 1 else 0.0
@@ -173,7 +174,7 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
 def row_of(
     packed: Packed, tables: Tables, antenna: int, level: int, along: float, across: float, height: float, facing: float
 ) -> int:
-    """The index in ``sigmoids`` of the logit of a tag in reach of an antenna.
+    """The index in ``sigmoids`` of :class:`Tables` for the logit of a tag in reach of an antenna.
 
     ``level``: the number of the table. ``along``, ``across``: the tag's position relative to the antenna's heading, divided by the
     range scale of the model. ``height`` [m]: of the tag above the floor. ``facing``: the cosine of the tag's facing.
@@ -250,8 +251,8 @@ def relevant(
 
 @compiled
 def _largest(tables: Tables, level: int, along: float, across: float, radius: float) -> float:
-    """An upper bound of the sigmoids of a table within ``radius`` [m] of a position. Beyond its edge a table continues with the
-    values at the edge."""
+    """An upper bound of the sigmoids of the table ``level`` within ``radius`` [m] of the position (``along``, ``across``). Beyond
+    its edge a table continues with the values at the edge."""
     half, largest = tables.half[level], 0.0
     last, reach = 2 * half, radius / CELL + 1.0
     i, j, count = along / CELL + half, across / CELL + half, 2 * half // COARSE + 1
@@ -263,5 +264,5 @@ def _largest(tables: Tables, level: int, along: float, across: float, radius: fl
 
 @compiled(inline="always")
 def _block(place: float, last: int) -> int:
-    """The number of the block of a cell, which is clipped to the range from 0 to ``last``."""
+    """The number of the block that contains the cell ``place``, clipped to the range from 0 to ``last``."""
     return int(min(max(place, 0.0), last)) // COARSE

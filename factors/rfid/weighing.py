@@ -240,8 +240,8 @@ def _chances(
     normal: Array,
     chance: Array,
 ) -> None:
-    """Write the sigmoids of the logits of one tag for one antenna at N poses into ``chance`` (N,). ``unit`` (N,): the inverse range
-    scale of each pose."""
+    """Write the sigmoids of the logits of one tag for one antenna at N poses into ``chance`` (N,). ``at`` (4, N): the antenna's
+    poses. ``unit`` (N,): the inverse range scale of each. ``level``: the table. ``point``, ``normal``: position and facing."""
     x, y, c, s = at[0], at[1], at[2], at[3]
     tx, ty, height, nx, ny = point[0], point[1], point[2], normal[0], normal[1]
     if packed.kinds[packed.which[antenna]] == LOGISTIC or tables.facings[level] > 1:

@@ -120,7 +120,7 @@ class AtTheEnd:
     extend = attach
 
     def current(self, key: int) -> Array:
-        """The present estimate of a variable that is not a pose."""
+        """The present estimate of the variable ``key``, which must not be a pose."""
         return self._guesses[key]
 
     def is_open(self, keyframe: int) -> bool:

@@ -266,7 +266,7 @@ class Graph:
         return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def between(self, first: Keyframe, last: Keyframe) -> Increment:
-        """The motion between two keyframes, with the estimated constants of the odometry."""
+        """The motion from the keyframe ``first`` to the keyframe ``last``, with the estimated constants of the odometry."""
         return self.recalibrated(self.motion.relative(first.odometry, last.odometry))
 
     @property
@@ -384,7 +384,7 @@ class Graph:
         return f"the measurements do not determine {self._named(key)}"
 
     def _named(self, key: int) -> str:
-        """The description of a variable for users."""
+        """The description of the variable ``key``, for messages."""
         if is_of_keyframe(key):
             return f"the {'pose' if is_pose(key) else 'tilt'} at {self.keyframes[index_of(key)].t:.3f} s"
         if is_point(key):

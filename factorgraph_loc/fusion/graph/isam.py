@@ -116,7 +116,7 @@ class Incremental:
         self._start_again(newest, summary)
 
     def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
-        """Accept a new keyframe with new factors and variables. ``guess``: the predicted pose of the keyframe, and its
+        """Add a new keyframe with the factors and variables of ``addition``. ``guess``: the predicted pose of the keyframe, and its
         covariance."""
         keyframe.causal = guess
         addition.nodes.insert(0, self._odometry_node(keyframe))
@@ -127,8 +127,8 @@ class Incremental:
             self._update(addition)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Accept new factors and variables on an existing keyframe. ``guess``: its pose corrected by the factors, with covariance,
-        or None if ``keyframe`` is not the newest."""
+        """Add the factors and variables of ``addition`` on an existing keyframe. ``guess``: its pose corrected by the factors, with
+        covariance, or None if ``keyframe`` is not the newest."""
         if guess is None or not (self._waits or keyframe.t < self._solved + self._solve_every):
             self._update(addition)
             return
@@ -138,13 +138,14 @@ class Incremental:
         self._wait(addition, guess)
 
     def _wait(self, addition: Addition, guess: Guess) -> None:
-        """Store new factors and variables for the next update of the solver. Until then the newest pose is ``guess``."""
+        """Store the factors and variables of ``addition`` for the next update of the solver. Until then the newest pose is
+        ``guess``."""
         self._waiting.nodes += addition.nodes
         self._waiting.values |= addition.values
         self._graph.pose, self._graph.covariance = guess
 
     def current(self, key: int) -> Array:
-        """The present estimate of a variable in the solver."""
+        """The solver's present estimate of the variable ``key``."""
         return self._solver.value(key)
 
     def is_open(self, keyframe: int) -> bool:
@@ -156,7 +157,7 @@ class Incremental:
         return self._is_whole or self.is_open(keyframe)
 
     def _update(self, addition: Addition) -> None:
-        """Update the solver with new and waiting factors. After a failure a new solver is built."""
+        """Update the solver with the factors of ``addition`` and the waiting factors. After a failure a new solver is built."""
         newest, nodes, values = self._graph.newest, addition.nodes, addition.values
         if self._waiting.nodes or self._waiting.values:
             nodes, values = self._waiting.nodes + nodes, self._waiting.values | values
@@ -193,15 +194,15 @@ class Incremental:
                 graph.values[key] = self._value(key)
 
     def _value(self, key: int) -> Array:
-        """The solver's estimate of a variable. Raises IndeterminateError if it is not finite."""
+        """The solver's estimate of the variable ``key``. Raises IndeterminateError if it is not finite."""
         value = self._solver.value(key)
         if not all(map(math.isfinite, value.tolist())):
             raise IndeterminateError(key)
         return value
 
     def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
-        """The estimate and covariance of a variable. ``known``: the covariance if it is already computed. ``graph``: the copy of
-        the graph in whose diagnostics a damping of the covariance is reported; by default the graph itself."""
+        """The estimate and covariance of the variable ``key``. ``known``: the covariance if it is already computed. ``graph``: the
+        copy of the graph in whose diagnostics a damping of the covariance is reported; by default the graph itself."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if known is None else known
@@ -218,8 +219,8 @@ class Incremental:
     def _leave(self, window: Window, now: float, new: Collection[int]) -> None:
         """Store the final estimates of keyframes that are older than the lag, before the next update marginalises them.
 
-        ``now`` [s]: the time of the newest keyframe. ``new``: keys of variables that are not yet in the solver. The estimates of
-        all constants and landmarks in the solver are stored too.
+        ``window``: the solver. ``now`` [s]: the time of the newest keyframe. ``new``: keys of variables that are not yet in the
+        solver. The estimates of all constants and landmarks in the solver are stored too.
         """
         assert self._lag is not None
         graph, oldest = self._graph, self._graph.keyframes[self._oldest]
@@ -265,7 +266,7 @@ class Incremental:
             del self._graph.values[key], self._graph.covariances[key]
 
     def _start_again(self, newest: Keyframe, summary: MarginalSummary | None, *, failed: bool = False) -> None:
-        """Build a new solver from the graph.
+        """Build a new solver from the graph, whose last keyframe is ``newest``.
 
         ``summary``: the information of variables that have left the window. The new solver begins with this summary, and with all
         measurements that are not part of it. If it is None, the solver begins with the priors. ``failed``: True if the previous

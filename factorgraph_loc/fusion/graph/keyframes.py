@@ -156,8 +156,9 @@ class Builder:
     def _gather_from(
         self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None, guess: Guess
     ) -> None:
-        """Correct the newest pose by a measurement of a sensor whose observations are collected until :meth:`gather`. ``guess``:
-        the newest pose and its covariance. ``offset``: the motion from this pose to the measurement, or None."""
+        """Correct the newest pose by a measurement of a sensor whose observations are collected until :meth:`gather`. ``odometry``:
+        the integrated odometry at its time. ``offset``: the motion from the newest pose to this time, or None. ``guess``: the
+        newest pose and its covariance."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
@@ -172,8 +173,9 @@ class Builder:
     def _observe(
         self, sensor: Sensor, m: Measurement, view: _KeyframeView, odometry: ChainState, addition: Addition | None
     ) -> bool:
-        """Convert a measurement to observations, and add these to ``addition``, or collect them if ``addition`` is None. On the
-        newest keyframe, each observation also corrects the pose in ``view``. Returns True if any observation was accepted."""
+        """Convert a measurement of ``sensor`` to observations, and add these to ``addition``, or collect them if ``addition`` is
+        None. ``odometry``: the integrated odometry at its time. On the newest keyframe, each observation also corrects the pose in
+        ``view``. Returns True if any observation was accepted."""
         applied = False
         for observation in sensor.observe(m, view):
             if isinstance(observation, Link):
@@ -228,8 +230,9 @@ class Builder:
     ) -> Guess | None:
         """Convert a measurement to factors of ``keyframe``. Returns the pose and covariance of the keyframe, corrected by them.
 
-        ``guess``: the predicted pose and covariance if ``keyframe`` is the newest keyframe, otherwise None. For an older keyframe,
-        innovations are relative to its causal estimate, and None is returned. ``addition``: gets the factors.
+        ``odometry``: the integrated odometry at the time of the measurement. ``offset``: the motion from the keyframe to this time,
+        or None. ``guess``: the predicted pose and covariance if ``keyframe`` is the newest keyframe, otherwise None. For an older
+        keyframe, innovations are relative to its causal estimate, and None is returned. ``addition``: gets the factors.
         """
         graph, sensor = self._graph, self._graph.sensors[m.source]
         expected = keyframe.causal if guess is None else guess
@@ -244,8 +247,8 @@ class Builder:
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
-        """Add a link (such as a loop closure) between a keyframe and an earlier keyframe. If the earlier keyframe has left the
-        solver, the link is only part of the final problem."""
+        """Add a link of ``sensor`` (such as a loop closure) between a keyframe and an earlier one to ``addition``. If the earlier
+        keyframe has left the solver, the link is only part of the final problem."""
         earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
@@ -253,8 +256,8 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add a landmark to the graph, with its earlier observations or with its prior. If the poses of most observations have left
-        the graph, the present estimate of the landmark is used as its prior."""
+        """Add the landmark ``new`` to ``addition``, with its earlier observations by ``sensor`` or with its prior. If the poses of
+        most observations have left the graph, the present estimate of the landmark is used as its prior."""
         graph = self._graph
         key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean

@@ -113,7 +113,8 @@ def _solved(
 
 
 def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
-    """The graph with a prior on each variable, whose information is ``damping`` times the diagonal of the graph's information."""
+    """The graph with a prior on each variable, whose information is ``damping`` times the diagonal of the graph's information.
+    ``sizes``: the number of components of each variable by key."""
     keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
     ends = np.cumsum([sizes[key] for key in keys])
     # the last column is the right side of the equations

@@ -69,8 +69,8 @@ class FullHistory:
         self._touched: Collection[int] = ()  # the keys of variables in the last update
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        """Add factors and new variables, and solve. ``values``: initial values of the new variables. ``t`` [s]: the time of new
-        poses."""
+        """Add the factors ``nodes`` and new variables, and solve. ``values``: initial values of the new variables. ``t`` [s]: the
+        time of new poses."""
         self.begin((), nodes, values, {})
         self._touched = {key for node in nodes for key in node.keys}
 
@@ -98,14 +98,14 @@ class FullHistory:
         return None
 
     def value(self, key: int) -> Array:
-        """The present estimate of a variable."""
+        """The present estimate of the variable ``key``."""
         if key not in self._touched:
             return read(self._isam, key)
         step = np.linalg.solve(*self._isam.marginalFactor(key).jacobian())
         return retract(key, self._ours.at[key], np.asarray(step, dtype=float))
 
     def covariance(self, key: int) -> Array:
-        """The marginal covariance of a variable. The covariance of a pose is in the body frame."""
+        """The marginal covariance of the variable ``key``. The covariance of a pose is in the body frame."""
         return np.asarray(self._solver.marginalCovariance(key))
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
@@ -181,8 +181,8 @@ class Window(FullHistory):
         return read(self._solver, key)
 
     def covariances(self, keys: Sequence[int]) -> dict[int, Array]:
-        """The marginal covariances of several variables by key, from one elimination of the window. Empty if the elimination fails,
-        or if a variable has left."""
+        """The marginal covariances of the variables ``keys``, by key, from one elimination of the window. Empty if the elimination
+        fails, or if a variable has left."""
         order = gtsam.Ordering()
         for key in keys:
             order.push_back(key)
@@ -301,7 +301,7 @@ class LinearFactors:
             self._slots.add(linear.slot)
 
     def forget(self, key: int) -> None:
-        """Delete the stored data of a variable and of all factors on it. Call this after the variable has left the solver."""
+        """Delete the stored data of the variable ``key`` and of all factors on it. Call this after it has left the solver."""
         del self.at[key]
         self._held.pop(key, None)
         for linear in self._on.pop(key, {}).values():
@@ -321,7 +321,7 @@ class LinearFactors:
         return frozenset(self._slots)
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
-        """The factors that the next update must replace, because a linearisation point of their variables changes."""
+        """The factors that the next update of ``solver`` must replace, because a linearisation point of their variables changes."""
         keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
         change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
         moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]
