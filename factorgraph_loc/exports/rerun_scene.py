@@ -241,7 +241,7 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
 def _carried(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
     """Return the entity path of the drawn camera, and the trajectory of its robot, or None.
 
-    The trajectory is that of the first run that has one, else the reference.
+    The robot is the robot of the first run that has a trajectory. If no run has one, its trajectory is the reference.
     """
     for run in runs:
         if len(run.played()):

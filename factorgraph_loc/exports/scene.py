@@ -22,7 +22,8 @@ REFERENCE, DARK, DETECTION, SIGHTING = (128, 128, 128), (160, 160, 160), (230, 1
 
 @dataclass(frozen=True)
 class Lights:
-    """The objects of a map that are highlighted over time. From ``t[i]`` [s] on, they are those with the names ``names[i]``."""
+    """The objects of a map that are highlighted over time. The objects ``names[i]`` are highlighted from ``t[i]`` to ``t[i + 1]``
+    [s]."""
 
     t: Array
     names: tuple[tuple[str, ...], ...]

@@ -196,7 +196,7 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
         out.tables["reference"] = reference
         if reference not in truths:
             out.remarks.append(
-                f"{reference.name} is used as the reference: remove it if it is an estimate, not the truth"
+                f"{reference.name} is used as the reference: remove [options.reference] if it is an estimate, not the truth"
             )
     return out
 

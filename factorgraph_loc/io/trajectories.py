@@ -74,9 +74,9 @@ def _reference(log: str) -> PosePath:
 def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
     """Write a trajectory in TUM format, or in KITTI format if ``path`` ends with .kitti. Returns the written files.
 
-    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. In KITTI format, times [s] are written to ``NAME.times.txt``;
-    those of a planar trajectory are relative to its t = 0. Poses in KITTI format are those of the robot (x forward, z up), not of a
-    camera, and not relative to the first pose.
+    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. In KITTI format, times [s] are written to ``NAME.times.txt``.
+    The times of a planar trajectory are written relative to its t = 0. A pose in KITTI format is the pose of the robot (x forward,
+    z up), not of a camera, and it is not relative to the first pose.
     """
     path = Path(path)
     if path.suffix != ".kitti":

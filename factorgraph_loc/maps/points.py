@@ -290,7 +290,8 @@ class CommonError:
     def at(self, poses: Array, looking: float = 0.0) -> Array:
         """Return the covariances (N, 3, 3) of the shared error at the ``poses`` (N, 3) of a robot.
 
-        Each is that of the nearest place with a similar view. ``looking``: direction of the camera in the robot frame [rad].
+        It is the shared error at the nearest place with a similar direction of view, moved to the pose as a rigid body.
+        ``looking``: direction of the camera in the robot frame [rad].
         """
         ahead = poses[:, 2] + looking
         cosine = np.column_stack((np.cos(ahead), np.sin(ahead))) @ self.directions.T

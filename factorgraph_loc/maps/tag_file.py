@@ -44,7 +44,7 @@ class TagFile(FileModel):
     """The section ``[markers]`` of a world file that refers to a file of apriltag_ros.
 
     ``family``: the family of the tags. ``sigma`` [m]: standard deviation of each coordinate of a tag's position. ``at``: the poses
-    of bundles by name and of standalone tags by number; the frame of a bundle without a pose is that of the map.
+    of bundles by name and of standalone tags by number. If a bundle has no pose, its frame is the frame of the map.
     """
 
     file: str

@@ -59,7 +59,7 @@ class Observation(Protocol):
     def found(self) -> int: ...
     @property
     def work(self) -> int:
-        """The approximate cost of the likelihood of one pose, in units of that of one RFID tag."""
+        """The approximate time to compute the likelihood of one pose, relative to the time for an observation of one RFID tag."""
 
     @property
     def things(self) -> frozenset[Hashable]:

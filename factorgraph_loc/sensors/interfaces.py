@@ -63,8 +63,8 @@ class Use:
 class Ending:
     """The results of a finished run.
 
-    ``diagnostics``: those of the causal estimates. ``final_diagnostics``: those of the ``final`` trajectory, which uses all
-    measurements. ``learnt``: estimated constants and landmarks.
+    ``diagnostics``: diagnostics of the causal estimates. ``final_diagnostics``: diagnostics of the ``final`` trajectory, which uses
+    all measurements. ``learnt``: estimated constants and landmarks.
     """
 
     diagnostics: Diagnostics
@@ -182,7 +182,7 @@ def marks(log: Log) -> list[Marks]:
 class Ride:
     """A simulated drive through a world.
 
-    ``settings``: those of the simulation, with the sections of the sensors. ``rig``: the rig that estimators will use.
+    ``settings``: settings of the simulation, with the sections of the sensors. ``rig``: the rig that estimators will use.
     ``world``: the true world. ``truth``: the true trajectory, from t = 0.
     ``rng``, ``rng_of_world``: return a random generator by name, from the seed of the log or of the world.
     """

@@ -45,7 +45,7 @@ class KnownPosition:
         return self.prior.t
 
     def facing(self, heading: float) -> PosePrior:
-        """Return the start as a Gaussian whose mean has the given ``heading`` [rad]. The heading has the standard deviation pi."""
+        """Return the start as a Gaussian. Its heading has the mean ``heading`` [rad] and the standard deviation pi."""
         covariance = self.prior.covariance.copy()
         covariance[2, 2] = math.pi**2
         return PosePrior(self.t, np.append(self.prior.pose[:2], heading), covariance)

@@ -118,7 +118,7 @@ class Motion(OdometryChain):
         return delta, jacobian
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
-        """Return the increment corrected for ``constants`` (P,)."""
+        """Return the increment after its motion is corrected with the estimated ``constants`` (P,)."""
         if not self.constants.names:
             return increment
         delta = kernels.recalibrated(increment.delta, increment.moving, constants, self._indices)

@@ -155,7 +155,7 @@ def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
 
 
 def parent_of(channel: str) -> str:
-    """Return the channel whose tables have ``channel`` as an optional column, or "" if ``channel`` has its own tables."""
+    """Return the channel whose tables have ``channel`` as an optional column, or "" if ``channel`` has tables itself."""
     known = channels().get(channel)
     return "" if known is None or known.tables else sensor_of(channel).channels[0].name
 

@@ -248,7 +248,9 @@ def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None
     plain = [topic for topic in measured if topic not in positions]
     if plain:
         out.take("reference", plain[:1])
-        out.remarks.append(f"{plain[0].name} is used as the reference: remove it if it is an estimate, not the truth")
+        out.remarks.append(
+            f"{plain[0].name} is used as the reference: remove [options.reference] if it is an estimate, not the truth"
+        )
     robot = tree.robot()
     world = None if robot is None else tree.above(robot, WORLD)
     if not plain and world is not None:

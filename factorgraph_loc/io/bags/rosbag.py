@@ -229,7 +229,7 @@ def read_trajectory(path: Path, topic: str) -> PosePath:
     """Return the trajectory in the ``topic`` of the bag ``path``.
 
     The topic has messages with poses or points. ``/tf:PARENT.CHILD`` gives the poses of the frame CHILD in the frame PARENT.
-    Timestamps are those of headers, or the times of receipt for messages without a header. Raises InputError with the number of
+    A timestamp is the header's timestamp, or the time of receipt if a message has no header. Raises InputError with the number of
     an invalid message.
     """
     name, _, frames = topic.partition(FRAMES)

@@ -303,8 +303,8 @@ class Listeners:
 class Stamper:
     """Chooses the timestamps [ns] of the messages of one topic.
 
-    With the ``clock`` ``header`` they are those of headers, or the times of receipt for messages without a header. With ``receive``
-    they are the times of receipt. For tf, whose headers are nested, use :meth:`choose`.
+    If ``clock`` is ``header``, a timestamp is the header's timestamp, or the time of receipt if a message has no header. If it is
+    ``receive``, a timestamp is the time of receipt. For tf, whose headers are nested, use :meth:`choose`.
     """
 
     def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
@@ -322,7 +322,7 @@ class Stamper:
         return self.choose(as_nanoseconds(item.message.header.stamp, 1), item.received)
 
     def choose(self, in_header: int, received: int) -> int:
-        """Return the timestamp [ns] to use: ``in_header``, that of the header, or ``received``, depending on the clock setting."""
+        """Return ``in_header``, the timestamp of the header, or ``received``, the time of receipt [ns], by the clock setting."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
         return in_header if self.uses_header else received

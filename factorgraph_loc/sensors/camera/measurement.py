@@ -99,7 +99,7 @@ class ImageStream(Stream):
 
 @dataclass(frozen=True)
 class FeatureStream(Stream):
-    """The features of a log's N images. The timestamps of the frames are ignored; those of the stream are used."""
+    """The features of a log's N images. The timestamps ``t`` of the stream are used, not the timestamps of each ``frame``."""
 
     kind: ClassVar[type[Any]] = CameraFrame
     frame: Sequence[CameraFrame]

@@ -217,8 +217,8 @@ SEARCH_INTERVAL = 1.0  # s between unsuccessful searches
 
 @dataclass(frozen=True)
 class _Fix:
-    """The pose (3,) by one image, with body-frame ``covariance`` (3, 3). ``odometry``: the odometry state at the image.
-    ``clear``: True if this image alone is sufficient."""
+    """The ``pose`` (3,) of the robot from one image, with body-frame ``covariance`` (3, 3). ``odometry``: the odometry state at the
+    image. ``clear``: True if this image alone is sufficient to localize the robot."""
 
     odometry: ChainState
     pose: Array
@@ -245,7 +245,7 @@ class PixelFinder:
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
-        """The pose by the last image as the only hypothesis, or () if no image has determined a pose."""
+        """The pose from the last image as the only hypothesis, or () if no image has determined a pose."""
         if not self._fixes:
             return ()
         last = self._fixes[-1]
@@ -308,7 +308,7 @@ class PixelFinder:
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return poses (N, 3) sampled around the pose by the last image."""
+        """Return ``count`` poses (N, 3) that are sampled around the pose from the last image."""
         last = self._fixes[-1]
         body = last.covariance + LEAST
         return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))
@@ -324,7 +324,7 @@ class PixelFinder:
         return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
-        """True if the poses by the last images agree along the odometry."""
+        """True if the poses from the last images agree, after each is moved to the last image by the odometry."""
         if len(self._fixes) < AGREEING:
             return False
         *others, last = self._fixes[-AGREEING:]

@@ -172,7 +172,7 @@ def _calibration(log: Log, images: ImageSummary) -> list[Notice]:
 PAIRS, FEWEST_PAIRS = 12, 5  # largest and smallest number of pairs of consecutive images that are compared
 TURNS = (0.03, 0.6)  # rad; bounds of the robot's rotation between two compared images
 FEATURE, COUNT, FEWEST_MATCHES = "orb", 400, 12
-APART = 0.5  # a warning is given if the downward component of the optical axis differs from that of the rig by more
+APART = 0.5  # a larger difference between the downward components of the optical axis in images and in the rig causes a warning
 
 
 def mounting_problems(log: Log) -> list[Notice]:

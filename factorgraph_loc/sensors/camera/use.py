@@ -85,8 +85,8 @@ class PreparedLog:
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
-    """Return the settings of feature detection. The kind of feature is that of the map's points, otherwise that of the rig's
-    camera.
+    """Return the settings of feature detection. The kind of feature is the kind that the map's points have. If the map has no
+    points, it is the kind in the settings of the rig's camera.
 
     Without a map, features are spread over the image, because most of the strongest features may be on a moving object.
     """
@@ -131,8 +131,8 @@ def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
 
 
 class CameraIntake(Intake):
-    """Detects and tracks features in pushed images. It checks that all descriptors of a kind of feature have the same length,
-    that of the map or of the first frame."""
+    """Detects and tracks features in pushed images. It checks that descriptors have the same length as the descriptors of the map,
+    or, without a map, as the descriptors of the first frame."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         points = world.points

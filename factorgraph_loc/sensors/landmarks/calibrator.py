@@ -36,7 +36,7 @@ SEPARATIONS = 20  # steps of expectation-maximisation
 SMALLEST = 1e-3  # m, rad, m per m; minimum standard deviation
 MIN_SIGHTINGS = 100
 MOST_SIGHTINGS = 12000  # largest number of sightings that are used per log
-# ranges are of the other kind (distance or depth) if the ratio of its errors to those of the given kind is below this
+# the kind of ranges (distance or depth) is changed if the other kind reduces the range errors to less than this fraction
 BETTER_KIND = 0.9
 SIGMAS = ("range_sigma", "range_sigma_relative", "bearing_sigma")
 WINDOW = 10.0  # s; errors of the sightings in different windows are treated as independent

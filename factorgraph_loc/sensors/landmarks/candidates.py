@@ -70,7 +70,7 @@ class Candidate:
     """The sightings of a landmark whose position is not known yet.
 
     Immutable, because filters go back to an earlier state when a measurement is late. ``sightings``: in order of time.
-    ``sources``: for each sighting, an object of the caller, which makes a factor of it once the landmark is located.
+    ``sources``: for each sighting, an object from which the caller makes a factor once the landmark is located.
     ``due``: the number of sightings at which the next attempt to locate the landmark is made."""
 
     sightings: tuple[PartialSighting, ...] = ()
@@ -148,7 +148,7 @@ class _PathSightings:
         self._back = se2.inverse(np.array(forth)[back])  # poses of the robot at the sightings
         # matrices (K, 3, 3) from an error of the path to the error of the pose at a sighting
         self._carried = se2.adjoint(np.array(forth)[back])
-        # covariance (K, K, 3, 3) of the path errors: those of two poses share the error of the path since the later pose
+        # covariance (K, K, 3, 3) of the path errors: the errors of two poses have the error since the later pose in common
         self._common = np.array(covariances)[np.minimum(back[:, None], back)]
         turns = np.array(by_constants)[back]
         self._common += np.einsum("iap,pq,jbq->ijab", turns, uncertainty, turns)

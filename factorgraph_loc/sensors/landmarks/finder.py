@@ -50,7 +50,7 @@ WIDE = 3.0  # m; a hypothesis with a larger standard deviation is not treated as
 REFUTING_LANDMARKS, REFUTING_SHARE, REFUTED = 3, 0.8, 0.5
 
 # an unambiguous hypothesis has at least this weight, explains this many sightings, and has no larger standard deviations than
-# CLEAR_POSITION [m] (or that of a range, if larger) and CLEAR_HEADING [rad]
+# CLEAR_POSITION [m] (or the standard deviation of a range, if larger) and CLEAR_HEADING [rad]
 CLEAR_WEIGHT, CLEAR_SIGHTINGS = 0.99, 4
 CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
 FOUND_HEADING = 0.3  # rad; replaces CLEAR_HEADING if the start position is known
@@ -278,7 +278,7 @@ def _insert(rows: list[Sighting], row: Sighting) -> None:
         rows.sort(key=_time)
         rows[:] = _thinned(rows)
         return
-    # all rows before the last are an interval apart
+    # the times of all rows except the last differ by at least INTERVAL
     if len(rows) > 1 and rows[-1].odometry.t < rows[-2].odometry.t + INTERVAL:
         rows.pop()
     rows.append(row)

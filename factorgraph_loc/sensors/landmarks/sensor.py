@@ -49,7 +49,7 @@ def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
 
 
 SURVEYED_ITERATIONS = 4  # linearisations of an observation with inexactly surveyed landmarks
-WORK = 8  # cost of the likelihood of one landmark at one pose, relative to that of an RFID tag
+WORK = 8  # time to compute the likelihood of one landmark at one pose, relative to the time for an RFID tag
 SMALL = 40  # largest error state whose matrices are inverted by compiled code
 MAX_PENDING = 5  # stored sightings of a new landmark until two of them agree
 

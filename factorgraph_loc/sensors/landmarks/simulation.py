@@ -166,8 +166,8 @@ class LandmarkForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> LandmarkForecast | None:
-    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: those of the simulation. Returns None
-    without a landmark sensor or without landmarks."""
+    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: settings of the simulation. Returns
+    None without a landmark sensor or without landmarks."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     sightings = settings.sightings

@@ -156,7 +156,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
 
 
 def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
-    """Return the median (2,) of a landmark's positions by single sightings, and their robust standard deviation [m]."""
+    """Return the median (2,) of the landmark positions that single sightings imply, and their robust standard deviation [m]."""
     rows = np.isfinite(sightings.bearings)
     direction = sightings.sensors[rows, 2] + sightings.bearings[rows]
     points = sightings.sensors[rows, :2] + sightings.ranges[rows, None] * np.stack(

@@ -59,7 +59,7 @@ class SightingWindow:
         since = [motion.relative(r.odometry, self.now) for r in rows]
         self._forth = np.array([i.delta for i in since])
         self._back = se2.inverse(self._forth)  # pose at each sighting relative to the present pose
-        # matrices (K, 3, 3) from a body-frame perturbation of the present pose to that of the pose at a sighting
+        # matrices (K, 3, 3) from a body-frame perturbation of the present pose to one of the pose at a sighting
         self._carried = se2.adjoint(self._forth)
         self._covariance = np.array([i.covariance for i in since])
         self._drift = self._carried @ self._covariance @ self._carried.transpose(0, 2, 1)

@@ -125,8 +125,8 @@ POSE = ("x", "y", "heading")
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of loops of a log. Raises InputError if the time of an earlier pose is not before that of its row, or
-    if a relative pose is incomplete."""
+    """Return the stream of loops of a log. Raises InputError if the time of an earlier pose is not before the timestamp of its row,
+    or if a relative pose is incomplete."""
     (table,) = rows.values()
     columns = dict(table.numbers)
     if "before_ns" in columns:

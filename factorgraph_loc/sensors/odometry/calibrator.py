@@ -78,8 +78,8 @@ class Windows:
         return chain.states(self.begin), chain.states(self.end)
 
     def errors(self, model: OdometryModel) -> Array:
-        """Return the errors (M, 3) of the odometry over each window, as body-frame perturbations at its end [m, m, rad]: motion
-        of the reference relative to that of the odometry."""
+        """Return the errors (M, 3) of the odometry over each window, as body-frame perturbations at its end [m, m, rad]. The motion
+        of the odometry, composed with the perturbation, equals the motion of the reference."""
         start, end = self.states(model)
         odometry = se2.between(start[:, 1:4], end[:, 1:4])
         return se2.log(se2.between(odometry, self.motion))

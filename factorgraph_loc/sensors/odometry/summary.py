@@ -34,8 +34,8 @@ COVERED = 0.9  # a reference should cover at least this fraction of a log's time
 
 @dataclass(frozen=True)
 class RateMatch:
-    """The comparison of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``: the ratio of
-    its values to those of the first signal."""
+    """The comparison of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``: values of the
+    second signal divided by values of the first signal."""
 
     shift: float
     slope: float

@@ -26,7 +26,7 @@ from factors.se2 import Array
 from factors.update import GATE
 
 DURATION, INTERVAL = 60.0, 0.5  # s; time span of the positions that are aligned, and minimum time between them
-FEWEST, SHARE = 5, 0.8  # a pose is accepted from this many positions, if this fraction is within the gate
+FEWEST, SHARE = 5, 0.8  # a pose needs at least FEWEST positions, and the fraction SHARE of them within the gate
 HEADING = 0.15  # rad; largest standard deviation of a known heading
 WIDENINGS = (64.0, 16.0, 4.0, 1.0, 1.0, 1.0)  # factor of the loss's scale in each iteration
 BEYOND = 2.0  # a position contradicts the track if its squared innovation exceeds this multiple of the gate

@@ -124,8 +124,8 @@ class PositionSettings(SensorSettings):
     """scale of the Geman-McClure loss, in standard deviations"""
 
     def covariance(self, m: Position) -> Array:
-        """Return the covariance (2, 2) [m^2] of a measured position. It is that of the measurement if plausible, otherwise that
-        of ``sigma``."""
+        """Return the covariance (2, 2) [m^2] of a measured position: the covariance in the measurement if it is plausible,
+        otherwise the square of the setting ``sigma`` for x and y."""
         if are_plausible(m.var_x, m.cov_xy, m.var_y):
             return np.array(((m.var_x, m.cov_xy), (m.cov_xy, m.var_y)))
         return self.sigma**2 * np.eye(2)

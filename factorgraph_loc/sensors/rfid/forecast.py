@@ -25,7 +25,7 @@ from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.kernels import FAST
 from factors.se2 import Array
 
-COARSE = 3  # ratio of the size of cells, in position and height, to that of the antennas' tables
+COARSE = 3  # size of cells, in position and height, divided by the size of cells in the antennas' tables
 FACINGS = 24  # number of facing directions of tags
 UNREAD = (
     1e-3  # a tag is out of range if no antenna has a probability of a read that is this much above that of a false read

@@ -318,8 +318,8 @@ def _add(
 def _merged(sums: Array, least: float) -> Array:
     """Merge neighbouring groups until each has ``least`` predicted reads. Returns sums (3, H) of the H merged groups.
 
-    ``sums`` (3, G): as in :class:`ReadGroups`. Merging begins at the last group. First groups that remain with too few
-    predicted reads are merged with the next ones. H is 0 if all groups together have too few.
+    ``sums`` (3, G): as in :class:`ReadGroups`. Merging proceeds from the last group to the first. If the groups at the beginning
+    still have too few predicted reads, they are merged with the next group. H is 0 if all groups together have too few.
     """
     out, count, open_ = np.zeros(sums.shape), 0, 0.0
     for g in range(sums.shape[1] - 1, -1, -1):

@@ -199,7 +199,7 @@ def review(use: Use, ending: Ending) -> Review:
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings about a finished run. ``diagnostics``: those of its causal estimates. ``learnt``: its estimated constants.
+    """Yield warnings about a finished run. ``diagnostics``: of the causal estimates. ``learnt``: the estimated constants.
 
     The warnings state that the estimator does not use RFID, that no tag of the map is read, which tags are probably dead, weak or
     moved (most probable first), and how the estimated models and mountings of the antennas differ from the rig.

@@ -255,8 +255,8 @@ def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) 
 
 
 def _priors_of(phase: PhaseFit, survey: SurveySettings) -> dict[str, tuple[float, float]]:
-    """Return means and standard deviations of changes of survey and lever arm, as estimated by phases, by the names of the
-    changes."""
+    """Return mean and standard deviation of each change of survey and lever arm by its name, such as ``antennas.x``, from a fit to
+    phases."""
     shift = (phase.survey.x - survey.x, phase.survey.y - survey.y, phase.survey.heading - survey.heading)
     names = (*SURVEY, "antennas.x", "antennas.y")
     return dict(zip(names, zip((*shift, *phase.lever_arm), phase.sigmas.tolist(), strict=True), strict=True))

@@ -95,7 +95,7 @@ def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
 
 
 def beam(start: BeamModel) -> Family:
-    """Return the family of beams, with priors around ``start``. The factor ``behind`` is that of ``start``."""
+    """Return the family of beams, with priors around ``start``. The factor ``behind`` is no parameter: it is ``start.behind``."""
     parameters = []
     for name, (low, high) in BEAM.items():
         mean = min(max(getattr(start, name), low), high)

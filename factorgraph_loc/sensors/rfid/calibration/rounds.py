@@ -117,9 +117,9 @@ def overdispersion(
     rounds have as much information as one independent round.
 
     ``hits``, ``count``, ``p`` (M,): reads, rounds, and predicted probability of a read in one round. ``antenna``, ``tag``,
-    ``block`` (M,): indices of antenna, tag and block of time. The overdispersion is the ratio of the variance of the reads of a
-    tag by an antenna in a block to that of independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section
-    4.5). It hardly depends on whether the trajectory was estimated from the same reads.
+    ``block`` (M,): indices of antenna, tag and block of time. The overdispersion is the variance of the number of reads of a
+    tag by an antenna in a block, divided by the variance for independent reads (McCullagh and Nelder, "Generalized linear
+    models", 1989, section 4.5). It hardly depends on whether the trajectory was estimated from the same reads.
     """
     first, cell = cells(np.column_stack((block, tag, antenna)), (1.0, 1.0, 1.0))
     excess, variance = np.bincount(cell, hits - count * p), np.bincount(cell, count * p * (1.0 - p))

@@ -32,7 +32,7 @@ from factors.se2 import Array
 ENOUGH_READS = 1000  # minimum number of reads with a phase
 SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m; shifts of the survey in the coarse search
 HEADINGS = (-0.05, -0.025, 0.0, 0.025, 0.05)  # rad; rotations of the survey in the coarse search
-THINNING = 6  # the coarse search uses one of so many windows
+THINNING = 6  # the coarse search uses every sixth window
 BLOCKS = 8  # number of blocks of windows; each part of the jackknife omits one
 
 
@@ -57,7 +57,7 @@ class PhaseFit:
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
     """Estimate survey and lever arm by the agreement of the phases of all ``logs``, which have the same world.
 
-    ``survey``: initial value. Standard deviations are those of a jackknife over blocks of time, which is robust to correlated
+    ``survey``: initial value. Standard deviations are estimated by a jackknife over blocks of time, which is robust to correlated
     reads. Raises InputError if a log has no reference, or if there are too few reads with a phase near their tags.
     """
     start = survey or SurveySettings()
