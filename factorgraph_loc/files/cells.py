@@ -78,7 +78,7 @@ class Cells:
 
     def nanoseconds(self) -> Integers:
         """Return the timestamps (N,) [ns] of a table of the native format. Raises InputError if one is no whole number."""
-        return self._known(self._nanoseconds())
+        return self._of_one_log(self._known(self._nanoseconds()))
 
     def stamps(self, name: str, offset: float = 0.0) -> Integers:
         """Return the timestamps (N,) [ns] in a field, plus ``offset`` [s].
@@ -86,9 +86,7 @@ class Cells:
         The unit of the field is s, ms, us, ns or iso: a date and time, which is UTC if it has no time zone. Raises InputError for
         other units, invalid cells, and timestamps that are too far apart.
         """
-        out = self._known(self._stamps(name, offset))
-        require_span([(self.path, self.rows, out)])
-        return out
+        return self._of_one_log(self._known(self._stamps(name, offset)))
 
     def usable(
         self, columns: Mapping[str, Column], warnings: list[Notice], *, offset: float = 0.0, more: Sequence[Fault] = ()
@@ -158,6 +156,14 @@ class Cells:
         """Return the timestamps [ns] in the first element of ``stamps``. Raises InputError if the second element has a fault."""
         self.require(stamps[1])
         return stamps[0]
+
+    def _of_one_log(self, t_ns: Integers) -> Integers:
+        """Return the timestamps. Raises InputError if they are too far apart, with the key that skips the outlier."""
+        try:
+            require_span([(self.path, self.rows, t_ns)])
+        except InputError as error:
+            raise InputError(f"{error}{self.rules.skipping if self.rules is not None else ''}") from error
+        return t_ns
 
     def _names(self, name: str, column: Column) -> tuple[list[str], Sequence[Fault]]:
         texts = self.texts(name)

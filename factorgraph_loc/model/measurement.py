@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from itertools import compress, pairwise
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +166,9 @@ class ScanStream(Stream):
             yield self._made(float(self.t[i]) + offset, *values)
 
 
+S = TypeVar("S", bound=Stream)
+
+
 def of_sensor(stream: Stream, name: str) -> Stream:
     """Return the stream with the sensor's ``name`` as its ``source``. If the name has no dot, the stream is returned unchanged,
     because the sensor is then the only one of its kind."""
@@ -177,7 +180,7 @@ def columns_of(stream: Stream) -> dict[str, Any]:
     return {f.name: getattr(stream, f.name) for f in fields(stream) if f.name != "source"}
 
 
-def selected(stream: Stream, keep: NDArray[np.bool_]) -> Stream:
+def selected(stream: S, keep: NDArray[np.bool_]) -> S:
     kept: dict[str, Any] = {
         k: v[keep] if isinstance(v, np.ndarray) else list(compress(v, keep)) for k, v in columns_of(stream).items()
     }

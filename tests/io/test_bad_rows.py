@@ -12,6 +12,7 @@ from rosbag_drive import COUNT, MS, T0, add_imu
 
 from factorgraph_loc import read_log
 from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.sensors.odometry.summary import summarize
 
 SKIP, SORT = 'bad_rows = "skip"\n', 'order = "sort"\n'
 BAD = ["{t},0.5", "{t},0.5,0,7", "{t},fast,0", "{t},,0", "{t},0.5,1e9", "{t},nan,0", "soon,0.5,0", "1e30,0.5,0", "{t}"]
@@ -183,6 +184,29 @@ def test_a_turn_rate_that_jumps(tmp_path):
         "the turn rate of the odometry jumps to -62.3 rad/s at t = 2.000 s, between rows with 0.50 and 0.50 rad/s"
     )
     assert said(log, "skipped_jumps").startswith(expected)
+
+
+@pytest.mark.parametrize("row", [0, 1, 38, 39])
+def test_a_jump_at_an_end(tmp_path, row):
+    rates = np.where(np.arange(40) == row, -60.0, 0.5)
+    log = read_log(write_mapped(tmp_path, VELOCITIES + SKIP, wheels=wheels(rates)))
+    assert log.streams["odometry"].w.tolist() == [0.5] * 39
+
+
+def test_a_gyro_that_jumps(native):
+    rows = "".join(f"{1_000_000_000 + 100_000_000 * i},{70 if i == 5 else 0.25}\n" for i in range(10))
+    (native / "imu.csv").write_text("t_ns,w\n" + rows)
+    (problem,) = [p for p in summarize(read_log(native)).problems if p.kind == "imu_jumps"]
+    assert str(problem).startswith("the turn rate of the gyro jumps to 70.0 rad/s at t = 0.500 s")
+    assert str(problem).endswith('(such rows: 1); bad_rows = "skip" skips them')
+    (native / "run.toml").write_text(SKIP + (native / "run.toml").read_text())
+    assert read_log(native).streams["imu"].w.tolist() == [0.25] * 9
+
+
+def test_a_stamp_of_another_year(tmp_path, refused):
+    text = "t,v,w\n1,0.5,0\n1700000000,0.5,0\n1700000001,0.5,0\n1700000002,0.5,0\n"
+    refused(write_mapped(tmp_path, VELOCITIES, wheels=text), "wheels.csv:2: stamp is", 'bad_rows = "skip"')
+    assert len(read_log(write_mapped(tmp_path, VELOCITIES + SKIP)).streams["odometry"].t) == 3
 
 
 def test_an_increment_that_jumps(tmp_path):

@@ -21,6 +21,7 @@ from factorgraph_loc.io.bags.file import Bag, Stamped
 from factorgraph_loc.io.bags.poses import POSES, PoseTopic, StaticFrames, poses_of_topic
 from factorgraph_loc.io.bags.topics import LIST, TF, Listeners, RowTopic, TopicRows, check_path
 from factorgraph_loc.model.planar import NEGLIGIBLE, Turned, about_z, are_null, null_poses
+from factorgraph_loc.sensors.odometry.jumps import without_jumps
 from factorgraph_loc.sensors.odometry.measurement import YawRateStream
 from factorgraph_loc.sensors.tables import Reading
 from factorgraph_loc.text import Notice, notice, quoted
@@ -168,7 +169,8 @@ class YawRates:
         values = self._rows.values
         keep = self._rows.kept([checks.not_finite(names, values)[i] for i in needed.tolist()], reading.warnings)
         w = about_z(self._rows.source, self._rows.rows[keep], values[keep], turned)
-        return YawRateStream(checks.seconds(self._rows.t_ns[keep], reading.t0_ns), w)
+        stream = YawRateStream(checks.seconds(self._rows.t_ns[keep], reading.t0_ns), w)
+        return without_jumps(stream, self._rows.rules, reading.warnings)
 
 
 def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:

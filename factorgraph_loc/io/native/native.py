@@ -27,7 +27,7 @@ from factorgraph_loc.model.sections import kind_of, layers
 from factorgraph_loc.model.trajectory import Trajectory, write_tum
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.odometry.jumps import without_jumps
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.sensors.registry import channel
 from factorgraph_loc.sensors.tables import Reading, Writing, assemble, disassemble, native_table, native_tables
 from factorgraph_loc.text import Notice, listed, notice
@@ -77,8 +77,9 @@ def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every re
     require_span([(rows.path, rows.rows, rows.t_ns) for rows in tables.values()])
     t0_ns = min(int(rows.t_ns.min()) for rows in tables.values())
     streams = streams_of(tables, Reading(rig, t0_ns, warnings))
-    if isinstance(odometry := streams["odometry"], VelocityStream | IncrementStream):
-        streams["odometry"] = without_jumps(odometry, run, warnings)
+    for name, stream in streams.items():
+        if isinstance(stream, VelocityStream | IncrementStream | YawRateStream):
+            streams[name] = without_jumps(stream, run, warnings)
     return Log(
         name=run.name or path.resolve().name,
         rig=rig,

@@ -25,7 +25,8 @@ from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.planar import Turned, about_z
 from factorgraph_loc.model.sections import several
 from factorgraph_loc.sensors.camera.measurement import make_images
-from factorgraph_loc.sensors.odometry.measurement import IMU
+from factorgraph_loc.sensors.odometry.jumps import without_jumps
+from factorgraph_loc.sensors.odometry.measurement import IMU, YawRateStream
 from factorgraph_loc.sensors.rfid.tables import ROUND_GAP, ReadsByRound, read_rounds
 from factorgraph_loc.sensors.tables import Reading, native_tables
 from factorgraph_loc.text import listed, notice
@@ -125,6 +126,8 @@ def read(path: Path | None, options: Options) -> Log:
         images = folder.file(options.camera.folder)
         streams["camera"] = make_images(tables.pop("camera"), t0_ns, warnings, images)
     streams |= native.streams_of(tables, Reading(DEFAULT_RIG, t0_ns, warnings))
+    if isinstance(gyro := streams.get("imu"), YawRateStream) and options.imu is not None:
+        streams["imu"] = without_jumps(gyro, options.imu, warnings)
     if rounds:
         streams["rfid"] = rounds.stream(t0_ns)
     reference = None

@@ -4,13 +4,13 @@ rows.
 The usual cause is an angle that wraps inside the robot's software.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from factorgraph_loc.files.row_rules import RowRules
 from factorgraph_loc.model.measurement import selected
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, VelocityStream, YawRateStream
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
@@ -18,6 +18,10 @@ from factors.se2 import Array, Integers
 LEAST_TURN, LEAST_SPEED = 6.0, 5.0
 FACTOR = 5.0
 AROUND = (-2, -1, 1, 2)  # neighbours of a row, relative to its number
+
+
+Motion = VelocityStream | IncrementStream | YawRateStream
+M = TypeVar("M", bound=VelocityStream | IncrementStream | YawRateStream)
 
 
 class Jump(NamedTuple):
@@ -35,12 +39,15 @@ class Jump(NamedTuple):
     after: float
 
 
-def jumps(stream: VelocityStream | IncrementStream) -> list[Jump]:
-    """Return the jumps of an odometry stream in order of its rows. In a jump the speed or turn rate differs from that of the
-    two rows before and after by more than a robot can accelerate."""
+def jumps(stream: Motion) -> list[Jump]:
+    """Return the jumps of a stream of odometry or of a gyro in order of its rows. In a jump the speed or turn rate differs from
+    that of the two rows before and after by more than a robot can accelerate.
+    """
     if len(stream.t) < len(AROUND) + 1:
         return []
-    if isinstance(stream, VelocityStream):
+    if isinstance(stream, YawRateStream):
+        speeds, turns = np.zeros(len(stream.t)), stream.w
+    elif isinstance(stream, VelocityStream):
         speeds, turns = stream.v, stream.w
     else:
         steps = np.diff(stream.t, prepend=2.0 * stream.t[0] - stream.t[1])
@@ -58,28 +65,28 @@ def jumps(stream: VelocityStream | IncrementStream) -> list[Jump]:
 def _outliers(rates: Array, least: float) -> Integers:
     """Return the indices of ``rates`` (N,) that differ from the median of their neighbours by more than ``least``, and that are
     more than FACTOR times as large as this median."""
-    padded = np.pad(rates, 2, mode="edge")
+    padded = np.pad(rates, 2, mode="reflect")
     usual = np.median([padded[2 + k : len(padded) - 2 + k] for k in AROUND], axis=0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 
 
-def jump_warning(kind: str, found: list[Jump], stream: VelocityStream | IncrementStream, end: str) -> Notice:
+def jump_warning(kind: str, found: list[Jump], stream: Motion, end: str) -> Notice:
     """Return a warning about the jumps ``found`` in a stream. ``kind``: the kind of the warning. ``end``: text that is appended
     to it."""
     first = found[0]
     sentence = (
-        "the {what} of the odometry jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {before:.2f} and {after:.2f} "
+        "the {what} of the {source} jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {before:.2f} and {after:.2f} "
         f"{{unit}} (such rows: {{rows}}){end}"
     )
     rows = len({jump.row for jump in found})
     t = float(stream.t[first.row])
-    return notice(kind, sentence, first.what, first.rate, first.unit, t, first.before, first.after, rows)
+    source = "gyro" if isinstance(stream, YawRateStream) else "odometry"
+    return notice(kind, sentence, first.what, source, first.rate, first.unit, t, first.before, first.after, rows)
 
 
-def without_jumps(
-    stream: VelocityStream | IncrementStream, rules: RowRules, warnings: list[Notice]
-) -> VelocityStream | IncrementStream:
-    """Return the odometry without jumps if ``rules`` skip bad rows, and append a warning. Otherwise return it unchanged.
+def without_jumps(stream: M, rules: RowRules, warnings: list[Notice]) -> M:
+    """Return the odometry, or the turn rates of a gyro, without jumps if ``rules`` skip bad rows, and append a warning.
+    Otherwise return it unchanged.
 
     The velocity before a removed row is valid until the next row. The motion of a removed increment is marked as unknown.
     """
@@ -92,5 +99,4 @@ def without_jumps(
     if isinstance(kept, IncrementStream):
         rows = np.flatnonzero(keep)
         kept.unknown[:] = np.where(np.diff(rows, prepend=-1) > 1, np.diff(kept.t, prepend=kept.t[0]), kept.unknown)
-    assert isinstance(kept, VelocityStream | IncrementStream)
     return kept

@@ -54,11 +54,12 @@ def summarize(log: Log) -> Summary:
 
 
 def _jumps(log: Log) -> list[Notice]:
-    """A warning about rows of odometry that jump."""
-    stream = log.streams.get("odometry")
-    if not isinstance(stream, VelocityStream | IncrementStream) or not (found := jumps(stream)):
-        return []
-    return [jump_warning("odometry_jumps", found, stream, '; bad_rows = "skip" skips them')]
+    """Return warnings about jumps of the odometry and of the gyro."""
+    return [
+        jump_warning(f"{name}_jumps", found, stream, '; bad_rows = "skip" skips them')
+        for name, stream in log.streams.items()
+        if isinstance(stream, VelocityStream | IncrementStream | YawRateStream) and (found := jumps(stream))
+    ]
 
 
 def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
