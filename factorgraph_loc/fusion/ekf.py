@@ -16,14 +16,14 @@ import numpy as np
 from pydantic import Field
 
 from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks
-from factorgraph_loc.fusion.layout import POSE, Layout, constants_of, learnt_from, on_pose
+from factorgraph_loc.fusion.layout import POSE, Layout, constants_of, learnt_from
 from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.setup import Calibration, MapUse, Setup
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.base import Binding, Link, NewVariable
+from factorgraph_loc.sensors.base import Binding, Link, NewVariable, Observation
 from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import MOTION
 from factorgraph_loc.sensors.registry import bound_sensors
@@ -72,6 +72,13 @@ class _State(NamedTuple):
         if size == len(self.covariance):
             return self
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
+
+    def on_pose(self, observation: Observation) -> Observation:
+        """The observation as a function of the pose only. Its blocks are fixed at this state, and their covariances are added to
+        the noise."""
+        values, columns = self.layout.values(self.rest), self.layout.columns
+        spreads = {name: self.covariance[columns[name], columns[name]] for name in observation.blocks}
+        return observation.on_pose({name: values[name] for name in spreads}, spreads)
 
     def with_block(self, new: NewVariable) -> _State:
         """The state with one more variable ``new``, such as a landmark, and its correlation with the rest of the state."""
@@ -231,12 +238,12 @@ class Ekf(Filter):
             correction = observation.correct(
                 s.pose, s.covariance, values, s.layout.columns, observation.iterations or self._iterations
             )
-            alone = on_pose(observation, view)
             if observation.is_judged:
                 if not sensor.judge(observation, correction, view):
                     continue
-                self._search.slips.add(alone.at_its_time, self._odometry, view, correction)
+                self._search.slips.add(partial(_at_its_time, observation, s), self._odometry, view, correction)
             if self._search.serves(sensor):
+                alone = s.on_pose(observation)
                 self._search.expect(sensor, alone, self._odometry, view)
                 evidence = partial(laplace_evidence, alone, s.pose, s.covariance[:POSE, :POSE], correction)
                 self._search.keep(sensor, alone, self._odometry, evidence)
@@ -296,3 +303,8 @@ class Ekf(Filter):
     def _standstill(self) -> _Step:
         """The prediction step between two measurements of equal time. It has no motion and no noise."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))
+
+
+def _at_its_time(observation: Observation, state: _State) -> Observation | None:
+    """The observation on the pose at its own time, with its blocks fixed at ``state``. This takes time and is rarely needed."""
+    return state.on_pose(observation).at_its_time()

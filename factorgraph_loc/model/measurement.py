@@ -160,8 +160,9 @@ class ScanStream(Stream):
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         """Yield one measurement per timestamp. ``offset`` [s] is added to the timestamps."""
+        columns = tuple(self._columns())
         for i, j in self.scans():
-            parts = (column[i:j] for column in self._columns())
+            parts = (column[i:j] for column in columns)
             values = (part if isinstance(part, np.ndarray) else tuple(part) for part in parts)
             yield self._made(float(self.t[i]) + offset, *values)
 

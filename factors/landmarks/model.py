@@ -126,9 +126,19 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
 def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> BearingRangeModel:
     """The model with corrected constants. ``parameters`` (6,): additive corrections of :data:`PARAMETERS`, except that the range
     scale is multiplied by one plus its correction. The time offset is ignored, because it is not part of the model."""
-    x, y, bearing_bias, range_scale, depth_axis = _constants(model, np.array(parameters)).tolist()
-    constants = {"bearing_bias": bearing_bias, "range_scale": range_scale, "depth_axis": depth_axis}
-    return replace(model, mounting=(x, y, model.mounting[2]), **constants)
+    by_x, by_y, by_bearing, by_scale, by_axis, _ = parameters
+    x, y, turn = model.mounting
+    return BearingRangeModel(
+        (x + by_x, y + by_y, turn),
+        model.range_scale * (1.0 + by_scale),
+        model.depth,
+        model.depth_axis + by_axis,
+        model.range_sigma,
+        model.range_sigma_relative,
+        model.bearing_bias + by_bearing,
+        model.bearing_sigma,
+        model.robust,
+    )
 
 
 @lru_cache(maxsize=64)

@@ -340,7 +340,9 @@ class Incremental:
 
 
 def _is_definite(covariance: Array) -> bool:
-    """True if a covariance (D, D) is finite and has a Cholesky factorisation."""
+    """True if a covariance (D, D) is finite and has a Cholesky root."""
+    if positive.is_clear(np.ascontiguousarray(covariance)):
+        return True
     try:
         return math.isfinite(np.linalg.cholesky(covariance).sum())
     except np.linalg.LinAlgError:
