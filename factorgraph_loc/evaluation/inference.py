@@ -190,7 +190,7 @@ def signed_rank(differences: Array) -> float:
     positive = int(np.rint(2.0 * ranks[differences > 0.0].sum()))
     extreme = min(positive, total - positive)
     if len(doubled) > _EXACT:
-        # the continuity correction is half a step of the rank sum, which is doubled here
+        # continuity correction: half of the step 1 between rank sums; it is doubled, like ``extreme`` and ``total``
         z = (extreme + 1.0 - total / 2.0) / math.sqrt(float(np.sum(np.square(doubled.astype(float)))) / 4.0)
         return min(1.0, 2.0 * float(ndtr(z)))
     counts = np.zeros(total + 1)

@@ -251,9 +251,10 @@ def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
 
     - ``nis.SENSOR.median_ratio``: median of the NIS divided by its expected median, ideally 1. ``nis.SENSOR.beyond_95``: fraction
       above the 95 % bound. ``nis.SENSOR.count``: number of innovations.
-    - ``residual.NAME.rms`` and ``residual.NAME.median_abs`` [m or rad]: of the residuals at the prediction.
+    - ``residual.NAME.rms`` and ``residual.NAME.median_abs`` [m or rad]: of measurement minus prediction.
     - ``ignored.*``, ``rejected.*``, ``late.*``: numbers of unused measurements, in total and by reason.
-    - ``KIND.total`` and ``KIND.NAME``: landmarks or tags that are probably dead or moved, by kind of doubt, with the probability.
+    - ``KIND.NAME``: probability that the map is wrong about the landmark or tag NAME. KIND is the kind of error, such as
+      ``moved_tags``. ``KIND.total``: number of these landmarks or tags.
     - ``events``: number of events.
     """
     figures: dict[str, Any] = {}

@@ -100,7 +100,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
 
 
 def overview(log: Log, odometry: Trajectory | None) -> Figure:
-    """Plot a log from above: its map, its reference, and the trajectory by ``odometry`` alone from the start, if known."""
+    """Plot a log from above: its map, its reference, and ``odometry``, the dead reckoning from the start (None if unknown)."""
     view, height = _room(log)
     figure, axes = grid(1, 1, height, log.name)
     _map(axes[0, 0], log, view)
@@ -247,7 +247,10 @@ def _view(places: Array, reference: Trajectory | None) -> Array | None:
 
 
 def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
-    """Plot an error with its band of two standard deviations. ``row``: 0 for x, 1 for y, 2 for the heading."""
+    """Plot a component of the errors ``e`` of a trajectory over time, with a band of two standard deviations around zero.
+
+    ``row``: the component, 0 for x, 1 for y, 2 for the heading.
+    """
     t = trajectory.t
     axis.axhline(0.0, color="0.5", linewidth=0.8)
     if trajectory.covariances is not None:
@@ -260,7 +263,8 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Return half the range of the y axis of a panel, so that it shows all but the largest half percent of errors and bands."""
+    """Return the upper end of the y axis of a panel of :func:`_band`, whose lower end is its negative. Half a percent of the errors
+    and band limits are larger."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))

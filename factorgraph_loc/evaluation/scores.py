@@ -33,7 +33,7 @@ class Metric:
 
     @property
     def heading(self) -> str:
-        """Title and unit."""
+        """The title with the unit in brackets, such as "position RMSE [m]"."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     def text(self, value: float, *, sign: bool = False) -> str:

@@ -187,7 +187,7 @@ def _interval_text(interval: Sequence[float], digits: int) -> str:
 
 
 def _median(rows: Sequence[Row], key: str) -> float:
-    """Return the median of a figure of the runs that have it, or NaN if none has it."""
+    """Return the median of the result ``key`` over the runs that have it, or NaN if no run has it."""
     known = [row[key] for row in rows if row.get(key) is not None]
     return float(np.median(known)) if known else math.nan
 
@@ -234,7 +234,10 @@ def run_picture(run: ActiveRun) -> Figure:
 
 
 def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    """Plot a box for each policy, and a dot for each run. Robots that were never localized are at the upper end and counted."""
+    """Plot the distances until localization of the runs of ``case`` (world, estimator): a box for each policy, a dot for each run.
+
+    Runs in which the robot was never localized are drawn at the largest distance, with their number.
+    """
     names = policies(rows)
     top = _farthest(rows, case)
     rng = np.random.default_rng(0)  # horizontal jitter, so that dots do not cover each other
@@ -257,7 +260,7 @@ def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 
 def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    """Plot the fraction of localized runs over the driven distance, a line for each policy."""
+    """Plot the fraction of localized runs of ``case`` (world, estimator) over the driven distance, with a line for each policy."""
     longest = _farthest(rows, case)
     for policy, style in zip(policies(rows), styles(), strict=False):
         driven = np.sort(metres(runs_of(rows, case, policy)))
@@ -269,7 +272,7 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 
 def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
-    """Return the largest distance [m] of a run of one world and estimator, or 1 if there is none."""
+    """Return the largest distance [m] that a robot drove in a run of ``case`` (world, estimator), or 1 if there is no run."""
     return (
         max((row.get("metres") or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
     )

@@ -74,7 +74,7 @@ class Cluster(Executor):
         with suppress(Exception):  # the scheduler may be gone
             self._client.cancel(list(self._sent), force=True)
         self._client.close()
-        if isinstance(error, OSError | self._distributed.CancelledError):  # errors of the store are StoreErrors
+        if isinstance(error, OSError | self._distributed.CancelledError):  # of the connection
             raise RunFailedError(
                 "the connection to the scheduler is lost; finished runs are stored, and the same command resumes"
             ) from error

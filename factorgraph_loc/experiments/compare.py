@@ -33,7 +33,7 @@ from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain
 
 WRITTEN = (*TABLES, PAGE)
-FINISHED = (*WRITTEN, *FILES)  # files of finished comparisons and runs, which must not be replaced without a request
+FINISHED = (*WRITTEN, *FILES)  # files of finished comparisons and runs, which only ``overwrite`` permits to replace
 
 
 @dataclass(frozen=True, repr=False)

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 SUFFIX = ".world.toml"
 POINTS = "points"
 KINDS = (POINTS, "landmarks", "tags")  # kinds of maps; by default the first kind that a log has is mapped
-FLAGS = {  # by option that applies to one kind of map: its flag, and the kind
+FLAGS = {  # options that apply to one kind of map only: by name, the option of the command line and this kind
     "estimator": ("--estimator", "landmarks"),
     "settings": ("--set", "landmarks"),
     "tag_height": ("--tag-height", "tags"),

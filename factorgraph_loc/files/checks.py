@@ -25,8 +25,9 @@ def require_finite(source: object, rows: Integers, names: Sequence[str], table: 
 
 
 def not_finite(names: Sequence[str], table: Array) -> list[Fault]:
-    """Return for each column of ``table`` (N, K) the fault of its numbers that are NaN or infinite. ``names``: the names of the
-    K columns.
+    """Return a :class:`Fault` for each of the K columns of ``table`` (N, K), with a mask of its numbers that are NaN or infinite.
+
+    ``names``: the names of the K columns.
     """
     columns = zip(names, table.T, strict=True)
     return [Fault(name, values, ~np.isfinite(values), "a finite number") for name, values in columns]
@@ -84,7 +85,7 @@ def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRul
 
 
 def _remedy(rules: RowRules | None) -> str:
-    """Return the end of an error, which says how to sort the rows; "" without a manifest."""
+    """Return the end of an error message that names the key for sorting rows. Return "" without a manifest."""
     return "" if rules is None else rules.sorting
 
 

@@ -166,7 +166,7 @@ class TableFolder:
     ) -> Cells:
         """Record the rows and columns from which ``cells`` were read. Return the cells without the rows that the mapping skips.
 
-        ``columns``: the description of each field. ``more``: further faults of the cells.
+        ``columns``: the description of each field. ``more``: further invalid cells, whose rows are skipped too.
         """
         if cells.passed:
             sentence = "{source}: {objects} objects that lack mapped columns are skipped"
@@ -176,8 +176,8 @@ class TableFolder:
         return cells.usable(own, self.warnings, offset=mapping.clock_offset, more=more)
 
     def left_out(self) -> list[Notice]:
-        """Return warnings about data that no mapping reads: one for each file with such rows, and one for all files that have the
-        same unread columns."""
+        """Return warnings about rows and columns that no mapping reads. Each file with unread rows has a warning. Files with the
+        same unread columns have one warning together."""
         warnings = []
         columns: dict[tuple[str, ...], list[str]] = {}
         for path, tables in self._read.items():

@@ -112,7 +112,9 @@ class Column:
         """
         factor = self.units.get(unit, 0.0) if isinstance(unit, str) else float(unit)
         if not LEAST_UNIT <= abs(factor) <= 1.0 / LEAST_UNIT:
-            expected = f"one of {', '.join(self.units)}, or a number of them, at least {LEAST_UNIT:g}"
+            expected = (
+                f"one of {', '.join(self.units)}, or its size in {next(iter(self.units))}, at least {LEAST_UNIT:g}"
+            )
             raise InputError(f"{source}: the unit of {self.name} is {quoted(unit)}, expected {expected}")
         name = unit if isinstance(unit, str) else f"{factor:g} {next(iter(self.units))}"
         low, high = sorted((self.low / factor, self.high / factor))

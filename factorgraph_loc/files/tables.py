@@ -153,9 +153,8 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
         raise InputError(f"{source}: {name} is of type {kind}, expected texts")
     with foreign(source, f"{name} is no column of texts"):
         texts = column.cast(pl.String)
-        if (
-            len(texts) * texts.estimated_size() > DATA
-        ):  # a text that many rows share is counted once in the estimated size
+        # the estimated size contains a shared text only once
+        if len(texts) * texts.estimated_size() > DATA:
             length = int(texts.str.len_bytes().sum())
             require_size(source, f"the length of all texts of {name}", length, DATA)
         return [text or "" for text in texts.to_list()]
@@ -232,7 +231,7 @@ def _cells_of_parquet(path: Path, tables: Sequence[Table], rules: RowRules | Non
                 raise InputError(f"{path}: {name} is of type {kind}, expected numbers")
             cells[name] = frame[name].cast(pl.Float64).to_numpy().copy()
         elif not kind.is_integer():
-            raise InputError(f"{path}: {name} is of type {kind}, expected integers, nanoseconds")
+            raise InputError(f"{path}: {name} is of type {kind}, expected integers in nanoseconds")
         else:
             cells[name] = frame[name].to_list()
     rows = np.arange(1, frame.height + 1, dtype=np.int64)

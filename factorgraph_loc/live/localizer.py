@@ -38,7 +38,7 @@ LAG = 10.0  # s: default lag of the smoother
 HISTORY = 60.0  # s: default length of the past that is kept
 TIDY_INTERVAL = 5.0  # s by which timestamps advance before the estimator again removes data older than ``history``
 ROWS_KEPT = 1000  # maximum number of rows in each list of diagnostics
-AHEAD = 3600.0  # s: a timestamp that is newer than all others by more comes from another clock
+AHEAD = 3600.0  # s: a timestamp that exceeds all others by more than this is from another clock
 
 
 class Localizer:

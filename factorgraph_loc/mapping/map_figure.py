@@ -50,8 +50,8 @@ def dropped_figure(
 ) -> Figure:
     """Plot a map of tags with those that are believed dead crossed out.
 
-    ``places``: the position (2,) of each tag by EPC. ``dead``: the EPCs of dead tags. ``poses`` (N, 3): the trajectory. ``walls``:
-    (x1, y1, x2, y2) of each wall.
+    ``places``: the position (2,) of each tag by EPC. ``dead``: by EPC of each dead tag, the probability that it is dead. ``poses``
+    (N, 3): the trajectory. ``walls``: (x1, y1, x2, y2) of each wall.
     """
     kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
     out, axis = _from_above(f"{log}: dead tags of the map", (np.array(list(places.values())), poses[:, :2]), walls)

@@ -138,7 +138,7 @@ def make_map(
     ``in_frame``: True if the learnt landmarks are in the frame of the log's map already and need no alignment.
 
     A given landmark is wrong if two conditions are met. Its distance from the learnt landmark is more than ``TOLERANCE``. The
-    squared Mahalanobis distance exceeds ``GATE``, with the covariances of the learnt landmark, the alignment and the survey.
+    squared Mahalanobis distance exceeds ``GATE``, with the sum of the covariances of learnt landmark, alignment and given landmark.
     Raises RunFailedError if nothing was learnt.
     """
     if not learnt and not extend:

@@ -197,7 +197,8 @@ def point_map(
 ) -> PointMap:
     """Return a map of T points, each with the descriptors of at most ``views`` observations.
 
-    ``points`` (T, 3), ``covariances`` (T, 3, 3): positions. ``cameras``, ``tracks``: camera poses and observations.
+    ``points`` (T, 3), ``covariances`` (T, 3, 3): positions and their covariances. ``cameras``: camera poses. ``tracks``:
+    observations.
     """
     shown = _different_views(cameras, tracks, points, views)
     views_of = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))

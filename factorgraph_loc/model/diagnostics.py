@@ -56,7 +56,8 @@ class Diagnostics:
         return "\n".join([*lines, *(f"{kind}: {', '.join(names)}" for kind, names in self.doubted.items())])
 
     def ignore(self, reason: str, count: int = 1) -> None:
-        """Count detections as ignored for a ``reason``. A negative ``count`` is for detections that are used after all."""
+        """Add ``count`` to the number of detections that are ignored for a ``reason``. A negative ``count`` reverses an earlier
+        call, if these detections are used after all."""
         self.ignored[reason] = self.ignored.get(reason, 0) + count
         if not self.ignored[reason]:
             del self.ignored[reason]

@@ -29,7 +29,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Feature:
-    """A kind of point feature. ``find`` detects the points of an image, and returns them with their descriptors or None."""
+    """A kind of point feature. ``find``: a function that detects the points of an image. It returns the points and their
+    descriptors, which are None for a detector without descriptors."""
 
     name: str
     find: Callable[[Image], tuple[Keypoints, Descriptors | None]]

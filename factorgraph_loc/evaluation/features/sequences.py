@@ -148,7 +148,8 @@ class Sequence:
 
 
 def find_sequences(paths: Several[Path]) -> list[Sequence]:
-    """Read sequences of images. A path is a folder with a sequence, a folder of such folders, or a photograph, which is warped.
+    """Read sequences of images. A path is a folder with a sequence, a folder of such folders, or a photograph, from which
+    :func:`warped` makes two sequences.
 
     Raises InputError for other paths and for damaged files.
     """
@@ -199,7 +200,7 @@ def warped(photograph: Image, source: Path) -> list[Sequence]:
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:
-        expected = f"at least {MIN_WARPED} px a side of a photograph that is to be warped"
+        expected = f"a photograph with at least {MIN_WARPED} px on each side"
         raise InputError(f"{source}: has {width} x {height} px, expected {expected}")
     name = f"{source.resolve().parent.name}/{source.stem}"
     return [_zoomed(photograph, f"{name} zoomed"), _rotated(photograph, f"{name} rotated")]

@@ -39,7 +39,7 @@ def write_report(
     ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional columns are
     label, sensors, kind (of a failure), warnings and ``sweep.*``.
     ``runs``: returns the result files of a run by its key. ``metrics``: keys of the scores to show.
-    ``baseline``: label with which the others are compared. If it is None or no run has it, the first label is used.
+    ``baseline``: label of the runs with which all other runs are compared. If it is None or no run has it, the first label is used.
     ``experiment``: content of the experiment file. ``damaged``: descriptions of runs with unusable results.
     ``versions``: version of each used software by name.
 
@@ -131,7 +131,7 @@ def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list
 
 
 def _toml(content: Any) -> Any:
-    """Omit null values, which TOML lacks."""
+    """Return nested ``content`` without its None values, which TOML cannot represent."""
     if isinstance(content, Mapping):
         return {str(key): _toml(value) for key, value in content.items() if value is not None}
     if isinstance(content, list | tuple):

@@ -115,9 +115,8 @@ def _known(values: Array) -> Array:
 
 
 def _thin(error: Array, count: int) -> NDArray[np.int64]:
-    """Return about ``count`` indices of poses: those with the smallest and largest error (N,) of each interval, and both ends.
-
-    They are evenly spaced where no error is known.
+    """Select about ``count`` of N poses, and return their indices: the first and the last pose, and the poses with the smallest and
+    the largest ``error`` (N,) of each of several intervals. Where no error is known, the selected poses are evenly spaced.
     """
     if len(error) <= count:
         return np.arange(len(error))

@@ -21,7 +21,7 @@ from factors import se2
 from factors.se2 import Array, Integers
 
 FEWEST = 3  # minimum number of pairs of poses for an alignment by least squares
-_DEGENERATE = 1e-12  # positions whose extent is smaller, relative to the largest one, are degenerate
+_DEGENERATE = 1e-12  # positions are on a line if the second squared singular value is smaller, relative to the first
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,8 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
 def in_plane(
     pair: Pairs, estimate: Trajectory, reference: Trajectory, names: tuple[str, str] = ("", ""), t0_ns: int = 0
 ) -> Associated:
-    """Convert the paired poses of two planar trajectories. Pairs with an unknown pose are omitted and count as gaps.
+    """Convert ``pair``, the paired poses of two planar trajectories, to poses in space. Pairs with a NaN pose are omitted, and
+    count as gaps.
 
     ``estimate``, ``reference``: the trajectories that were paired. ``names``: their names. ``t0_ns``: timestamp of the time 0.
     """

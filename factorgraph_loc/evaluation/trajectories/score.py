@@ -147,7 +147,7 @@ def score_paths(
     """
     _check(align, associate_by, max_diff, max_gap)
     if align_poses is not None and (align_poses < 1 or align in ("none", "origin")):
-        raise InputError(f"align_poses is {align_poses}, expected 1 or more, and align se2, yaw, se3 or sim3")
+        raise InputError(f"align_poses is {align_poses}, expected 1 or more, together with align se2, yaw, se3 or sim3")
     deltas = {text: _delta(text) for text in delta}
     require_poses(estimate)
     require_poses(reference)
@@ -271,7 +271,8 @@ def _angles(rotations: Array) -> Array:
 
 
 def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
-    """Return the times (N,) [s] of pairs since the first pair, by the clock of the estimate if it has one. None without any."""
+    """Return the times (N,) [s] of pairs since the first pair, from the timestamps of the estimate if it has any, or else from
+    those of the reference ``truth``. Return None if neither has timestamps."""
     t_ns = truth.t_ns if estimate.t_ns is None else estimate.t_ns
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
