@@ -242,3 +242,22 @@ def test_two_receivers_have_one_origin(maker, read_drive):
     np.testing.assert_allclose(front, (0.0, 30.9, 61.9), atol=0.1)
     np.testing.assert_allclose(rear, front - 30.95, atol=0.02)
     assert [warning.kind for warning in log.warnings].count("origin") == 1
+
+
+def test_fixes_that_a_receiver_has_not(maker, read_drive):
+    add_fixes(maker, "/fix", [60.0, 60.0 + 1.0 / 3600.0])
+    maker.stamped(
+        "/fix",
+        T0 + 300 * MS,
+        "sensor_msgs/msg/NavSatFix",
+        status=maker.make("sensor_msgs/msg/NavSatStatus", status=-1, service=1),
+        latitude=0.0,
+        longitude=0.0,
+        altitude=0.0,
+        position_covariance=np.zeros(9),
+        position_covariance_type=0,
+    )
+    log = read_drive(maker, position={"topic": "/fix"})
+    assert len(log.streams["position"].t) == 2
+    (warning,) = [str(warning) for warning in log.warnings if warning.kind == "no_fix"]
+    assert "/fix:3: latitude and longitude are 0, in the first of 1 rows without a fix" in warning

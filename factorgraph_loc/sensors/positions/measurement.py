@@ -14,7 +14,7 @@ from factorgraph_loc.files.models import FARTHEST, InUnit
 from factorgraph_loc.model.measurement import Stream
 from factorgraph_loc.model.settings import Offset, SensorSettings
 from factorgraph_loc.sensors.tables import Reading, stream_of
-from factorgraph_loc.text import notice
+from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array
 
@@ -137,6 +137,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
     Latitudes and longitudes become metres to the east and north of the first position. All sensors of a log share this origin.
     """
     (table,) = rows.values()
+    if "latitude" in table.numbers:
+        table = _with_fix(table, reading.warnings)
     columns = {name: np.full(len(table.rows), np.nan) for name in VARIANCES} | dict(table.numbers)
     if "latitude" in columns:
         for column in POSITIONS_ON_EARTH.columns[1:3]:
@@ -153,6 +155,17 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
             )
             reading.warnings.append(notice("origin", sentence, *degrees[0]))
     return stream_of(POSITIONS, replace(table, numbers=columns), reading.t0_ns, reading.warnings)
+
+
+def _with_fix(table: TableRows, warnings: list[Notice]) -> TableRows:
+    """Return the rows of a table without those at latitude 0 and longitude 0, which receivers report while they have no fix."""
+    none = (table.numbers["latitude"] == 0.0) & (table.numbers["longitude"] == 0.0)
+    if not none.any() or none.all():
+        return table
+    sentence = "{source}:{row}: latitude and longitude are 0, in the first of {rows} rows without a fix: skipped"
+    first = table.rows[none.argmax()]
+    warnings.append(notice("no_fix", sentence, table.path, first, np.count_nonzero(none)))
+    return table.rows_at(np.flatnonzero(~none))
 
 
 def on_map(degrees: Array, origin: Array) -> Array:
