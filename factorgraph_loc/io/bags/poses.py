@@ -1,7 +1,7 @@
 """Reads poses and coordinate frames (tf) from a bag.
 
-Poses are those of odometry, the reference and the start. Static transforms give the mounting of sensors. A chain of transforms
-gives a trajectory.
+The odometry, the reference and the start are read as poses. Static transforms give the mounting of sensors. A chain of
+transforms gives a trajectory.
 """
 
 from __future__ import annotations

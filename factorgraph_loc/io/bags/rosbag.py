@@ -106,7 +106,7 @@ class Options(FileModel):
     reference: ReferenceTopic | None = None
     start: StartTopic | None = None
     clock: Clock = "header"
-    """timestamps to use: header for those of message headers, receive for the time of receipt; a topic may override it"""
+    """timestamps to use: header for the timestamps of message headers, receive for the times of receipt; a topic may override it"""
     base_frame: str = "base_link"
     """frame of the robot, relative to which tf_static gives the mountings of sensors"""
 

@@ -248,7 +248,7 @@ class LandmarkTopic(RowTopic, Turned):
     """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; not needed for
     the messages of common marker detectors"""
     axes: Axes = "optical"
-    """axes of the sensor that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
+    """axes of the sensor that point forward, left and up: body (x, y, z), optical (z, -x, -y), or a list of three axes"""
     frame: str | None = None
     """frame of the sensor in tf_static, which gives its pose; if tf_static lacks it, use axes and mounting instead"""
 

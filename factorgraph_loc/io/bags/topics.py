@@ -1,7 +1,7 @@
 """Reads the fields and the timestamps of the messages of a bag, and passes the messages to collectors.
 
 A field has a path: ``tag.epc``, or ``reads[].tag.epc`` for a list. Paths are checked against the message type before messages
-are read. Errors list the available fields. A timestamp is that of the header (time of measurement) or the time of receipt.
+are read. Errors list the available fields. A timestamp is the header's (time of measurement) or the time of receipt.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class TopicSettings(FileModel):
     topic: str
     """name of the topic"""
     clock: Clock | None = None
-    """timestamps to use: header for those of message headers, receive for the time of receipt; by default as for the bag"""
+    """timestamps to use: header for the timestamps of message headers, receive for the times of receipt; by default the setting
+    clock of the bag"""
 
 
 class RowTopic(TopicSettings, RowRules):

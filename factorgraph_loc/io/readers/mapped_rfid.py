@@ -1,4 +1,4 @@
-"""Reads RFID reads from CSV or JSON lines of other programs, by a mapping of columns. Presets know the files of common tools.
+"""Reads RFID reads from CSV or JSON lines of other programs, by a mapping of columns. Presets describe the files of common tools.
 
 A table may also have a column of signal strengths for each tag or each antenna.
 """

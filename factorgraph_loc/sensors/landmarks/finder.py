@@ -6,8 +6,8 @@ robust likelihood. The best candidates are refined by Levenberg-Marquardt. Those
 pose.
 
 The weight of a hypothesis is its posterior probability by Laplace's method: the likelihood times the volume of the mode
-(MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6). The prior is flat, or that of a known start
-position. Source of the generation of hypotheses from few features and their test by the rest: Jensfelt, Kristensen, IEEE
+(MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6). The prior is flat, or the prior of a known
+start position. Source of hypotheses that are generated from few features and tested with the others: Jensfelt, Kristensen, IEEE
 Transactions on Robotics and Automation 17(5), 2001.
 """
 

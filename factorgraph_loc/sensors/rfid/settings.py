@@ -301,9 +301,9 @@ class SurveySettings(FileModel):
     """The transform from the frame in which tags were surveyed to the world: a rotation about a point, then a translation."""
 
     x: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
-    """translation of the map's tags"""
+    """translation of the map's tags along x, after the rotation"""
     y: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
-    """translation of the map's tags"""
+    """translation of the map's tags along y, after the rotation"""
     heading: Angle = 0.0
     """rotation of the map's tags"""
     about_x: Coordinate = 0.0

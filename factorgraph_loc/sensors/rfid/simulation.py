@@ -54,7 +54,7 @@ class Fading(FileModel):
     duration: Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("s")] = 2.0
     """mean duration of a fade"""
     share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
-    """fraction of the time in which an antenna misses a tag by fades"""
+    """fraction of the time in which an antenna misses a tag because of fades"""
 
 
 class AntennaStop(FileModel):
@@ -83,7 +83,7 @@ class Silence(FileModel):
     """An interval without reads by any antenna."""
 
     time: Duration
-    """begin of the interval"""
+    """start of the interval"""
     duration: Duration
     """duration of the interval"""
 

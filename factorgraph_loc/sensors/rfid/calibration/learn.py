@@ -1,8 +1,8 @@
 """Estimates RFID settings along trajectories: survey, mounting, detection models, tempering, and models of strength and phase.
 
-Along references all of these are estimated. Along smoothed trajectories only detection models and tempering are. The likelihood
-of the reads is then averaged over possible poses (:func:`~factorgraph_loc.sensors.smoothed.possible_poses`), and models keep
-their kind. Beams and logistic models are fitted in all parameters, grids only in range and rate. The smoother itself estimates
+Along references all of these are estimated. Along smoothed trajectories only detection models and tempering are estimated. There
+the likelihood of the reads is averaged over possible poses (:func:`~factorgraph_loc.sensors.smoothed.possible_poses`), and models
+keep their kind. Beams and logistic models are fitted in all parameters, grids only in range and rate. The smoother itself estimates
 yaw and clock.
 """
 

@@ -36,7 +36,7 @@ MOST_PAIRS = 60000  # largest number of pairs per log in the fit of survey and m
 # bounds of the parameters of a beam
 BEAM = {"p0": (0.05, 0.999), "r_max": (0.3, 2.0 * REACH), "s_r": (0.05, 5.0), "sigma_phi": (0.1, 9.0)}
 SURVEY = {"survey.x": 0.1, "survey.y": 0.1, "survey.heading": 0.05}  # m, rad; standard deviations of the priors
-# m, rad; standard deviations of the priors of changes that all antennas have in common
+# m, rad; standard deviations of the priors of changes of mounting that all antennas have in common
 COMMON = {"antennas.x": 0.05, "antennas.y": 0.05, "antennas.yaw": 0.15}
 APART = 0.7  # standard deviations of additional changes of each antenna, as a fraction of COMMON
 NO_FOCUS: Mapping[str, tuple[float, float]] = {}

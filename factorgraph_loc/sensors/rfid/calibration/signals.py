@@ -1,4 +1,4 @@
-"""Fits signals of reads to logs with a reference: the model of signal strength, and the geometry by phases.
+"""Fits signals of reads to logs with a reference: the model of signal strength, and the geometry from phases.
 
 Phases determine the survey's transform, and a shift that all antennas have in common (lever arm), as in synthetic aperture
 radar. With the correct geometry the phases of one tag's reads within a short window agree, after the phase of the path is
