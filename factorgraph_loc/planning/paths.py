@@ -80,7 +80,7 @@ def primitives(length: float) -> list[Path]:
     Raises InputError if ``length`` is not positive.
     """
     if not (math.isfinite(length) and length > 0.0):
-        raise InputError(f"horizon is {length:g} m, expected a length above 0")
+        raise InputError(f"policy.horizon is {length:g} m, expected a length above 0 m")
     out = []
     for turn in (2.0 * math.pi * np.arange(DIRECTIONS) / DIRECTIONS).tolist():
         for curvature in CURVATURES:

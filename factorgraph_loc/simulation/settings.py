@@ -261,5 +261,5 @@ def named_settings(what: str, changes: Mapping[str, Any] | None = None) -> Simul
 
 def _preset(name: Any, source: object) -> dict[str, Any]:
     if not isinstance(name, str) or name not in PRESETS:
-        raise InputError(f"{source}: preset is {quoted(name)}{nearest(str(name), list(PRESETS))}")
+        raise InputError(f"{source}: preset {quoted(name)} is not known{nearest(str(name), list(PRESETS))}")
     return {"name": name, **PRESETS[name]}

@@ -75,7 +75,7 @@ def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Tr
         if goal == start:
             if len(space.centres) == 1:
                 raise InputError(
-                    f"world {world.name}: has no room to drive in: make it larger, or reduce drive.clearance"
+                    f"world {world.name} has no room for a robot: increase world.width and world.depth, or reduce drive.clearance"
                 )
             continue
         leg = dense(shortest_path(space, start, goal))

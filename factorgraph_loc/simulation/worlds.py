@@ -188,7 +188,9 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
             f"world: plan {settings.plan} of this size has no shelves for tags: add wall or floor to world.surfaces"
         )
     if plan.hanging and count > len(plan.hanging):
-        raise InputError(f"world: tags is {count}, expected at most {len(plan.hanging)} in plan {settings.plan}")
+        raise InputError(
+            f"world: tags is {count}, expected at most {len(plan.hanging)}, the number of places for tags in plan {settings.plan}"
+        )
     on_floor = 0
     if "floor" in settings.surfaces and not plan.hanging:
         on_floor = round(count / len(settings.surfaces)) if len(faces) else count

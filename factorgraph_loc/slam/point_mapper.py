@@ -27,7 +27,7 @@ class PointMapper(UnknownPoints):
     """Adds the points of images to a factor graph as variables. It decides which images become keyframes."""
 
     fewest, horizon, estimates = FEWEST, HORIZON, True
-    rejected = "camera: not where it was seen"
+    rejected = "camera: point is far from its estimated position"
 
     def __init__(self, camera: CameraSensor, model: CameraModel, diagnostics: Diagnostics) -> None:
         super().__init__(model, diagnostics, camera.constants)

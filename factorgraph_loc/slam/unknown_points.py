@@ -374,7 +374,7 @@ class UnknownPoints(Mapper):
         """Add the observation ``sighting`` of the point ``name`` of the graph, or count an outlier if ``agrees`` is False."""
         point = self._points[name]
         if not agrees:
-            self.diagnostics.reject("camera: does not agree with the others")
+            self.diagnostics.reject("camera: point disagrees with the other points of the image")
             point.strikes += 1
             if point.strikes >= STRIKES:
                 self._astray.append(self._points.pop(name))

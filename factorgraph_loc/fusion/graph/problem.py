@@ -41,7 +41,7 @@ from factors.se2 import Array
 
 DAMPINGS = (0.0, 1e-10, 1e-7)  # are tried one after the other
 # message of the event
-DAMPED = "the graph hardly determines some covariances, which needed a relative damping of {damping:g}"
+DAMPED = "the measurements hardly determine some variables: their covariances needed a relative damping of {damping:g}"
 _NEAR = re.compile(r"variable\s+(\d+)")  # the key in GTSAM's message about an indeterminate system
 MOST_PARAMETERS = 40  # with more parameters, GTSAM's sparse elimination is faster than the chain solver
 Placed = tuple[Factor, tuple[int, ...]]  # a factor with the keys of its variables

@@ -29,7 +29,8 @@ from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel, TiltScale
 from factors.motion import Increment, propagate
 from factors.se2 import Array
 
-DISAGREES = "camera: does not agree with the others"  # reason in the diagnostics why a point is rejected
+# the reason in the diagnostics why a point is rejected
+DISAGREES = "camera: point disagrees with the other points of the image"
 FEW_SHARE = 0.3  # an image misses named points if a smaller fraction of them are inliers
 FEW, MANY = 6, 20  # an image misses matched points if fewer than FEW are inliers, although MANY or more are expected
 UNSURE = 1.0  # m; with a larger standard deviation of the prediction, FEW alone decides if points are missing

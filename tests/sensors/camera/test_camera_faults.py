@@ -48,7 +48,7 @@ def test_a_camera_that_was_knocked_does_not_break_a_run(name, log):
     result = run(with_camera(cut(log, 0.0, 10.0), pitch=CAMERA.pitch + 0.1), CONFIGS[name])
     assert np.all(np.isfinite(result.poses))
     assert np.all(np.isfinite(result.final.poses))
-    assert result.diagnostics.rejected["camera: does not agree with the others"] > 250
+    assert result.diagnostics.rejected["camera: point disagrees with the other points of the image"] > 250
 
 
 @pytest.mark.parametrize("name", ["ekf", "particle_filter"])
