@@ -115,7 +115,7 @@ class Factor(Protocol):
 
 class Stack(Protocol):
     """Many factors of one kind that are linearised by one call, for speed. Each factor depends on one of N poses or on two
-    consecutive poses, and on some of P parameters of the graph, such as sensor constants."""
+    consecutive poses, and on some of P parameters of the graph, such as sensor constants. ``rows``: M, the number of residuals."""
 
     rows: int
 

@@ -155,7 +155,7 @@ class Cloud:
 
 
 class Corrected(NamedTuple):
-    """Particles after a correction by a likelihood. ``evidence``: the logarithm of the mean likelihood over the particles.
+    """A ``cloud`` after a correction by a likelihood. ``evidence``: the logarithm of the mean likelihood over the particles.
     ``left``: the exponent of the part of the likelihood that is not yet applied, 0 if all of it is applied."""
 
     cloud: Cloud

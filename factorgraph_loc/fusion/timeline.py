@@ -38,7 +38,7 @@ class Taken(NamedTuple):
 
 
 class Timeline(ABC):
-    """The base of estimators that process measurements in the order of time. See the module."""
+    """The base of estimators that process measurements in the order of time. ``modalities``: the kinds of sensors they use."""
 
     deterministic = True
     takes_rows = True  # several measurements of odometry may arrive joined to one

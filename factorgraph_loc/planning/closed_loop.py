@@ -75,7 +75,7 @@ class PlanningStep:
 
 @dataclass(frozen=True)
 class ActiveRun:
-    """The result of a run of one policy with one estimator in one world.
+    """The result of a run of one policy with one estimator in one world, simulated from a ``preset`` with a ``seed``.
 
     ``localized``: True if the robot was localized correctly; the run then ends.
     ``metres`` [m], ``seconds`` [s]: distance and time at the end of the run.

@@ -135,7 +135,7 @@ class MonoslamSettings(FilterSettings):
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
     """largest number of points in the state"""
     per_image: Annotated[int, Field(ge=1, le=1000)] = 20
-    """new points are added if fewer estimated points than this should be visible"""
+    """new points are added if an image should show fewer estimated points than this"""
     iterations: Annotated[int, Field(ge=1, le=20)] = 3
     """largest number of linearizations of an update in a known map"""
 

@@ -82,7 +82,8 @@ class BeamModel:
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """A detection model whose logit is linear in :data:`FEATURES`. ``coefficients`` (11,): one for each feature.
+    """A detection model whose logit is linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients`` (11,): one for
+    each feature.
 
     The features are made of the horizontal distance r [m], w = 1 - cosine of the bearing, the height difference z [m], and c, the
     cosine of the angle between the tag's facing and the direction to the antenna (0 if the facing is unknown).

@@ -147,9 +147,9 @@ class StrengthProblem(NamedTuple):
 
 @dataclass(frozen=True)
 class PhaseModel:
-    """The model of phases. ``kappa``: concentration of the von Mises density of twice the phase. ``tempering``: exponent of the
-    likelihood, for correlated reads. ``max_range`` [m]: the likelihood ignores more distant tags, because of reflections.
-    ``min_reads``: minimum number of reads of a group."""
+    """The model of the phases that ``antennas`` measure. ``kappa``: concentration of the von Mises density of twice the phase.
+    ``tempering``: exponent of the likelihood, below 1 for correlated reads. ``max_range`` [m]: the likelihood ignores more distant
+    tags, because of reflections. ``min_reads``: minimum number of reads of a group (antenna, tag, channel, time window)."""
 
     antennas: tuple[Antenna, ...]
     kappa: float = 1.0
@@ -160,8 +160,8 @@ class PhaseModel:
 
 @dataclass(frozen=True)
 class RssiModel:
-    """The model of signal strengths. ``coefficients`` (6,): a0 to a5, of :data:`FEATURES`. ``sigma`` [dB], ``dof``: scale and
-    degrees of freedom of the Student density. ``tempering``: exponent of the likelihood, for correlated reads."""
+    """The model of the signal strengths that ``antennas`` measure, linear in :data:`FEATURES` with ``coefficients`` (6,). ``sigma``
+    [dB], ``dof``: scale and degrees of freedom of the Student density of errors. ``tempering``: exponent of the likelihood."""
 
     antennas: tuple[Antenna, ...]
     coefficients: Sequence[float]
@@ -172,7 +172,7 @@ class RssiModel:
 
 @dataclass(frozen=True, eq=False)
 class PhaseLikelihood:
-    """The likelihood of phases as a function of the robot's pose, for a map of tags."""
+    """The likelihood of phases by ``model`` as a function of the robot's pose, for the ``tags`` of a map."""
 
     model: PhaseModel
     tags: TagArray

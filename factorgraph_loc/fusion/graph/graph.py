@@ -92,7 +92,7 @@ class TickAt(NamedTuple):
 
 @dataclass
 class Addition:
-    """New factors of the graph, and new variables with their initial ``values``."""
+    """New factors (``nodes``) of the graph, and new variables with their initial ``values``, by key."""
 
     nodes: list[Node] = field(default_factory=list)
     values: Values = field(default_factory=dict)
