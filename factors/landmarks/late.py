@@ -153,14 +153,8 @@ class LateShares:
         if self.probability == 0.0:
             return NONE
         logs = _prior(self.probability) if self.log_weights is None else self.log_weights
-        weights = np.exp(logs[:, 1:]).sum(axis=0)[_IS_LATE] * _SHARES[_IS_LATE]
-        share = float(weights.sum())
-        if share < LEAST:
-            return NONE
-        means, spreads = _MEANS[_IS_LATE], _SPREADS[_IS_LATE]
-        mean = float(weights @ means) / share
-        variance = float(weights @ (spreads**2 + means**2)) / share - mean**2
-        return LateRanges(_rounded(share), _rounded(mean), _rounded(math.sqrt(variance)))
+        share, mean, spread = _averaged(logs, _SHARES, _MEANS, _SPREADS)
+        return LateRanges(_rounded(share), _rounded(mean), _rounded(spread)) if share >= LEAST else NONE
 
     def after(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
         """The posterior after K ranges.
@@ -206,3 +200,20 @@ def _learnt(
                 out[n, 1 + j] += math.log((1.0 - OUTLIERS) * both + floor)
     largest = out.max()
     return np.asarray(out - (largest + math.log(np.exp(out - largest).sum())))
+
+
+@compiled(error_model="numpy")
+def _averaged(logs: Array, shares: Array, means: Array, spreads: Array) -> tuple[float, float, float]:
+    """The share of late ranges, and the mean and standard deviation of their excess, averaged over all hypotheses. The arguments
+    are those of :func:`_learnt`."""
+    share = first = second = 0.0
+    for j in range(len(shares)):
+        if shares[j] < 1.0:
+            weight = 0.0
+            for n in range(len(logs)):
+                weight += shares[j] * math.exp(logs[n, 1 + j])
+            share += weight
+            first += weight * means[j]
+            second += weight * (means[j] ** 2 + spreads[j] ** 2)
+    mean = first / share
+    return share, mean, math.sqrt(max(second / share - mean * mean, 0.0))

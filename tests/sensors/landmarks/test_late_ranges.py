@@ -57,6 +57,14 @@ def test_a_log_without_late_ranges_has_the_results_of_a_rig_without_them():
         assert with_prior[f"{kind}.position_rmse"] == pytest.approx(without[f"{kind}.position_rmse"], rel=0.01)
 
 
+@pytest.mark.parametrize("name", ["ekf", "smoother"])
+def test_biases_of_landmarks_are_learnt_beside_late_ranges(name):
+    biased = {"uncertainty": {"range_bias": 0.2}}
+    late, ignored = (figures(office(0.2, 3, **biased, late=prior), name) for prior in (0.1, 0.0))
+    assert late["causal.position_rmse"] < ignored["causal.position_rmse"]
+    assert late["causal.anees"] < ignored["causal.anees"]
+
+
 @pytest.fixture
 def sensors(monkeypatch):
     """The sensors of the runs of a test."""
