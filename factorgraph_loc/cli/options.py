@@ -208,7 +208,7 @@ def parse_settings(
         if estimator not in sections:
             check_names([estimator])
         if estimator not in settings:
-            raise InputError(f"--set is {quoted(text)}, but {estimator} is not run here; run: {listed(estimators)}")
+            raise InputError(f"--set is {quoted(text)}, but {estimator} is not run here, expected {listed(estimators)}")
         set_key(settings, key, value, "--set")
     return settings
 

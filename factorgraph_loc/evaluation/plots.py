@@ -69,7 +69,7 @@ def remove_plots(folder: Path) -> None:
 
 
 def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
-    """Return the plots of a single estimator, by the end of the file name."""
+    """Return the plots of a single estimator by the ending of their file names, such as "errors-ekf"."""
     if not len(track.final):
         return {}
     figures = {}

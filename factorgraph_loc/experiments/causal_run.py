@@ -38,8 +38,8 @@ GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_thresho
 class CausalEstimates:
     """The estimates of a run, which are recorded at regular times (ticks). Each field is a list with one entry per tick.
 
-    ``t``: times [s]. ``poses``, ``covariances``: (3,) and (3, 3), of (x, y, heading) [m, rad]. ``doubts_model``: whether
-    measurements contradict the model of their sensor.
+    ``t``: times [s]. ``poses``, ``covariances``: (3,) and (3, 3), of (x, y, heading) [m, rad]. ``status``: whether the pose is
+    known, ambiguous or unknown. ``doubts_model``: whether measurements contradict the model of their sensor.
     """
 
     t: list[float] = field(default_factory=list)
@@ -141,7 +141,7 @@ class CausalRun:
             self._tick(tick)
 
     def _move(self, m: Measurement) -> None:
-        """Process a row of odometry, or several successive rows (``Rows``), which are divided at ticks."""
+        """Process a row of odometry, or several successive rows (``Rows``), which are split at the times of ticks."""
         if not isinstance(m, Rows):
             self._reach(m.t)
             self.guard.process(self.estimator, m)

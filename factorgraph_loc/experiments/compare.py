@@ -115,7 +115,7 @@ def compare(
 def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
     """Return the settings of each estimator by name. Raises InputError for settings of an estimator that is not compared."""
     if unknown := [name for name in settings if name not in estimators]:
-        raise InputError(f"settings are given for {unknown[0]}, which is not run here; run: {listed(estimators)}")
+        raise InputError(f"settings are given for {unknown[0]}, which is not run here, expected {listed(estimators)}")
     return {name: settings.get(name, {}) for name in estimators}
 
 

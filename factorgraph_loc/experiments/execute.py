@@ -173,7 +173,7 @@ def compute(run: Planned) -> Files:
 
 
 def failure(kind: Kind, reason: str, details: str = "") -> Files:
-    """Return the content of the file of a failed run, by its name. ``details``: a traceback, or ""."""
+    """Return the content of the file of a failed run, by its name. ``kind``: such as "timeout". ``details``: a traceback, or ""."""
     content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
     return {FAILURE: json_text(content).encode()}
 

@@ -153,7 +153,7 @@ class Sweep(FileModel):
     @model_validator(mode="after")
     def _in_step(self) -> Sweep:
         if self.mode == "list" and len({len(values) for values in self.over.values()}) > 1:
-            raise ValueError(f"mode list requires equal numbers of values of {listed(self.over)}")
+            raise ValueError(f'mode is "list", expected equal numbers of values for {listed(self.over)}')
         return self
 
     def points(self, *words: str) -> list[dict[str, Scalar]]:
@@ -170,7 +170,7 @@ class Sweep(FileModel):
 
 
 class ReportSettings(FileModel):
-    """Settings of the report. ``metrics``: keys of its scores. ``baseline``: the label with which the others are compared."""
+    """Settings of the report. ``metrics``: keys of its scores. ``baseline``: label of the estimator to compare the others with."""
 
     metrics: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST, fail_fast=True)] = SUMMARY
     baseline: str | None = None

@@ -125,7 +125,8 @@ def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
 
 
 def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
-    """Return the metrics of which any run has a score. If there is none, return all if ``whole`` is set."""
+    """Return the metrics with the given ``keys`` for which at least one run has a score. If there are none, return all metrics if
+    ``whole`` is set, otherwise an empty list."""
     known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return known or ([metric_of(k) for k in keys] if whole else [])
 

@@ -114,7 +114,7 @@ def _series(files: ResultFiles) -> dict[str, Estimates]:
 
 @dataclass(frozen=True)
 class MetricComparison:
-    """Comparison of the variants by one metric.
+    """Comparison of the variants (estimators with certain settings and sensors) by one metric.
 
     ``pooled``: by variant, the pooled score; variants without scores are missing. ``best``: the best of the variants that have a
     score on every log, None if there is none. ``reference``: the variant with which the others are compared. ``contrasts``: by
@@ -157,7 +157,7 @@ class MetricComparison:
 
 
 class Results:
-    """The runs of an experiment by variant and log.
+    """The runs of an experiment by variant and log. A variant is an estimator with certain settings and sensors.
 
     ``variants``: the label of each variant, by its name on the page. ``logs``: the name of each log, by its name on the page.
     ``rows``: all runs as dictionaries. ``sweeps``: columns of the swept settings that vary. A simulated log appears once for each

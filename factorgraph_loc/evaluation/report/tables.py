@@ -190,7 +190,7 @@ def _first(names: Sequence[str]) -> str:
 
 
 def _poses(runs: Sequence[Row]) -> Cell:
-    """Return a cell with the number of scored poses, as a range over the runs."""
+    """Return a cell with the number of scored poses of the runs, such as "840", or "800 to 840" if it differs between runs."""
     return Cell(counted(runs) or _NONE)
 
 

@@ -123,14 +123,14 @@ def _nothing_in_common(
     if ours[0] > theirs[-1] or theirs[0] > ours[-1]:
         spans = (f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (ours, theirs))
         named = " and ".join(f"{path.name} {span}" for path, span in zip((estimate, reference), spans, strict=True))
-        return InputError(f"the trajectories do not overlap in time: {named}, expected one clock")
+        return InputError(f"the trajectories do not overlap in time: {named}, expected timestamps of one clock")
     if how == "nearest":
         expected = "a larger --max-diff, or --associate interpolate"
         return InputError(
             f"{estimate.name}: no stamp is within {max_diff:g} s of {reference.name}, expected {expected}"
         )
     return InputError(
-        f"{estimate.name}: no stamp of {reference.name} lies between poses at most {max_gap:g} s apart, expected a larger --max-gap"
+        f"{estimate.name}: no stamp of {reference.name} lies between two poses at most {max_gap:g} s apart: use a larger --max-gap"
     )
 
 
