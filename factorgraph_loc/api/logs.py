@@ -40,7 +40,8 @@ def info(
 
 
 def draw(logs: Sequence[Log], path: Path) -> None:
-    """Write a picture of the one log in ``logs``. Raises InputError if there are several, or if ``path`` is not a PNG file."""
+    """Write a picture of the log in ``logs`` to ``path``. Raises InputError if there is not exactly one log, or if ``path`` does
+    not end in .png."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: expected a name that ends in .png")
     if len(logs) != 1:
@@ -91,7 +92,7 @@ def simulate(
     write the log in the native format.
     """
     if isinstance(what, SimulationSettings) and changes:
-        raise InputError("changes apply to a preset or a file, but settings are given")
+        raise InputError("changes apply to a preset or a file, but settings are given: change the settings themselves")
     settings = what if isinstance(what, SimulationSettings) else named_settings(str(what), changes)
     if images and out is None:
         raise InputError("images is true, but out is missing: give a folder in which to write the log")

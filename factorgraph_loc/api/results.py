@@ -142,7 +142,7 @@ def _only(runs: list[StoredRun], out: Path) -> StoredRun:
 
 
 def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory:
-    """Return the final trajectory of the one run, or the reference of the log if there are no runs."""
+    """Return the final trajectory of the only run in ``runs``, or the reference of the log if there are no runs."""
     if runs:
         return _only(runs, out).final
     if log.reference is None:

@@ -267,7 +267,7 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
 
 
 def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: Notice) -> LandmarkMap:
-    """Make a map in the frame of the run's start, for a given map that cannot be aligned. ``note``: tells the user why."""
+    """Make a map in the frame of the run's start, if the given map cannot be aligned. ``note``: the reason, for the user."""
     notes = [note, *not_located(log, learnt)]
     return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
 

@@ -71,8 +71,8 @@ class TagObservations:
     has_height: NDArray[np.bool_]
 
     def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
-        """Return the read counts of some observations. ``which``: mask (K,) of K' observations, or a slice. ``poses`` (K', 3): the
-        robot poses at their times, in the world frame."""
+        """Return the read counts of the L selected observations. ``which``: mask (K,) that selects them, or a slice. ``poses``
+        (L, 3): the robot poses at the times of the selected observations, in the world frame."""
         return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 

@@ -141,7 +141,7 @@ def on_floor(
 ) -> Array:
     """Return planar poses (N, 3) of ``positions`` (N, 3) and ``rotations`` (N, 3, 3): x, y and the direction of the x axis.
 
-    ``turned``: the orientation of the recorded axes and of the measured frame on the robot. Without ``rotations``, headings are 0.
+    ``turned``: the axes of the recorded poses, and how their frame is mounted on the robot. Without ``rotations``, headings are 0.
     Adds a warning if heights differ by more than :data:`RISE`, or if the robot tilts by more than :data:`TILT`. Raises InputError
     if heights differ by more than :data:`MOST` and no axes are set, because y and z may be swapped.
     """
