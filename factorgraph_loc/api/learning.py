@@ -62,7 +62,7 @@ def build_map(
     settings: Mapping[str, Any] | None = None,
     extend: bool = False,
     poses: str | None = None,
-    tag_height: float | None = None,
+    height: float | None = None,
     prior: str | None = None,
     drop_dead: bool = False,
     points: Mapping[str, Any] | None = None,
@@ -77,7 +77,7 @@ def build_map(
     of the work that is done.
     """
     maps.plot_path(Path(out), overwrite=overwrite)
-    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, tag_height, prior, drop_dead, points or {})
+    options = maps.MapOptions(of, estimator, settings or {}, extend, poses, height, prior, drop_dead, points or {})
     made = maps.make_map(read_log(log, rig=rig, world=world), options, progress)
     made.write(Path(out), overwrite=overwrite)
     return made

@@ -90,9 +90,12 @@ class MapArguments:
             help="Robot poses for a map of tags: reference, or odometry to estimate them too. Default: a reference in the log.",
         ),
     ] = None
-    tag_height: Annotated[
+    height: Annotated[
         float | None,
-        typer.Option(metavar="Z", help="Height [m] of tags that the log's map lacks; by default that of the antennas."),
+        typer.Option(
+            metavar="Z",
+            help="Height [m] of tags or landmarks that the log's map lacks; by default that of the antennas or the radio.",
+        ),
     ] = None
     drop_dead: Annotated[
         bool,

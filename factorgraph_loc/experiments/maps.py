@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,8 @@ from factorgraph_loc.plugins import MAP_ESTIMATORS
 from factorgraph_loc.sensors.camera.frontend import with_features
 from factorgraph_loc.sensors.camera.settings import CameraSettings
 from factorgraph_loc.sensors.interfaces import lacking_section
-from factorgraph_loc.sensors.landmarks.summary import require_mappable
+from factorgraph_loc.sensors.landmarks.measurement import Landmark
+from factorgraph_loc.sensors.landmarks.summary import detected, require_mappable
 from factorgraph_loc.sensors.registry import sensors
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.settings import SurveySettings
@@ -45,13 +46,15 @@ if TYPE_CHECKING:
 SUFFIX = ".world.toml"
 POINTS = "points"
 KINDS = (POINTS, "landmarks", "tags")  # kinds of maps; by default the first kind that a log has is mapped
-FLAGS = {  # options that apply to one kind of map only: by name, the option of the command line and this kind
-    "estimator": ("--estimator", "landmarks"),
-    "settings": ("--set", "landmarks"),
-    "tag_height": ("--tag-height", "tags"),
-    "points": ("--set points", POINTS),
+FLAGS: dict[
+    str, tuple[str, tuple[str, ...]]
+] = {  # options of some kinds of maps: by name, the option of the command line and these kinds
+    "estimator": ("--estimator", ("landmarks",)),
+    "settings": ("--set", ("landmarks",)),
+    "height": ("--height", ("landmarks", "tags")),
+    "points": ("--set points", (POINTS,)),
 }
-HEIGHTS = (-10.0, 20.0)  # m; bounds of the height of tags
+HEIGHTS = (-10.0, 20.0)  # m; bounds of the height of tags and landmarks
 OF_REFERENCE = "that of the reference"
 BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without one"
 SOURCES = {"log": "the log's start", "reference": "its reference"}
@@ -69,7 +72,7 @@ class MapOptions:
     ``extend``: whether to keep the log's map and to add what it lacks.
     ``poses``: source of the robot poses for a map of tags: "reference", or "odometry" to estimate the poses together with the tags.
     None: "reference" if the log has one, else "odometry".
-    ``tag_height`` [m]: height of tags that the log's map lacks, None for the height of the antennas.
+    ``height`` [m]: height of tags or landmarks that the log's map lacks, None for the height of the antennas or of the radio.
     ``drop_dead``: if set, nothing is mapped, and the log's map is written without the tags that are believed dead.
     ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
@@ -79,7 +82,7 @@ class MapOptions:
     settings: Mapping[str, Any] = field(default_factory=dict)
     extend: bool = False
     poses: str | None = None
-    tag_height: float | None = None
+    height: float | None = None
     prior: str | None = None
     drop_dead: bool = False
     points: Mapping[str, Any] = field(default_factory=dict)
@@ -146,10 +149,15 @@ def _mapped_kind(log: Log, options: MapOptions) -> str:
     if options.of not in (None, *KINDS):
         raise InputError(f"--of is {quoted(options.of)}, expected {' or '.join(KINDS)}")
     usual = MapOptions()
-    given = {flag: kind for name, (flag, kind) in FLAGS.items() if getattr(options, name) != getattr(usual, name)}
-    what = options.of or next(iter(given.values()), None) or _usual_kind(log, extend=options.extend)
-    if flag := next((flag for flag, kind in given.items() if kind != what), None):
-        raise InputError(f"{flag} is for maps of {given[flag]}, but this is a map of {what}: remove {flag}")
+    given = {flag: kinds for name, (flag, kinds) in FLAGS.items() if getattr(options, name) != getattr(usual, name)}
+    only = next((kinds[0] for kinds in given.values() if len(kinds) == 1), None)
+    what = options.of or only or _usual_kind(log, extend=options.extend)
+    if flag := next((flag for flag, kinds in given.items() if what not in kinds), None):
+        raise InputError(
+            f"{flag} is for maps of {' or '.join(given[flag])}, but this is a map of {what}: remove {flag}"
+        )
+    if options.height is not None and not HEIGHTS[0] <= options.height <= HEIGHTS[1]:
+        raise InputError(f"--height is {options.height:g}, expected metres, {HEIGHTS[0]:g} to {HEIGHTS[1]:g}")
     return what
 
 
@@ -185,31 +193,44 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     require_mappable(log)
     if options.extend and not log.world.landmarks:
         raise InputError(f"{log.name}: has no map that --extend could extend: remove --extend")
-    source = ""
+    if options.extend and options.height is not None:
+        raise InputError(
+            "--height does not apply to landmarks with --extend: state z of the landmarks in the map instead"
+        )
+    source, new = "", [name for name in detected(log) if name not in log.world.landmarks]
     if options.extend:
         started, config = log, RunConfig(estimator, settings | {"landmarks": "extended"}, prior=options.prior)
     else:
         started, source = _started_exactly(log, options.prior)
+        started = replace(started, world=_at_height(log.world, new, options.height))
         config = RunConfig(estimator, settings | {"landmarks": "unknown"}, prior="log")
     result = run(started, config, progress)
     made = mapping.make_map(log, result.learnt.landmarks, extend=options.extend)
+    mapped = [name for name in new if name in made.world.landmarks]
+    made = replace(made, world=_at_height(made.world, mapped, options.height))
     trajectory = se2.compose(made.frame, result.final.poses)
     frame = "that of the given map" if options.extend or made.judged else f"that of the start: {source}"
     draw = partial(map_figure.figure, log.name, made, trajectory)
     return MadeMap(made.world, frame, made, result.warnings, draw)
 
 
+def _at_height(world: World, names: Iterable[str], height: float | None) -> World:
+    """Return the world with ``height`` [m] for the landmarks ``names``. Those that the world lacks are added at its origin, for
+    estimators that use only their heights. Without a height the world is returned unchanged."""
+    if height is None:
+        return world
+    marks = {name: world.landmarks.get(name, Landmark(x=0.0, y=0.0)).model_copy(update={"z": height}) for name in names}
+    return world.model_copy(update={"landmarks": {**world.landmarks, **marks}})
+
+
 def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     """Make a map of RFID tags."""
     uses_reference = _uses_reference(options, has_reference=log.reference is not None)
-    height = options.tag_height
-    if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
-        raise InputError(f"--tag-height is {height:g}, expected metres, {HEIGHTS[0]:g} to {HEIGHTS[1]:g}")
     if options.extend and not log.world.tags:
         raise InputError(f"{log.name}: has no map of tags that --extend could extend: remove --extend")
     prior, frame = (None, OF_REFERENCE) if uses_reference else _start_of_tags(log, options)
     poses: tag_mapping.Poses = "reference" if uses_reference else "odometry"
-    made = tag_mapping.map_tags(log, poses, prior, extend=options.extend, height=height, progress=progress)
+    made = tag_mapping.map_tags(log, poses, prior, extend=options.extend, height=options.height, progress=progress)
     if options.extend or (not uses_reference and made.made.judged):
         frame = "that of the given map"
     return MadeMap(made.world, frame, made, log.warnings, partial(map_figure.tag_figure, log.name, made))

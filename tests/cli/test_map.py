@@ -147,7 +147,7 @@ def test_dead_tags_are_dropped_and_named(fgloc, refused, room_on_disk, room, tmp
 
 def test_without_reference_and_map_the_frame_is_the_start(fgloc, room_on_disk, tmp_path):
     folder = room_on_disk(world=World(), reference=None)
-    result = fgloc("map", folder, "--prior", "1,2,0.5", "--tag-height", "1.2", "-o", tmp_path / "a.world.toml")
+    result = fgloc("map", folder, "--prior", "1,2,0.5", "--height", "1.2", "-o", tmp_path / "a.world.toml")
     assert result.exit_code == 0, result.output
     assert "the robot starts at (1.000 m, 2.000 m, 0.500 rad), from --prior" in result.stdout
     tags = read_world(tmp_path / "a.world.toml").tags

@@ -24,7 +24,7 @@ from factors.graph import Factor
 from factors.landmarks.factor import BearingRangeFactor, landmark_update
 from factors.landmarks.kernels import innovations
 from factors.landmarks.late import LateShares
-from factors.landmarks.model import PARAMETERS, TIME_OFFSET, on_floor
+from factors.landmarks.model import HEIGHT, PARAMETERS, TIME_OFFSET, on_floor
 from factors.se2 import Array
 from factors.update import GATE, Correction
 
@@ -113,7 +113,8 @@ class LandmarkObservation(ResidualObservation):
                 parameters[:, list(factor.estimated)] = values[term.blocks[0]]
             if factor.free:  # a shift of the landmark has the same effect as the opposite shift of the robot
                 places = values[term.blocks[-1]]
-                factor, at = replace(factor, points=places[:1]), poses.copy()
+                point = np.concatenate((places[:1], factor.points[:1, HEIGHT:]), axis=1)
+                factor, at = replace(factor, points=point), poses.copy()
                 at[:, :2] -= places - places[0]
             total += factor.log_likelihood(at, parameters)
         return total

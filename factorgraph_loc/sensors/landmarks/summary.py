@@ -312,10 +312,14 @@ def require_mappable(log: Log) -> None:
         raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and mounting")
 
 
+def detected(log: Log) -> Counter[str]:
+    """Return the number of sightings of each landmark, by its name."""
+    return Counter(name for stream in _streams(log).values() for name in stream.landmark)
+
+
 def not_located(log: Log, located: Container[str]) -> list[Notice]:
     """Return a note that lists the sighted landmarks that are not in ``located``. Returns [] if all are."""
-    counts = Counter(name for stream in _streams(log).values() for name in stream.landmark)
-    missing = [f"{name} ({count} sightings)" for name, count in sorted(counts.items()) if name not in located]
+    missing = [f"{name} ({count} sightings)" for name, count in sorted(detected(log).items()) if name not in located]
     return (
         [notice("not_located", "landmarks that were sighted but could not be located: {landmarks}", listed(missing))]
         if missing
