@@ -1,7 +1,7 @@
 """Registries of sensors, estimators, readers and mappers by name. An object is imported when it is first used.
 
-The module :mod:`factorgraph_loc.builtin` registers the objects of this project. Other packages register objects by entry points of
-the groups ``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and
+The module :mod:`factorgraph_loc.builtin` registers the objects of this project. Other packages register objects by
+entry points of the groups ``factorgraph_loc.sensors``, ``factorgraph_loc.estimators``, ``factorgraph_loc.readers`` and
 ``factorgraph_loc.mappers``. This module also has the other names that commands accept, because it is fast to import.
 """
 
@@ -27,9 +27,9 @@ def load(place: Place) -> Any:
 class Group(Mapping[str, Any]):
     """A registry of one kind of plug-in. ``group[name]`` imports and returns an object. Built-in objects come first.
 
-    ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in objects by name. ``needs``: attributes
-    that an object must have. Raises InputError if an object of another package cannot be imported, lacks such an attribute, or has
-    a name that another object has.
+    ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in objects by name. ``needs``:
+    attributes that an object must have. Raises InputError if an object of another package cannot be imported, lacks
+    such an attribute, or has a name that another object has.
     """
 
     def __init__(self, kind: str, *needs: str) -> None:

@@ -57,8 +57,8 @@ class Child(SpawnProcess):
 class Worker:
     """A worker process of :func:`run_each`.
 
-    ``connection``: the parent's end of the connection to the process. ``ready``: whether the process has loaded its modules.
-    ``job``: the current job, or None.
+    ``connection``: the parent's end of the connection to the process. ``ready``: whether the process has loaded its
+    modules. ``job``: the current job, or None.
     """
 
     process: Child
@@ -116,10 +116,10 @@ def run_each(
 ) -> Iterator[tuple[int, Value | Exception]]:
     """Call ``function`` on each job in at most ``workers`` parallel processes.
 
-    Yields the index of a job and its value, or the exception that it raised, in the order in which jobs finish. Each job runs in a
-    new process. Thus a crash affects only one job, and peak memory can be measured per job. ``beat`` is called about every
-    :data:`BEAT` seconds. Closing the iterator ends the processes. Function, jobs and values must be picklable, and defined in
-    modules that can be imported.
+    Yields the index of a job and its value, or the exception that it raised, in the order in which jobs finish. Each
+    job runs in a new process. Thus a crash affects only one job, and peak memory can be measured per job. ``beat`` is
+    called about every :data:`BEAT` seconds. Closing the iterator ends the processes. Function, jobs and values must be
+    picklable, and defined in modules that can be imported.
     """
     waiting = deque(range(len(jobs)))
     team: list[Worker] = []

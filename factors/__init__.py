@@ -1,5 +1,5 @@
-"""The numerical core on plain arrays: sensor models, factors, Gaussian corrections, least squares, planar poses. It does not depend
-on logs, rigs or files."""
+"""The numerical core on plain arrays: sensor models, factors, Gaussian corrections, least squares, planar poses. It
+does not depend on logs, rigs or files."""
 
 __all__ = [
     "camera",

@@ -1,5 +1,5 @@
-"""Compilation of functions by numba, with a cache on disk that several processes share. If several processes need a function that
-is not in the cache, one compiles the function and the rest wait."""
+"""Compilation of functions by numba, with a cache on disk that several processes share. If several processes need a
+function that is not in the cache, one compiles the function and the rest wait."""
 
 import fcntl
 import os
@@ -31,8 +31,8 @@ def compiled(**options: Any) -> Callable[[Function], Function]: ...
 def compiled(function: Any = None, /, **options: Any) -> Any:
     """Compile a function with ``numba.njit`` and these options. A decorator, with or without arguments.
 
-    The compiled code is cached next to the function's file, or in the user's cache folder if the former is not writable. If neither
-    is writable, each process compiles the function.
+    The compiled code is cached next to the function's file, or in the user's cache folder if the former is not
+    writable. If neither is writable, each process compiles the function.
     """
     if function is None:
         return lambda decorated: _compiled(decorated, options)
@@ -50,9 +50,9 @@ def _compiled(function: Any, options: dict[str, Any]) -> Any:
 class _Shared(FunctionCache):
     """A cache of one function's compiled code with a lock between processes.
 
-    The process that does not find the code takes the lock, and releases it after saving the code. While it compiles the function,
-    it may also lock the functions that this one calls. There is no deadlock, because calls of compiled functions form no cycle. The
-    operating system releases the locks of a process that ends.
+    The process that does not find the code takes the lock, and releases it after saving the code. While it compiles the
+    function, it may also lock the functions that this one calls. There is no deadlock, because calls of compiled
+    functions form no cycle. The operating system releases the locks of a process that ends.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:

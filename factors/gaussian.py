@@ -41,8 +41,8 @@ def product_by_transpose(left: Array, right: Array) -> Array:
 def solved(matrix: Array, right: Array) -> tuple[Array, float]:
     """Solve ``matrix @ x = right`` by Gaussian elimination with pivots.
 
-    ``matrix`` (D, D), ``right`` (D, N). Returns the solution x (D, N) and the logarithm of the absolute determinant of the matrix.
-    Raises LinAlgError if the matrix is singular or not finite.
+    ``matrix`` (D, D), ``right`` (D, N). Returns the solution x (D, N) and the logarithm of the absolute determinant of
+    the matrix. Raises LinAlgError if the matrix is singular or not finite.
     """
     size, width = matrix.shape[0], right.shape[1]
     left, out, log_determinant = matrix.copy(), right.copy(), 0.0
@@ -70,8 +70,8 @@ def solved(matrix: Array, right: Array) -> tuple[Array, float]:
 
 @compiled(error_model="numpy")
 def _substitute(upper: Array, out: Array) -> None:
-    """Solve ``upper @ x = out`` for an upper triangular matrix (D, D), and write x (D, N) into ``out`` (D, N). The elements below
-    the diagonal of ``upper`` are ignored."""
+    """Solve ``upper @ x = out`` for an upper triangular matrix (D, D), and write x (D, N) into ``out`` (D, N). The
+    elements below the diagonal of ``upper`` are ignored."""
     size, width = out.shape
     for i in range(size - 1, -1, -1):
         for k in range(i + 1, size):
@@ -97,8 +97,8 @@ def inverse(matrix: Array) -> Array:
 
 @compiled(error_model="numpy")
 def cholesky(covariance: Array) -> tuple[Array, bool]:
-    """The lower Cholesky root (D, D) of a covariance (D, D), and True if the covariance is positive definite. If the second value
-    is False, the first is undefined. The elements above the diagonal of the covariance are ignored."""
+    """The lower Cholesky root (D, D) of a covariance (D, D), and True if the covariance is positive definite. If the
+    second value is False, the first is undefined. The elements above the diagonal of the covariance are ignored."""
     size = len(covariance)
     out = np.zeros((size, size))
     for i in range(size):
@@ -117,8 +117,8 @@ def cholesky(covariance: Array) -> tuple[Array, bool]:
 
 @compiled(error_model="numpy")
 def invert_covariance(covariance: Array) -> Array:
-    """The inverse of a covariance (D, D). The elements above its diagonal are ignored. Raises LinAlgError if the covariance is not
-    positive definite."""
+    """The inverse of a covariance (D, D). The elements above its diagonal are ignored. Raises LinAlgError if the
+    covariance is not positive definite."""
     size = len(covariance)
     lower, exists = cholesky(covariance)
     if not exists:
@@ -162,12 +162,12 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
     """One backward step of the smoother of Rauch, Tung and Striebel (1965).
 
     ``covariance`` (S, S): covariance of the filtered state.
-    ``transition`` (R, S), ``noise`` (R, R): the prediction step that follows the filtered state, as in :func:`predicted`.
-    ``change`` (S,): the smoothed minus the predicted state after that step.
+    ``transition`` (R, S), ``noise`` (R, R): the prediction step that follows the filtered state, as in
+    :func:`predicted`. ``change`` (S,): the smoothed minus the predicted state after that step.
     ``later`` (S, S): the smoothed covariance after that step.
 
-    Returns the correction (S,) of the filtered state, and its smoothed covariance (S, S). Raises LinAlgError if the predicted
-    covariance is singular, or if the smoothed covariance is not positive definite because of rounding.
+    Returns the correction (S,) of the filtered state, and its smoothed covariance (S, S). Raises LinAlgError if the
+    predicted covariance is singular, or if the smoothed covariance is not positive definite because of rounding.
     :func:`factors.positive.smoothed` handles these cases.
     """
     size, prediction, moved = len(covariance), predicted(covariance, transition, noise), product(transition, covariance)

@@ -1,12 +1,12 @@
 """Variables and factors of a graph, and their conversion to GTSAM.
 
-A variable is a pose (3,) or a vector. A vector is the roll and pitch (2,) of the robot at a pose, the estimated constants of a
-sensor, or the position of a landmark (2,) or of a point in space (3,).
+A variable is a pose (3,) or a vector. A vector is the roll and pitch (2,) of the robot at a pose, the estimated
+constants of a sensor, or the position of a landmark (2,) or of a point in space (3,).
 
-A factor has the method ``linearize(values)``, whose values are arrays: poses (3,) and vectors (P,). It returns the whitened
-residual with robust weights and one Jacobian per variable. The Jacobian of a pose is by its body-frame perturbation. GTSAM gets
-each factor linearised, not as a callback. Callbacks would copy all variables, and an exception in a callback leaves iSAM2 in an
-inconsistent state.
+A factor has the method ``linearize(values)``, whose values are arrays: poses (3,) and vectors (P,). It returns the
+whitened residual with robust weights and one Jacobian per variable. The Jacobian of a pose is by its body-frame
+perturbation. GTSAM gets each factor linearised, not as a callback. Callbacks would copy all variables, and an exception
+in a callback leaves iSAM2 in an inconsistent state.
 """
 
 import math
@@ -63,8 +63,8 @@ def point_key(index: int) -> int:
 
 
 def leaving_key(index: int) -> int:
-    """The key of auxiliary variable number ``index``. A fixed-lag smoother marginalises such a variable in the update that adds
-    it."""
+    """The key of auxiliary variable number ``index``. A fixed-lag smoother marginalises such a variable in the update
+    that adds it."""
     return int(gtsam.symbol("q", index))
 
 
@@ -124,8 +124,8 @@ class Stack(Protocol):
         """The number (M,) of the first pose that each of the ``rows`` residuals depends on."""
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Linearise at ``poses`` (N, 3) and ``parameters`` (P,). Writes ``residual`` (M,) and ``jacobian`` (M, 6 + P), whose
-        columns :mod:`factors.chain` defines."""
+        """Linearise at ``poses`` (N, 3) and ``parameters`` (P,). Writes ``residual`` (M,) and ``jacobian`` (M, 6 + P),
+        whose columns :mod:`factors.chain` defines."""
 
     def cost(self, poses: Array, parameters: Array) -> float:
         """The loss, summed over all factors."""
@@ -133,19 +133,19 @@ class Stack(Protocol):
 
 @runtime_checkable
 class Stackable(Factor, Protocol):
-    """A factor on one pose or on two consecutive poses, and optionally on one vector of parameters. Many such factors can be
-    combined into a :class:`Stack`."""
+    """A factor on one pose or on two consecutive poses, and optionally on one vector of parameters. Many such factors
+    can be combined into a :class:`Stack`."""
 
     @property
     def kind(self) -> Hashable:
-        """A key for grouping: factors of one class with equal ``kind`` and on equal parameters can be in one stack. None if the
-        factor must be linearised alone."""
+        """A key for grouping: factors of one class with equal ``kind`` and on equal parameters can be in one stack.
+        None if the factor must be linearised alone."""
 
     def stack(self, factors: Sequence[Any], numbers: Sequence[int], column: int) -> Stack:
         """Combine ``factors`` of this type and kind.
 
-        ``numbers``: for each factor, the number of the (first) pose that it depends on. ``column``: the index of the first
-        component of the factors' vector among the parameters of the graph.
+        ``numbers``: for each factor, the number of the (first) pose that it depends on. ``column``: the index of the
+        first component of the factors' vector among the parameters of the graph.
         """
 
 
@@ -161,11 +161,11 @@ def jacobian_factors(
 ) -> list[gtsam.GaussianFactor]:
     """Linearise factors at ``values``, as linear factors of GTSAM in the same order.
 
-    ``factors``: tuples of a factor, the keys of its variables, and its number of residuals. The number is needed only with
-    ``on_failure``.
+    ``factors``: tuples of a factor, the keys of its variables, and its number of residuals. The number is needed only
+    with ``on_failure``.
     ``values``: the value of each key.
-    ``on_failure``: is called with the reason if a residual or Jacobian is not finite or has a wrong shape. The linear factor is
-    then zero. If ``on_failure`` is None, nothing is checked.
+    ``on_failure``: is called with the reason if a residual or Jacobian is not finite or has a wrong shape. The linear
+    factor is then zero. If ``on_failure`` is None, nothing is checked.
 
     Some factors have an attribute ``alike``. Those with equal values of it are linearised together by ``linearize_all`` of their
     class, for speed. It returns residuals (N, m) and a Jacobian (N, m, d) for each variable. These factors are never checked.
@@ -240,8 +240,8 @@ class VectorPriorFactor:
 def _checked(
     factor: Factor, values: Sequence[Array], rows: int, on_failure: Callable[[str], None]
 ) -> tuple[Array, list[Array]]:
-    """Linearise a factor that must have ``rows`` residuals. If the result is not finite or has a wrong shape, call ``on_failure``
-    with the reason and return zeros."""
+    """Linearise a factor that must have ``rows`` residuals. If the result is not finite or has a wrong shape, call
+    ``on_failure`` with the reason and return zeros."""
     try:
         residual, blocks = factor.linearize(values)
         # NaN or infinity times zero is NaN, so the product with zeros detects a value that is not finite
@@ -276,8 +276,8 @@ def retract(key: int, value: Array, step: Array) -> Array:
 def frame_motions(values: Values) -> tuple[Array, list[int]]:
     """The gauge directions of a graph: how all variables change when the whole solution moves in the world frame.
 
-    Returns an array (n, 3) of stacked tangent steps of the variables, and the index behind the last row of each variable. The
-    columns are derivatives by a shift in x, a shift in y, and a rotation about the origin of the world.
+    Returns an array (n, 3) of stacked tangent steps of the variables, and the index behind the last row of each
+    variable. The columns are derivatives by a shift in x, a shift in y, and a rotation about the origin of the world.
     """
     parts = []
     for key, value in values.items():
@@ -357,11 +357,11 @@ def compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, 
     ``gradient`` (d,): its gradient g.
     ``information`` (d, d): its Fisher information H, symmetric and positive semi-definite, of any rank.
 
-    With H = L L^T the residual is ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` and its Jacobian is ``[L^T; 0]``. Half the squared
-    residual is exactly nll, its gradient is g, and its curvature is H. A least-squares solver therefore takes the step of Fisher
-    scoring and evaluates the exact likelihood. The last residual requires ``g^T H^-1 g <= 2 nll``: the minimum of the parabola must
-    not be negative. Otherwise the curvature is raised along g to ``H + t g g^T`` with ``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``. The
-    results are always finite.
+    With H = L L^T the residual is ``[L^-1 g; sqrt(2 nll - g^T H^-1 g)]`` and its Jacobian is ``[L^T; 0]``. Half the
+    squared residual is exactly nll, its gradient is g, and its curvature is H. A least-squares solver therefore takes
+    the step of Fisher scoring and evaluates the exact likelihood. The last residual requires ``g^T H^-1 g <= 2 nll``:
+    the minimum of the parabola must not be negative. Otherwise the curvature is raised along g to ``H + t g g^T`` with
+    ``t = 1 / (2 nll) - 1 / (g^T H^-1 g)``. The results are always finite.
     """
     arrays = np.ascontiguousarray(gradient, dtype=float), np.ascontiguousarray(information, dtype=float)
     residual, jacobian = _compressed(float(nll), *arrays)

@@ -21,8 +21,8 @@ State = TypeVar("State")
 
 
 class Minima(NamedTuple):
-    """The solutions of N problems: the final ``states`` (N, S), with ``costs`` (N,), ``gradients`` (N, D) and ``curvatures``
-    (N, D, D) at these states."""
+    """The solutions of N problems: the final ``states`` (N, S), with ``costs`` (N,), ``gradients`` (N, D) and
+    ``curvatures`` (N, D, D) at these states."""
 
     states: Array
     costs: Array
@@ -41,8 +41,8 @@ def minima(
 ) -> Minima:
     """Find local minima of N independent costs.
 
-    ``at(states, which)``: returns costs (n,), gradients (n, D) and curvatures (n, D, D) of the problems with indices ``which``
-    (n,). The curvature is the Fisher information or the Gauss-Newton approximation of the Hessian.
+    ``at(states, which)``: returns costs (n,), gradients (n, D) and curvatures (n, D, D) of the problems with indices
+    ``which`` (n,). The curvature is the Fisher information or the Gauss-Newton approximation of the Hessian.
     ``start`` (N, S): initial states.
     ``iterations``: maximum number of iterations.
     ``converged``: scalar or (D,). A problem is solved when all components of its step are at most this large.
@@ -82,8 +82,8 @@ def minimum(
 ) -> tuple[Array, float, Array]:
     """Find a local minimum of one cost within the bounds ``low`` and ``high``, scalars or (D,).
 
-    ``at(state)``: returns the cost, gradient (D,) and curvature (D, D). The remaining arguments are those of :func:`minima`.
-    Returns the state (D,), the cost and the curvature (D, D) at the minimum.
+    ``at(state)``: returns the cost, gradient (D,) and curvature (D, D). The remaining arguments are those of
+    :func:`minima`. Returns the state (D,), the cost and the curvature (D, D) at the minimum.
     """
 
     def only(states: Array, _: Integers) -> tuple[Array, Array, Array]:
@@ -106,12 +106,12 @@ def descended(
     """Find a local minimum of a cost whose steps the caller computes.
 
     ``cost_of(state)``: returns the cost.
-    ``moved(state, damping)``: returns the state after one damped step, and the largest absolute component of the step. Returns None
-    if the step is not determined. ``damping`` is relative to the diagonal of the curvature.
+    ``moved(state, damping)``: returns the state after one damped step, and the largest absolute component of the step.
+    Returns None if the step is not determined. ``damping`` is relative to the diagonal of the curvature.
     ``state``: the initial state. ``max_iterations``: maximum number of steps.
 
-    The problem is solved when a step is at most :data:`CONVERGED_STEP`, or when it reduces the cost by at most the fraction
-    :data:`CONVERGED_GAIN`. Returns the state at the minimum, its cost, and the number of iterations.
+    The problem is solved when a step is at most :data:`CONVERGED_STEP`, or when it reduces the cost by at most the
+    fraction :data:`CONVERGED_GAIN`. Returns the state at the minimum, its cost, and the number of iterations.
     """
     damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
     while iteration < max_iterations and damping < MAX_DAMPING:

@@ -50,8 +50,8 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Propagate the body-frame ``covariance`` (3, 3) of a pose along an increment. Returns the body-frame covariance (3, 3) of the
-    pose at the end."""
+    """Propagate the body-frame ``covariance`` (3, 3) of a pose along an increment. Returns the body-frame covariance
+    (3, 3) of the pose at the end."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 
@@ -71,14 +71,14 @@ def poses_between(
     """Interpolate M estimated poses at T times, along the odometry.
 
     ``previous`` (T,): the index of the last estimated pose before each time.
-    ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time, its
-    body-frame covariance, and its duration.
+    ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time,
+    its body-frame covariance, and its duration.
     ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: the motion from each estimated pose to the next.
     ``elsewhere`` (M-1,): True where somebody carried the robot to the next pose. Poses in between then ignore the next pose.
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
 
-    The misclosure of the odometry at the next pose is distributed in proportion to time. The covariance is the linear interpolation
-    of both, plus that of a Brownian bridge. Returns poses (T, 3) and body-frame covariances (T, 3, 3).
+    The misclosure of the odometry at the next pose is distributed in proportion to time. The covariance is the linear
+    interpolation of both, plus that of a Brownian bridge. Returns poses (T, 3) and body-frame covariances (T, 3, 3).
     """
     count = len(previous)
     at, out = np.empty((count, 3)), np.empty((count, 3, 3))

@@ -1,8 +1,8 @@
 """Operations on covariances that may be numerically singular.
 
-A covariance whose components have very different scales may be singular in floating point, although its correlation matrix is well
-conditioned. Eigenvalues of the correlation matrix below :data:`LEAST` are rounding errors, and are raised to :data:`LEAST`.
-Well-conditioned covariances are used unchanged.
+A covariance whose components have very different scales may be singular in floating point, although its correlation
+matrix is well conditioned. Eigenvalues of the correlation matrix below :data:`LEAST` are rounding errors, and are
+raised to :data:`LEAST`. Well-conditioned covariances are used unchanged.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ SKEW = 1e-6  # largest asymmetry of a correlation matrix that counts as a roundi
 
 
 def nearest(covariances: Array) -> Array:
-    """The nearest symmetric, invertible covariances (..., D, D). Raises LinAlgError if a variance is not positive, or if an element
-    is not finite."""
+    """The nearest symmetric, invertible covariances (..., D, D). Raises LinAlgError if a variance is not positive, or
+    if an element is not finite."""
     sigmas, values, vectors = _parts(covariances)
     shares = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     shares = (shares + np.swapaxes(shares, -1, -2)) / 2.0
@@ -42,8 +42,8 @@ def sound(covariance: Array) -> Array:
 
 @compiled(error_model="numpy")
 def is_clear(covariance: Array) -> bool:
-    """True if a covariance (D, D) is finite, symmetric and far from singular. A cheap sufficient test: :func:`sound` then returns
-    the covariance unchanged."""
+    """True if a covariance (D, D) is finite, symmetric and far from singular. A cheap sufficient test: :func:`sound`
+    then returns the covariance unchanged."""
     size, shares = len(covariance), np.empty(covariance.shape)
     for i in range(size):
         if not 0.0 < covariance[i, i] < np.inf:
@@ -108,9 +108,9 @@ def squared(errors: Array, covariances: Array) -> Array:
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
     """One backward step of the smoother of Rauch, Tung and Striebel (1965), also for nearly singular covariances.
 
-    The arguments are those of :func:`factors.gaussian.smoothed`. If that function fails, the covariance is computed in Joseph's
-    form, a sum of positive semi-definite terms for any gain. Returns the correction (S,) of the filtered state and its smoothed
-    covariance (S, S).
+    The arguments are those of :func:`factors.gaussian.smoothed`. If that function fails, the covariance is computed in
+    Joseph's form, a sum of positive semi-definite terms for any gain. Returns the correction (S,) of the filtered state
+    and its smoothed covariance (S, S).
     """
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (covariance, transition, noise, change, later))
     try:
@@ -146,8 +146,8 @@ def _whitener(covariances: Array) -> Array:
 
 
 def _parts(covariances: Array) -> tuple[Array, Array, Array]:
-    """Decompose covariances (..., D, D). Returns the standard deviations (..., D), and the eigenvalues (..., D), raised to at least
-    :data:`LEAST`, and eigenvectors (..., D, D) of the correlation matrices."""
+    """Decompose covariances (..., D, D). Returns the standard deviations (..., D), and the eigenvalues (..., D), raised
+    to at least :data:`LEAST`, and eigenvectors (..., D, D) of the correlation matrices."""
     variances = np.diagonal(covariances, axis1=-2, axis2=-1)
     if not (np.all(np.isfinite(covariances)) and np.all(variances > 0.0)):
         raise np.linalg.LinAlgError("a covariance is not finite, or has a variance that is not positive")

@@ -18,8 +18,8 @@ Squared = TypeVar("Squared", float, Array)
 
 @register_jitable(inline="always")
 def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
-    """The loss of Geman and McClure (1985) for ``squared`` whitened residuals. It is at most ``scale^2 / 2``, so that gross
-    outliers have no influence. ``scale``: in standard deviations."""
+    """The loss of Geman and McClure (1985) for ``squared`` whitened residuals. It is at most ``scale^2 / 2``, so that
+    gross outliers have no influence. ``scale``: in standard deviations."""
     return 0.5 * squared / (1.0 + squared / scale**2)
 
 
@@ -31,8 +31,8 @@ def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_loss(squared: Squared, scale: float) -> Squared:
-    """The loss of Huber (1964) for ``squared`` whitened residuals. It is linear in the residual beyond ``scale`` standard
-    deviations."""
+    """The loss of Huber (1964) for ``squared`` whitened residuals. It is linear in the residual beyond ``scale``
+    standard deviations."""
     size = np.sqrt(squared)
     inner = np.minimum(size, scale)
     loss: Squared = inner * (size - 0.5 * inner)

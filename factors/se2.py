@@ -4,8 +4,8 @@ A pose is ``(x, y, heading)``: metres, metres, radians counter-clockwise. A tang
 ``(rho_x, rho_y, phi)``, applied on the right: ``pose * exp(xi)``. This is also GTSAM's convention for ``Pose2``.
 Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, appendix A (eqs. 153 to 166).
 
-Functions of arrays broadcast over leading axes, ``(..., 3)``. The compiled functions take numbers (``_scalars``), one pose
-(``_one``), or many poses. Compiled code and filters call them, because NumPy is slow for single poses.
+Functions of arrays broadcast over leading axes, ``(..., 3)``. The compiled functions take numbers (``_scalars``), one
+pose (``_one``), or many poses. Compiled code and filters call them, because NumPy is slow for single poses.
 """
 
 import math
@@ -128,9 +128,9 @@ def transform_from(pose: Array, points: Array) -> Array:
 def align_points(points: Array, targets: Array) -> Array:
     """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) with the least squared distances.
 
-    Pairs that contain a NaN are ignored. If no pair is left, the result is NaN. If all points coincide, the rotation is 0. Source:
-    Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4), 1991, equations 40 to
-    42 with scale 1. In the plane the rotation is one angle.
+    Pairs that contain a NaN are ignored. If no pair is left, the result is NaN. If all points coincide, the rotation is
+    0. Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
+    1991, equations 40 to 42 with scale 1. In the plane the rotation is one angle.
     """
     known = np.isfinite(points).all(axis=1) & np.isfinite(targets).all(axis=1)
     if not known.any():
@@ -284,8 +284,8 @@ def inverse_right_jacobian(xi: Array) -> Array:
 
 @compiled
 def body_to_world_one(pose: Array, covariance: Array) -> Array:
-    """:func:`body_to_world` of one pose (3,) and of the first three components of a covariance (S, S). Elements below the diagonal
-    are ignored, so the result (3, 3) is exactly symmetric."""
+    """:func:`body_to_world` of one pose (3,) and of the first three components of a covariance (S, S). Elements below
+    the diagonal are ignored, so the result (3, 3) is exactly symmetric."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     out = np.empty((3, 3))
     a, b, e = covariance[0, 0], covariance[0, 1], covariance[1, 1]
@@ -327,8 +327,8 @@ def twists_to(pose: Array, targets: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"reassoc", "contract"})
 def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) of (x, y, heading)
-    in the world frame. ``weights`` (N,): must have the sum 1."""
+    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) of (x,
+    y, heading) in the world frame. ``weights`` (N,): must have the sum 1."""
     x = y = cosine = sine = 0.0
     for n in range(len(poses)):
         x, y = x + weights[n] * poses[n, 0], y + weights[n] * poses[n, 1]

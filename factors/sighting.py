@@ -1,5 +1,5 @@
-"""Common parts of the factors of landmarks, positions and image points: an offset between pose variable and measurement, and the
-marginalisation of all values except the pose."""
+"""Common parts of the factors of landmarks, positions and image points: an offset between pose variable and
+measurement, and the marginalisation of all values except the pose."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from factors.se2 import Array
 
 
 class SightingFactor(Protocol):
-    """The interface of a factor with K sightings that were measured at one time, such as the ranges and bearings of K landmarks in
-    :class:`~factors.landmarks.factor.BearingRangeFactor`. Each sighting has g coordinates."""
+    """The interface of a factor with K sightings that were measured at one time, such as the ranges and bearings of K
+    landmarks in :class:`~factors.landmarks.factor.BearingRangeFactor`. Each sighting has g coordinates."""
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Whitened residual (K, g) and its Jacobian (K, g, d) by each value."""
@@ -30,8 +30,8 @@ class SightingFactor(Protocol):
 def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
     """Extend an ``offset`` (3,) to a time ``seconds`` later, at the robot's body-frame velocity ``twist`` (3,).
 
-    ``offset``: the pose at the measurement's time in the frame of the pose variable, None for zero. It is returned unchanged if the
-    twist is None.
+    ``offset``: the pose at the measurement's time in the frame of the pose variable, None for zero. It is returned
+    unchanged if the twist is None.
     """
     if twist is None or seconds == 0.0:
         return offset
@@ -46,8 +46,8 @@ class Marginalized:
     ``factor``: the factor on the pose and further values, such as sensor constants or the position of a landmark.
     ``values``: the estimates of the further values. ``covariances``: the covariance of each, None if the value is exact.
 
-    All K sightings have the error of a value in common. Its covariance is therefore multiplied by K, so that it does not average
-    out.
+    All K sightings have the error of a value in common. Its covariance is therefore multiplied by K, so that it does
+    not average out.
     """
 
     factor: SightingFactor

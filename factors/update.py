@@ -1,8 +1,8 @@
 """The correction of a Gaussian by residuals: a robust, iterated Kalman update in information form.
 
-The update is robust because an outlier must not dominate it, and because a wrong prediction must not reject good measurements.
-Landmarks of a map have a compiled version in :mod:`factors.landmarks.kernels`. Without it, calls of NumPy take most of the time of
-an EKF.
+The update is robust because an outlier must not dominate it, and because a wrong prediction must not reject good
+measurements. Landmarks of a map have a compiled version in :mod:`factors.landmarks.kernels`. Without it, calls of NumPy
+take most of the time of an EKF.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Correction:
     ``nis``: the normalised innovation squared. ``dof``: its degrees of freedom.
 
     The last three fields are for likelihoods without residuals, such as that of RFID reads.
-    ``excess_nll``: the negative log-likelihood at the prediction minus its expected value. ``variance``: the variance of
-    ``excess_nll``. ``evidence``: the marginal log-likelihood by Laplace's method, or None if it was not computed.
+    ``excess_nll``: the negative log-likelihood at the prediction minus its expected value. ``variance``: the variance
+    of ``excess_nll``. ``evidence``: the marginal log-likelihood by Laplace's method, or None if it was not computed.
     """
 
     delta: Array
@@ -57,15 +57,15 @@ def update_state(
 ) -> Correction:
     """Correct a Gaussian by K sightings, with a robust, iterated Kalman update.
 
-    ``linearize(delta)``: returns the whitened residuals (K, g) at the correction ``delta`` (S,), and their Jacobian (K, g, D) by
-    the first D components of the error state.
+    ``linearize(delta)``: returns the whitened residuals (K, g) at the correction ``delta`` (S,), and their Jacobian (K,
+    g, D) by the first D components of the error state.
     ``covariance`` (S, S): covariance of the error state at the prediction.
-    ``weight``: maps squared norms (K,) of whitened residuals to weights (K,). A weight is a robust weight times a tempering
-    exponent of the likelihood. The weight of zero is therefore the tempering exponent.
+    ``weight``: maps squared norms (K,) of whitened residuals to weights (K,). A weight is a robust weight times a
+    tempering exponent of the likelihood. The weight of zero is therefore the tempering exponent.
     ``iterations``: maximum number of iterations. They end earlier when a step is below ``converged``.
     ``dof``: number of measured values, stored in the result.
-    ``common``: number of errors that all sightings have in common. They are independent unit Gaussians. ``linearize`` gets them
-    after the S components of the error state.
+    ``common``: number of errors that all sightings have in common. They are independent unit Gaussians. ``linearize``
+    gets them after the S components of the error state.
 
     The first iteration linearises at the prediction. There the noise of a sighting is multiplied by the square of (normalised
     innovation squared / gate) where this ratio exceeds 1, so that an outlier has less influence but is not rejected. Further
@@ -106,8 +106,8 @@ def _iterated(
     dof: int,
     converged: float,
 ) -> Correction:
-    """Run the iterations of :func:`update_state`. ``solve``: solves one linearised update. ``first_solve``: the same without the
-    tempering exponent."""
+    """Run the iterations of :func:`update_state`. ``solve``: solves one linearised update. ``first_solve``: the same
+    without the tempering exponent."""
     zero = np.zeros(len(covariance))
     # numba would compile `normalised` and `inform` again for another memory order
     residual, blocks = map(np.ascontiguousarray, linearize(zero))
@@ -145,8 +145,8 @@ def _informed(prior: Array) -> _Solver:
 
 
 def _rooted(root: Array) -> _Solver:
-    """Make a solver of linearised updates in square-root form, whose covariance is always positive definite. ``root`` (S, S): lower
-    Cholesky root of the covariance of the prediction."""
+    """Make a solver of linearised updates in square-root form, whose covariance is always positive definite. ``root``
+    (S, S): lower Cholesky root of the covariance of the prediction."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size, scale = len(at), np.sqrt(np.repeat(weight, blocks.shape[1]))
@@ -194,9 +194,9 @@ def corrected(
 ) -> tuple[Array, Array, Array]:
     """One Kalman update in information form.
 
-    ``prior`` (S, S): the information of the prediction. The other arguments are those of :func:`inform`. Returns the correction
-    (S,), the covariance (S, S) after it, and the information vector (D,) of the residuals. Raises LinAlgError if the total
-    information is not positive definite.
+    ``prior`` (S, S): the information of the prediction. The other arguments are those of :func:`inform`. Returns the
+    correction (S,), the covariance (S, S) after it, and the information vector (D,) of the residuals. Raises
+    LinAlgError if the total information is not positive definite.
     """
     total = prior.copy()
     pull = inform(residual, jacobian, columns, weights, at, total)

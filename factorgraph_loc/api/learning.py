@@ -73,8 +73,8 @@ def build_map(
 ) -> maps.MadeMap:
     """Estimate a map of landmarks, RFID tags or points from a log. Writes ``out`` (``NAME.world.toml``) and a picture next to it.
 
-    The other arguments are those of :class:`~factorgraph_loc.experiments.maps.MapOptions`. ``progress`` is called with the fraction
-    of the work that is done.
+    The other arguments are those of :class:`~factorgraph_loc.experiments.maps.MapOptions`. ``progress`` is called with
+    the fraction of the work that is done.
     """
     maps.plot_path(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, height, prior, drop_dead, points or {})

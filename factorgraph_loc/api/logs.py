@@ -40,8 +40,8 @@ def info(
 
 
 def draw(logs: Sequence[Log], path: Path) -> None:
-    """Write a picture of the log in ``logs`` to ``path``. Raises InputError if there is not exactly one log, or if ``path`` does
-    not end in .png."""
+    """Write a picture of the log in ``logs`` to ``path``. Raises InputError if there is not exactly one log, or if
+    ``path`` does not end in .png."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: expected a name that ends in .png")
     if len(logs) != 1:
@@ -68,8 +68,8 @@ def convert(
 def manifest(log: str | Path) -> Proposal:
     """Propose a manifest for a folder of tables or a ROS bag, which states which file or topic is which sensor.
 
-    Write its ``text`` to a file in its ``folder`` and check it. That file can then be read as a log. Raises InputError if the
-    folder or the bag cannot be read.
+    Write its ``text`` to a file in its ``folder`` and check it. That file can then be read as a log. Raises InputError
+    if the folder or the bag cannot be read.
     """
     path = Path(log)
     propose = manifest_of_folder if path.is_dir() and not is_bag(path) else manifest_of_bag
@@ -87,8 +87,8 @@ def simulate(
 ) -> Log:
     """Simulate a log with known ground truth. The same seed gives the same bytes.
 
-    ``what``: a preset, a TOML file, or settings. ``changes``: changed settings as nested tables, such as
-    ``{"drive": {"duration": 60.0}}``. ``images``: render the images of the camera into ``out``. ``out``: a new folder in which to
+    ``what``: a preset, a TOML file, or settings. ``changes``: changed settings as nested tables, such as ``{"drive":
+    {"duration": 60.0}}``. ``images``: render the images of the camera into ``out``. ``out``: a new folder in which to
     write the log in the native format.
     """
     if isinstance(what, SimulationSettings) and changes:

@@ -70,8 +70,8 @@ def _listed(results: LogLike | Sequence[LogLike]) -> list[LogLike]:
 
 
 def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, list[StoredRun]]:
-    """Return the log and the runs in ``results``. If ``results`` has no log, the known data set is read whose name the runs
-    contain.
+    """Return the log and the runs in ``results``. If ``results`` has no log, the known data set is read whose name the
+    runs contain.
 
     ``read``: reads a log. Raises InputError if there are several logs, or if no known data set has the name that the runs contain.
     """
@@ -166,10 +166,10 @@ def score(
 ) -> TrajectoryScore:
     """Score a trajectory against another. The field ``figures`` of the returned score has the errors, in metres and radians.
 
-    ``estimate``, ``reference``: trajectories with times of the same clock, or texts that name trajectories as in ``fgloc score``.
-    ``out``: a folder in which to write the files of ``fgloc score``. For the other arguments see
-    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. Raises InputError if a trajectory cannot be read, or if no
-    poses of the two can be paired.
+    ``estimate``, ``reference``: trajectories with times of the same clock, or texts that name trajectories as in
+    ``fgloc score``. ``out``: a folder in which to write the files of ``fgloc score``. For the other arguments see
+    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. Raises InputError if a trajectory cannot be
+    read, or if no poses of the two can be paired.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)

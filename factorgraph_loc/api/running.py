@@ -28,8 +28,8 @@ SMOOTHER = "smoother"
 class Run:
     """The outcome of a run.
 
-    ``result``: the estimates. ``scores``: the scores, as in ``metrics.json``. ``learnt``: the constants of the rig that were
-    estimated from the log, empty unless requested.
+    ``result``: the estimates. ``scores``: the scores, as in ``metrics.json``. ``learnt``: the constants of the rig that
+    were estimated from the log, empty unless requested.
     """
 
     result: RunResult
@@ -91,10 +91,10 @@ def run_and_learn(
 ) -> tuple[RunResult, Knowledge]:
     """Run an estimator on a log, estimate the rig from the same log, and compute the final trajectory with the estimated rig.
 
-    The smoother and the calibration of the rig alternate. The estimated rig depends on the whole log, so only the final trajectory
-    uses it. All other results use the given rig. The effective configuration of the result has the estimated rig as ``learnt_rig``.
-    ``progress`` is called with the fraction of the work that is done. Raises InputError if the log has too little information, and
-    the errors of :func:`~factorgraph_loc.experiments.run.run`.
+    The smoother and the calibration of the rig alternate. The estimated rig depends on the whole log, so only the final
+    trajectory uses it. All other results use the given rig. The effective configuration of the result has the estimated
+    rig as ``learnt_rig``. ``progress`` is called with the fraction of the work that is done. Raises InputError if the
+    log has too little information, and the errors of :func:`~factorgraph_loc.experiments.run.run`.
     """
     report = progress or (lambda _share: None)
     runs = TURNS + 2

@@ -1,5 +1,5 @@
-"""Calibration of a complete rig: estimate it from logs with a reference, test it on held-out logs, and keep the input rig if the
-estimated rig is worse."""
+"""Calibration of a complete rig: estimate it from logs with a reference, test it on held-out logs, and keep the input
+rig if the estimated rig is worse."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -22,8 +22,8 @@ class Calibration:
     """Result of a calibration.
 
     ``logs``: names of the logs. ``input_rig``: the rig before the calibration.
-    ``rig``: the learnt rig, or ``input_rig`` if the learnt rig is refused. ``refused``: the reason of the refusal, "" if none.
-    ``knowledge``: the rig and the constants that are learnt from all logs.
+    ``rig``: the learnt rig, or ``input_rig`` if the learnt rig is refused. ``refused``: the reason of the refusal, ""
+    if none. ``knowledge``: the rig and the constants that are learnt from all logs.
     ``trials``: scores on held-out logs, empty if the logs have no reference or are too short. ``doubts``: warnings.
     """
 
@@ -46,12 +46,12 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from ``logs``. If no log has a reference, smoothing and learning alternate.
 
-    ``run``: runs an estimator on a log. ``rig``: its values are the means of the priors; None for the rig of the first log.
-    ``progress``: called with the number of steps done and the number of all steps.
+    ``run``: runs an estimator on a log. ``rig``: its values are the means of the priors; None for the rig of the first
+    log. ``progress``: called with the number of steps done and the number of all steps.
     ``grids``: path prefix of the files of learnt detection grids, required for logs with tag reads.
 
-    Raises InputError if a log lacks a reference or odometry, is too short, or has other sensors than the first log. Also if it has
-    neither exteroceptive measurements nor a reference with headings.
+    Raises InputError if a log lacks a reference or odometry, is too short, or has other sensors than the first log.
+    Also if it has neither exteroceptive measurements nor a reference with headings.
     """
     report = progress or (lambda _done, _total: None)
     blind = bool(logs) and all(log.reference is None for log in logs)

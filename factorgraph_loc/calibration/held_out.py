@@ -49,8 +49,8 @@ class Trial:
     """The runs of an estimator on one held-out section of a log.
 
     ``log``: name of the log. ``scores``: the scores of the run by rig (:data:`RIGS`), None if the run failed.
-    ``doubted``: of the run with the learnt rig, the landmarks or tags that are probably moved or dead. By kind of doubt and name
-    it has their probabilities.
+    ``doubted``: of the run with the learnt rig, the landmarks or tags that are probably moved or dead. By kind of doubt
+    and name it has their probabilities.
     """
 
     log: str
@@ -101,8 +101,8 @@ def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list
 def pooled(trials: Sequence[Trial], rig: str, key: str) -> float:
     """Return a score pooled over held-out sections, weighted by their numbers of poses: root mean square, or mean for ANEES.
 
-    ``rig``: one of :data:`RIGS`. ``key``: name of the score, such as "final.position_rmse". Only sections with a score of both rigs
-    are used, if there are any. Returns NaN if no section has the score.
+    ``rig``: one of :data:`RIGS`. ``key``: name of the score, such as "final.position_rmse". Only sections with a score
+    of both rigs are used, if there are any. Returns NaN if no section has the score.
     """
     kind = key.partition(".")[0]
     known = [t for t in trials if _is_known(t, key)]

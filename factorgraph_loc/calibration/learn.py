@@ -1,9 +1,9 @@
 """Learning of a rig from logs by the calibrators of all sensors, along reference trajectories or smoothed ones.
 
-Without a reference, smoothing and learning alternate (expectation-maximisation: Dempster, Laird and Rubin, JRSS B 39, 1977; with a
-smoother: Shumway and Stoffer, "An approach to time series smoothing and forecasting using the EM algorithm", 1982). Each turn
-smooths the logs with the current rig, and learns a rig from the smoothed trajectories and their covariances. The iteration ends
-when a turn changes all values by less than a fraction of their standard errors.
+Without a reference, smoothing and learning alternate (expectation-maximisation: Dempster, Laird and Rubin, JRSS B 39,
+1977; with a smoother: Shumway and Stoffer, "An approach to time series smoothing and forecasting using the EM
+algorithm", 1982). Each turn smooths the logs with the current rig, and learns a rig from the smoothed trajectories and
+their covariances. The iteration ends when a turn changes all values by less than a fraction of their standard errors.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,8 +35,8 @@ TOO_VAGUE = 1.0  # m; a smoothed trajectory with a larger median standard deviat
 class Knowledge:
     """A learnt ``rig``, and the results of its ``sensors`` by name.
 
-    ``turns``: for logs without a reference, the largest change of a constant in each turn of smoothing and learning, in standard
-    errors. Empty for logs with a reference.
+    ``turns``: for logs without a reference, the largest change of a constant in each turn of smoothing and learning, in
+    standard errors. Empty for logs with a reference.
     """
 
     rig: Rig
@@ -80,9 +80,9 @@ def learn(
 ) -> Knowledge:
     """Learn a rig from logs along their trajectories. Given the trajectory, the sensors are independent and are learnt separately.
 
-    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first turn of smoothing and learning,
-    None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written. ``like``: a result from more
-    logs, whose choices between models are kept. Raises InputError if a log is too short.
+    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first turn of smoothing
+    and learning, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written.
+    ``like``: a result from more logs, whose choices between models are kept. Raises InputError if a log is too short.
     """
     traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]
     sensors, learnt = {}, rig
@@ -94,8 +94,8 @@ def learn(
 
 
 def sensing(rig: Rig, log: Log) -> Rig:
-    """Return ``rig`` with another list ``sensors``: exteroceptive sensors are listed if the log has their measurements. Other
-    sensors stay in the list."""
+    """Return ``rig`` with another list ``sensors``: exteroceptive sensors are listed if the log has their measurements.
+    Other sensors stay in the list."""
     sensed = senses(rig)
     kept = [name for name in rig.sensors if name not in sensed or name in log.streams]
     added = [name for name in sensed if name in log.streams and name not in kept]
@@ -116,9 +116,9 @@ def learn_by_turns(
 ) -> Knowledge:
     """Learn a rig from ``logs`` without reference trajectories: alternately smooth all logs and learn from the result.
 
-    ``start``: the rig of the first turn. ``smooth``: runs the smoother on a log. ``grids``: path and name prefix of files of
-    detection grids that may be written. ``progress``: called with the number of smoothed logs so far and its maximum. Raises
-    InputError if a log contains too little information.
+    ``start``: the rig of the first turn. ``smooth``: runs the smoother on a log. ``grids``: path and name prefix of
+    files of detection grids that may be written. ``progress``: called with the number of smoothed logs so far and its
+    maximum. Raises InputError if a log contains too little information.
     """
     rig, turns, fitted = start, list[float](), dict[tuple[str, str], float]()
     while True:

@@ -1,7 +1,7 @@
 """Shell completion of names and settings.
 
-Completion of names is fast, because it imports no numerical library. Completion of settings imports the classes that define the
-settings, which takes a second.
+Completion of names is fast, because it imports no numerical library. Completion of settings imports the classes that
+define the settings, which takes a second.
 """
 
 from collections.abc import Callable, Iterable
@@ -23,8 +23,8 @@ def _one_of(names: Callable[[], Iterable[str]]) -> Completion:
 
 
 def _some_of(names: Callable[[], Iterable[str]]) -> Completion:
-    """Return a completion of the last name in a comma-separated list. Names that are already in the list are not proposed.
-    ``names`` returns all valid names."""
+    """Return a completion of the last name in a comma-separated list. Names that are already in the list are not
+    proposed. ``names`` returns all valid names."""
 
     def complete(incomplete: str) -> list[str]:
         first, comma, last = incomplete.rpartition(",")

@@ -1,7 +1,7 @@
 """The commands ``fgloc experiment`` and ``fgloc active``.
 
-``fgloc experiment`` executes many runs that a file describes, stores their results and writes a report. ``fgloc active`` simulates
-robots that plan their paths so as to localize themselves.
+``fgloc experiment`` executes many runs that a file describes, stores their results and writes a report. ``fgloc
+active`` simulates robots that plan their paths so as to localize themselves.
 """
 
 from __future__ import annotations
@@ -226,8 +226,8 @@ def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
 def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of the table of results.
 
-    Each row summarizes the runs (``rows``) of one label, one set of sensors and one combination of swept values. Each cell has the
-    median, minimum and maximum of one of the ``metrics`` over these runs.
+    Each row summarizes the runs (``rows``) of one label, one set of sensors and one combination of swept values. Each
+    cell has the median, minimum and maximum of one of the ``metrics`` over these runs.
     """
     from statistics import median
 

@@ -1,5 +1,5 @@
-"""The commands ``fgloc datasets``, ``info``, ``manifest``, ``convert`` and ``simulate``, which list, summarize, describe, convert
-and simulate logs."""
+"""The commands ``fgloc datasets``, ``info``, ``manifest``, ``convert`` and ``simulate``, which list, summarize,
+describe, convert and simulate logs."""
 
 from __future__ import annotations
 

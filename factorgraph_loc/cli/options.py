@@ -193,8 +193,8 @@ def parse_settings(
 ) -> dict[str, dict[str, Any]]:
     """Parse the values of ``--set``: ``smoother.lag=10`` becomes {"smoother": {"lag": 10}}.
 
-    ``estimators``: names of the estimators that are run. ``sections``: other names that a setting may start with. Raises
-    InputError if a setting starts with another name.
+    ``estimators``: names of the estimators that are run. ``sections``: other names that a setting may start with.
+    Raises InputError if a setting starts with another name.
     """
     from factorgraph_loc.files.models import set_key
     from factorgraph_loc.fusion.registry import check_names

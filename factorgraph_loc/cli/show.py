@@ -114,8 +114,8 @@ def first_use() -> None:
 def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
     """Show a progress bar on stderr in this block. If stderr is no terminal, nothing is shown.
 
-    Yields a function ``update(done, total, remark="")`` that moves the bar. ``what``: title of the bar. ``counted``: if set, the
-    bar shows ``done`` and ``total`` as counts, otherwise a percentage.
+    Yields a function ``update(done, total, remark="")`` that moves the bar. ``what``: title of the bar. ``counted``: if
+    set, the bar shows ``done`` and ``total`` as counts, otherwise a percentage.
     """
     from rich.console import Console
     from rich.progress import (

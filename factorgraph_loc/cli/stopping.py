@@ -1,7 +1,7 @@
 """Orderly ends of a command after a signal, and when its output cannot be written.
 
-After a signal the command removes its temporary files and prints one line. If standard output is closed or its disk is full, the
-command ends with one line and an exit code.
+After a signal the command removes its temporary files and prints one line. If standard output is closed or its disk is
+full, the command ends with one line and an exit code.
 """
 
 import io
@@ -32,8 +32,8 @@ class Stop(KeyboardInterrupt):
 
 
 def end(stop: KeyboardInterrupt) -> int:
-    """Remove temporary files and print one line on stderr with the signal and the notes of the exception. Return the exit code,
-    which is 128 plus the number of the signal."""
+    """Remove temporary files and print one line on stderr with the signal and the notes of the exception. Return the
+    exit code, which is 128 plus the number of the signal."""
     from factorgraph_loc.files.temporary import remove_own
 
     remove_own()
@@ -154,8 +154,8 @@ def standard_streams() -> Iterator[None]:
 def _replaced(stream: TextIO | None, number: int, kind: type[io.TextIOWrapper], errors: str) -> io.TextIOWrapper:
     """Return a stream of class ``kind`` that writes to the descriptor of ``stream``.
 
-    ``number``: the descriptor to use if ``stream`` is None, which means that it was closed when Python started. ``errors``: how
-    characters that cannot be encoded are replaced.
+    ``number``: the descriptor to use if ``stream`` is None, which means that it was closed when Python started.
+    ``errors``: how characters that cannot be encoded are replaced.
     """
     if not isinstance(stream, io.TextIOWrapper):
         return kind(os.fdopen(number, "wb", closefd=False), "utf-8", errors)

@@ -102,8 +102,8 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
 def drawing(figure: Figure) -> Iterator[None]:
     """Prepare the texts of a figure, and suppress warnings while it is drawn in this block.
 
-    A ``$`` in a text is drawn and does not start a formula. Long lines are shortened. The suppressed warnings are about missing
-    glyphs and about labels that leave no room for the axes.
+    A ``$`` in a text is drawn and does not start a formula. Long lines are shortened. The suppressed warnings are about
+    missing glyphs and about labels that leave no room for the axes.
     """
     named = [text for axis in figure.axes for text in (axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts)]
     for text in (*figure.texts, *named, *(text for legend in figure.legends for text in legend.get_texts())):

@@ -1,7 +1,7 @@
 """HTML pages from the Jinja2 templates in ``templates``. All values are escaped.
 
-A page loads nothing: style, script, data and pictures are embedded. Its content security policy forbids other scripts, so a value
-that is not escaped by mistake cannot run. The same values give the same bytes.
+A page loads nothing: style, script, data and pictures are embedded. Its content security policy forbids other scripts,
+so a value that is not escaped by mistake cannot run. The same values give the same bytes.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The plotted data of a run, common parts of its plots, and the plot of its consistency.
 
-The consistency of an estimator is judged by the normalised estimation error squared (NEES) of the poses and the normalised
-innovation squared (NIS) of the predicted measurements. Both are chi-square distributed for a consistent estimator (Bar-Shalom, Li,
-Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4). Errors of consecutive poses are
-correlated, so the NEES is compared with the interval of a single value. Innovations are independent, so the running mean of the NIS
-is compared with the interval of the mean.
+The consistency of an estimator is judged by the normalised estimation error squared (NEES) of the poses and the
+normalised innovation squared (NIS) of the predicted measurements. Both are chi-square distributed for a consistent
+estimator (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4).
+Errors of consecutive poses are correlated, so the NEES is compared with the interval of a single value. Innovations are
+independent, so the running mean of the NIS is compared with the interval of the mean.
 """
 
 from __future__ import annotations
@@ -139,8 +139,8 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
 def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]:
     """Return the running means (N,) in windows of :data:`WINDOW` seconds around each time, and the sums of weights (N,) in them.
 
-    ``t`` (N,): ascending times [s]. ``values`` (N,): values that are already multiplied by their ``weights`` (N,). The mean is NaN
-    if the sum of weights is 0.
+    ``t`` (N,): ascending times [s]. ``values`` (N,): values that are already multiplied by their ``weights`` (N,). The
+    mean is NaN if the sum of weights is 0.
     """
     first = np.searchsorted(t, t - WINDOW / 2.0, side="left")
     last = np.searchsorted(t, t + WINDOW / 2.0, side="right")

@@ -1,14 +1,14 @@
 """Statistical inference on the scores of many runs: pooled scores, differences, significance and effect size.
 
-Runs are paired by log and seed. With six logs or more, intervals and tests are over logs. With a single log and six seeds or more,
-they are over seeds, and are valid for this log only. Otherwise there is neither interval nor test.
+Runs are paired by log and seed. With six logs or more, intervals and tests are over logs. With a single log and six
+seeds or more, they are over seeds, and are valid for this log only. Otherwise there is neither interval nor test.
 
-Test: Wilcoxon, "Individual comparisons by ranking methods", Biometrics Bulletin 1(6), 1945, with zeros as of Pratt, "Remarks on
-zeros and ties in the Wilcoxon signed rank procedures", JASA 54(287), 1959. Effect: matched-pairs rank-biserial correlation,
-Kerby, "The simple difference formula", Comprehensive Psychology 3, 2014. Many comparisons: Holm, "A simple sequentially rejective
-multiple test procedure", Scandinavian Journal of Statistics 6(2), 1979. Band of the NEES: Bar-Shalom, Li, Kirubarajan,
-"Estimation with Applications to Tracking and Navigation", 2001, section 5.4. Its number of independent values: Geyer,
-"Practical Markov chain Monte Carlo", Statistical Science 7(4), 1992, section 3.3.
+Test: Wilcoxon, "Individual comparisons by ranking methods", Biometrics Bulletin 1(6), 1945, with zeros as of Pratt,
+"Remarks on zeros and ties in the Wilcoxon signed rank procedures", JASA 54(287), 1959. Effect: matched-pairs
+rank-biserial correlation, Kerby, "The simple difference formula", Comprehensive Psychology 3, 2014. Many comparisons:
+Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6(2), 1979. Band of
+the NEES: Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4. Its
+number of independent values: Geyer, "Practical Markov chain Monte Carlo", Statistical Science 7(4), 1992, section 3.3.
 """
 
 import math
@@ -64,12 +64,12 @@ class Pooled:
 class Contrast:
     """The difference between the scores of two methods a and b.
 
-    ``difference``: pooled score of a minus that of b, negative if the scores of a are lower. ``low``, ``high``: 95 % interval.
-    ``p``: two-sided p value of the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1.
-    ``units``: "logs", or "seeds" of a single log. ``count``: number of units. Interval and test are over the units; they are None
-    if there are too few.
-    ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs that
-    cannot be paired with a run of the other method on the same log and seed.
+    ``difference``: pooled score of a minus that of b, negative if the scores of a are lower. ``low``, ``high``: 95 %
+    interval. ``p``: two-sided p value of the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1.
+    ``units``: "logs", or "seeds" of a single log. ``count``: number of units. Interval and test are over the units;
+    they are None if there are too few.
+    ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of runs. ``left_out``: number of
+    runs that cannot be paired with a run of the other method on the same log and seed.
     """
 
     difference: float
@@ -87,8 +87,8 @@ class Contrast:
 def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) -> Pooled | None:
     """Pool a score over seeds, and then over logs with equal weights. Return None if there are no scores.
 
-    ``scores``: by log and seed. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``: for logs that are
-    variants of the same log, a common name. Together they count as one log.
+    ``scores``: by log and seed. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``: for
+    logs that are variants of the same log, a common name. Together they count as one log.
     """
     known = {log: np.array([[v] for v in seeds.values() if v is not None]) for log, seeds in scores.items()}
     clusters = _clusters(known, alike)
@@ -108,8 +108,8 @@ def contrast(
     """Compare the scores ``a`` and ``b`` of two methods on common logs and seeds. Return None if they have no pair in common.
 
     If a method ran with a single seed, its run is paired with each seed of the other method. ``rms``, ``alike``: see
-    :func:`pooled`; ``by_log`` of the result lists variants of a log separately. ``interval``: whether to compute the interval,
-    which takes time.
+    :func:`pooled`; ``by_log`` of the result lists variants of a log separately. ``interval``: whether to compute the
+    interval, which takes time.
     """
     matched = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in matched.values()) + sum(len(b[log]) for log in b if log not in a)
@@ -146,11 +146,11 @@ def contrast(
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the table of differences between the RMSEs of all pairs of estimators ``a`` and ``b``, with :data:`DIFFERENCES`.
 
-    ``rows``: runs with log, estimator, seed and scores. A row of the table has the RMSEs on one log, pooled over pairs of
-    seeds, and their difference, which is negative if ``a`` is better. With enough logs for an interval there is a row with log
-    "(all)".
-    ``pairs``: number of compared pairs of runs. ``left_out``: number of runs that cannot be paired, because the other estimator
-    has no score for the same seed. Values are None if there are no pairs.
+    ``rows``: runs with log, estimator, seed and scores. A row of the table has the RMSEs on one log, pooled over pairs
+    of seeds, and their difference, which is negative if ``a`` is better. With enough logs for an interval there is a
+    row with log "(all)".
+    ``pairs``: number of compared pairs of runs. ``left_out``: number of runs that cannot be paired, because the other
+    estimator has no score for the same seed. Values are None if there are no pairs.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -244,8 +244,8 @@ def independent_count(values: Array) -> float:
 def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float, float]:
     """Return the 95 % interval of the NEES of a consistent estimator, averaged over each log and then over logs.
 
-    ``counts``: by log, the effective number of independent values. ``dofs``: by log, the degrees of freedom of a pose. The
-    distribution is approximated by a scaled chi-square distribution with the same mean and variance.
+    ``counts``: by log, the effective number of independent values. ``dofs``: by log, the degrees of freedom of a pose.
+    The distribution is approximated by a scaled chi-square distribution with the same mean and variance.
     """
     expected = float(np.mean(dofs))
     matched = (expected * len(dofs)) ** 2 / float(np.sum(np.asarray(dofs) / np.asarray(counts, dtype=float)))
@@ -264,8 +264,8 @@ def _ranks(differences: Array) -> Array:
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """Return one array (K, C) of scores for each log. Logs with the same name in ``alike`` have one array together, and logs
-    without scores have none."""
+    """Return one array (K, C) of scores for each log. Logs with the same name in ``alike`` have one array together, and
+    logs without scores have none."""
     merged: dict[str, list[Array]] = {}
     for log, values in scores.items():
         if len(values):

@@ -44,8 +44,8 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The entries of all sensor summaries by key, such as ``unseen`` or ``rfid``. If there are several sensors of a kind,
-        the entries of each are in a dictionary whose key is the name of the sensor."""
+        """The entries of all sensor summaries by key, such as ``unseen`` or ``rfid``. If there are several sensors of a
+        kind, the entries of each are in a dictionary whose key is the name of the sensor."""
         entries: dict[str, Any] = {}
         for name, summary in self.sensors.items():
             entries |= summary.found if kind_of(name) == name else {name: dict(summary.found)}

@@ -2,8 +2,8 @@
 
 Trajectories are compared without alignment, except on request or if the run estimated its map in a frame of its own.
 
-Pairing of poses: :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan, "Estimation with
-Applications to Tracking and Navigation", 2001, section 5.4. Relative pose errors:
+Pairing of poses: :mod:`factorgraph_loc.evaluation.pairing`. NEES and its bounds: Bar-Shalom, Li, Kirubarajan,
+"Estimation with Applications to Tracking and Navigation", 2001, section 5.4. Relative pose errors:
 :mod:`factorgraph_loc.evaluation.trajectories.score`.
 """
 
@@ -198,8 +198,8 @@ def landmark_figures(
 ) -> dict[str, Any]:
     """Return the scores of the landmarks of a run that estimated its map. A score that is undefined is None.
 
-    Estimated ``landmarks`` are compared with those of the log's map, after an alignment in the plane that moves ``trajectory`` onto
-    the reference. Without a reference, the alignment moves the landmarks onto those of the map.
+    Estimated ``landmarks`` are compared with those of the log's map, after an alignment in the plane that moves
+    ``trajectory`` onto the reference. Without a reference, the alignment moves the landmarks onto those of the map.
 
     - ``landmarks.count``: number of estimated landmarks that the log's map has too.
     - ``landmarks.rmse`` [m]: root mean square distance of these landmarks from the map.

@@ -1,11 +1,11 @@
 """Common steps of all scores of trajectories: pairing of poses with the reference, pieces of paths, and statistics of errors.
 
-A trajectory is compared with the reference at timestamps of the reference, at most ten per second. Relative errors are computed
-over pieces of the path.
+A trajectory is compared with the reference at timestamps of the reference, at most ten per second. Relative errors are
+computed over pieces of the path.
 
-The estimates are interpolated at these timestamps. The reference is not interpolated: nothing is scored in its gaps. Estimates are
-usually 0.1 s apart, so a scored pose is interpolated between two estimates that are less than 0.1 s away. The later one may use a
-measurement that arrives after the timestamp.
+The estimates are interpolated at these timestamps. The reference is not interpolated: nothing is scored in its gaps.
+Estimates are usually 0.1 s apart, so a scored pose is interpolated between two estimates that are less than 0.1 s away.
+The later one may use a measurement that arrives after the timestamp.
 
 Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights, which is conservative. Let
 ``a`` and ``b`` be the errors of the neighbours, and ``f`` the weight of the later one. The covariance of ``(1 - f) a + f b`` is at
@@ -48,8 +48,8 @@ class Pairs:
 
 
 def thinned(t: Array) -> Integers:
-    """Return the indices of those timestamps (N,) [s] at which poses are scored. They are the first timestamp, and then each
-    first timestamp that is at least 0.1 s after the previously selected one. ``t`` is ascending."""
+    """Return the indices of those timestamps (N,) [s] at which poses are scored. They are the first timestamp, and then
+    each first timestamp that is at least 0.1 s after the previously selected one. ``t`` is ascending."""
     kept: list[int] = []
     stamps, i = t.tolist(), 0
     while i < len(stamps):
@@ -95,8 +95,8 @@ def pauses(t: Array) -> Integers:
 
 
 def _within(t: Array, stamps: Array) -> Array:
-    """Return times ``t`` (M,) clipped to the range of ``stamps`` (N,). A time that is outside by more than :data:`TOLERANCE`
-    becomes NaN."""
+    """Return times ``t`` (M,) clipped to the range of ``stamps`` (N,). A time that is outside by more than
+    :data:`TOLERANCE` becomes NaN."""
     if not len(stamps):
         return np.full(len(t), np.nan)
     clipped = np.clip(t, stamps[0], stamps[-1])
@@ -128,8 +128,8 @@ def summarize(values: Array) -> dict[str, float | None]:
 def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
     """Divide a path of N poses into successive pieces. Return the indices of the first and the last pose of each piece.
 
-    ``steps`` (N - 1,): distances or times between successive poses. ``first``: index of the first pose. A piece ends at the first
-    pose where the sum of its steps is ``length`` or more.
+    ``steps`` (N - 1,): distances or times between successive poses. ``first``: index of the first pose. A piece ends at
+    the first pose where the sum of its steps is ``length`` or more.
     """
     pieces: list[tuple[int, int]] = []
     begin, covered = first, 0.0

@@ -32,8 +32,8 @@ _FILES = (
 
 
 def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path) -> list[Path]:
-    """Write the plots of the runs on a log into ``folder``. Return the paths of the PNG files, whose names start with that of the
-    log.
+    """Write the plots of the runs on a log into ``folder``. Return the paths of the PNG files, whose names start with
+    that of the log.
 
     ``tracks``: the plotted data of the run of each estimator by name. The plots are:
 
@@ -263,8 +263,8 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Return the upper end of the y axis of a panel of :func:`_band`, whose lower end is its negative. Half a percent of the errors
-    and band limits are larger."""
+    """Return the upper end of the y axis of a panel of :func:`_band`, whose lower end is its negative. Half a percent
+    of the errors and band limits are larger."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))

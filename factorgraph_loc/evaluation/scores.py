@@ -16,10 +16,10 @@ _DEGREES = 180.0 / math.pi
 class Metric:
     """How a score is displayed and pooled.
 
-    ``key``: key of the score, such as "final.position_rmse". ``title``: name in an HTML report. There the value is multiplied by
-    ``factor`` and has the unit ``unit``. ``column``: header in a table of text, with the unit of the value itself. ``digits``:
-    decimals in such a table. ``rms``: whether values are pooled by the root mean square instead of the mean. ``better``:
-    "low" or "high", the values that are better, None for neither.
+    ``key``: key of the score, such as "final.position_rmse". ``title``: name in an HTML report. There the value is
+    multiplied by ``factor`` and has the unit ``unit``. ``column``: header in a table of text, with the unit of the
+    value itself. ``digits``: decimals in such a table. ``rms``: whether values are pooled by the root mean square
+    instead of the mean. ``better``: "low" or "high", the values that are better, None for neither.
     """
 
     title: str

@@ -1,7 +1,7 @@
 """Pooled scores, their bootstrap, and the comparison of two methods on the same cases.
 
-Runs are paired by log and seed, and logs are clusters. Intervals are percentile bootstraps over logs and, within each log, over
-seeds (Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
+Runs are paired by log and seed, and logs are clusters. Intervals are percentile bootstraps over logs and, within each
+log, over seeds (Davison and Hinkley, "Bootstrap Methods and their Application", 1997, section 3.8).
 
 Proportions are compared by McNemar's test with the exact binomial distribution: McNemar, "Note on the sampling error of the
 difference between correlated proportions or percentages", Psychometrika 12(2), 1947. Intervals of medians are percentile bootstraps
@@ -40,8 +40,8 @@ def pooled_rms(values: Sequence[float]) -> float:
 def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> tuple[Array, int]:
     """Pair the scores of two methods by seed. ``a``, ``b``: by seed, the score of a run, None if it has none.
 
-    If a method has a single run, it is paired with each run of the other method. Returns the pairs (K, 2), and the number of seeds
-    that have no pair.
+    If a method has a single run, it is paired with each run of the other method. Returns the pairs (K, 2), and the
+    number of seeds that have no pair.
     """
     by_seed = (a, b)
     seeds = sorted(set(a) | set(b))
@@ -63,8 +63,8 @@ def bounds(figures: Array) -> tuple[float, float]:
 def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
     """Return bootstrap draws (DRAWS, C) of C pooled scores. Logs are drawn, and seeds within each log.
 
-    ``clusters``: for each log, the scores (K, C) of its K seeds. Scores are pooled over seeds, and then over logs with equal
-    weights, by the root mean square if ``rms`` is set, and otherwise by the mean.
+    ``clusters``: for each log, the scores (K, C) of its K seeds. Scores are pooled over seeds, and then over logs with
+    equal weights, by the root mean square if ``rms`` is set, and otherwise by the mean.
     """
     scores = np.concatenate([np.square(cluster) if rms else cluster for cluster in clusters])
     drawn = _weights(tuple(map(len, clusters))) @ scores
@@ -91,8 +91,8 @@ def _weights(seeds: tuple[int, ...]) -> Array:
 class McNemar:
     """The result of McNemar's test.
 
-    ``only_a``, ``only_b``: number of cases in which the event occurred only with method a, or only with b. ``p``: two-sided p value
-    of the hypothesis that the event is equally frequent with both.
+    ``only_a``, ``only_b``: number of cases in which the event occurred only with method a, or only with b. ``p``:
+    two-sided p value of the hypothesis that the event is equally frequent with both.
     """
 
     only_a: int

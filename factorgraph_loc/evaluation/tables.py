@@ -80,8 +80,8 @@ def unscored(rows: Sequence[Row]) -> list[str]:
 def verdict(rows: Sequence[Row]) -> list[str]:
     """Return a sentence about the estimator with the smallest position error, for causal and for final trajectories.
 
-    Errors are pooled over logs and seeds. The sentence also names estimators that are nearly as good, and the error of dead
-    reckoning. Estimators with a failed run or a missing score are excluded.
+    Errors are pooled over logs and seeds. The sentence also names estimators that are nearly as good, and the error of
+    dead reckoning. Estimators with a failed run or a missing score are excluded.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -163,8 +163,8 @@ def _pooled(metric: Metric, by_log: Sequence[Sequence[Row]]) -> str:
 def counted(*by_log: Sequence[Row]) -> str:
     """Return the number of scored poses on all logs as text, such as "840", or "800 to 840" if the runs of a log differ.
 
-    ``by_log``: the runs on each log. The first number is the sum over logs of the smallest number, the second of the largest.
-    "" if no log has a reference.
+    ``by_log``: the runs on each log. The first number is the sum over logs of the smallest number, the second of the
+    largest. "" if no log has a reference.
     """
     counts = [[c for row in runs if (c := scored_of(row)) is not None] for runs in by_log]
     known = [of_log for of_log in counts if of_log]

@@ -65,8 +65,8 @@ class ActiveJob:
         return digest_of(given + [model.model_dump(mode="json") for model in (self.simulation, self.settings)])
 
     def make(self) -> Files:
-        """Execute the run. Return the content of its files by name: the scores as JSON, and the plot as PNG. If the input is
-        invalid, return the file that describes the failure."""
+        """Execute the run. Return the content of its files by name: the scores as JSON, and the plot as PNG. If the
+        input is invalid, return the file that describes the failure."""
         try:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)
         except InputError as error:
@@ -102,17 +102,17 @@ def active(
 
     ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings.
     ``out``: folder for the results. ``overwrite``: whether existing results in it may be replaced.
-    ``changes``: nested tables of settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres": 50}``.
-    ``jobs``: number of parallel processes, None for one per core.
+    ``changes``: nested tables of settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres":
+    50}``. ``jobs``: number of parallel processes, None for one per core.
     ``progress``: called with the number of finished runs and of all runs.
 
     The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
-    :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and ``plots/comparison.png``.
-    For each policy and estimator there is a plot of the run with the first seed. A failed run has a row with the reason, and does
-    not stop other runs. The same call resumes an interrupted experiment.
+    :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and
+    ``plots/comparison.png``. For each policy and estimator there is a plot of the run with the first seed. A failed run
+    has a row with the reason, and does not stop other runs. The same call resumes an interrupted experiment.
 
-    Raises InputError before any run if a policy or an estimator is unknown or repeated, or if ``out`` contains results and
-    ``overwrite`` is not set. Also raises InputError if every run rejects its input.
+    Raises InputError before any run if a policy or an estimator is unknown or repeated, or if ``out`` contains results
+    and ``overwrite`` is not set. Also raises InputError if every run rejects its input.
     """
     simulation, settings = _settings(world, changes or {})
     seeds, out = list(seeds), Path(out)

@@ -1,7 +1,7 @@
 """Results of active localization: summaries of policies, paired comparisons on the same seeds, and plots.
 
-A run that failed, or whose robot is not localized at the end, has an infinite distance. ``rows`` are the runs: dictionaries with
-world, estimator, policy, seed and figures.
+A run that failed, or whose robot is not localized at the end, has an infinite distance. ``rows`` are the runs:
+dictionaries with world, estimator, policy, seed and figures.
 """
 
 from __future__ import annotations
@@ -207,8 +207,8 @@ def comparison(rows: Sequence[Row]) -> Figure:
 
 
 def run_picture(run: ActiveRun) -> Figure:
-    """Plot some decisions of a run: the belief, the candidate paths and the chosen path. Also plot the belief's standard deviation
-    over distance."""
+    """Plot some decisions of a run: the belief, the candidate paths and the chosen path. Also plot the belief's
+    standard deviation over distance."""
     chosen = np.unique(np.linspace(0, len(run.steps) - 1, SHOWN).round().astype(int)) if run.steps else ()
     rows = max(math.ceil(len(chosen) / COLUMNS), 1)
     width, depth = np.ptp(_outline(run).reshape(-1, 2), axis=0)

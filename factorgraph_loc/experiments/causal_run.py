@@ -38,8 +38,8 @@ GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_thresho
 class CausalEstimates:
     """The estimates of a run, which are recorded at regular times (ticks). Each field is a list with one entry per tick.
 
-    ``t``: times [s]. ``poses``, ``covariances``: (3,) and (3, 3), of (x, y, heading) [m, rad]. ``status``: whether the pose is
-    known, ambiguous or unknown. ``doubts_model``: whether measurements contradict the model of their sensor.
+    ``t``: times [s]. ``poses``, ``covariances``: (3,) and (3, 3), of (x, y, heading) [m, rad]. ``status``: whether the
+    pose is known, ambiguous or unknown. ``doubts_model``: whether measurements contradict the model of their sensor.
     """
 
     t: list[float] = field(default_factory=list)
@@ -126,15 +126,15 @@ class CausalRun:
         )
 
     def _measurements(self) -> Iterator[Measurement]:
-        """Return the measurements until ``end``. Successive rows of odometry are joined in one ``Rows`` object, if the estimator
-        has the attribute ``takes_rows``."""
+        """Return the measurements until ``end``. Successive rows of odometry are joined in one ``Rows`` object, if the
+        estimator has the attribute ``takes_rows``."""
         joined = getattr(self.estimator, "takes_rows", False)
         steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
         return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
-        """Record the estimates at the ticks before a measurement at ``t`` [s]. Initialize the estimator first if ``t`` is later
-        than the start and it is not initialized."""
+        """Record the estimates at the ticks before a measurement at ``t`` [s]. Initialize the estimator first if ``t``
+        is later than the start and it is not initialized."""
         if not self._initialized and t > self._start:
             self._initialize()
         for tick in self.ticks.advance(t):
@@ -198,8 +198,8 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 def rare_garbage_collection() -> Iterator[None]:
     """Collect garbage less often in this block, and exclude objects that exist already.
 
-    A collection over the objects of all loaded modules takes as long as many updates. No effect if the program has called
-    ``gc.freeze``.
+    A collection over the objects of all loaded modules takes as long as many updates. No effect if the program has
+    called ``gc.freeze``.
     """
     if gc.get_freeze_count():
         yield

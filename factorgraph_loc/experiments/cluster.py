@@ -1,7 +1,7 @@
 """Execution of the runs of an experiment on an existing cluster of ``dask.distributed``.
 
-Workers return the files of their runs, so a common file system is needed only for recorded logs. If a worker ends during a run,
-another worker repeats the run.
+Workers return the files of their runs, so a common file system is needed only for recorded logs. If a worker ends
+during a run, another worker repeats the run.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class _Made:
 class Cluster(Executor):
     """Executes runs on the cluster of a scheduler. ``scheduler``: its address.
 
-    The time of a run is limited by this class, and its memory by the cluster. Used as a context manager, the executor raises
-    InputError if ``distributed`` is not installed, the scheduler does not answer or has no workers, or a worker has other code or
-    libraries. It raises RunFailedError if the connection to the scheduler is lost.
+    The time of a run is limited by this class, and its memory by the cluster. Used as a context manager, the executor
+    raises InputError if ``distributed`` is not installed, the scheduler does not answer or has no workers, or a worker
+    has other code or libraries. It raises RunFailedError if the connection to the scheduler is lost.
     """
 
     def __init__(self, scheduler: str, limits: Limits) -> None:

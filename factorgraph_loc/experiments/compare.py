@@ -74,8 +74,8 @@ def compare(
 ) -> Comparison:
     """Run several estimators on several logs with each seed, and compare them.
 
-    ``out``: folder for the results, None for a new folder below the folder ``out``. ``overwrite``: whether existing results in it
-    may be replaced.
+    ``out``: folder for the results, None for a new folder below the folder ``out``. ``overwrite``: whether existing
+    results in it may be replaced.
     ``settings``: by estimator, its settings by key. ``rig``, ``world``: replace those of the logs.
     ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
     :class:`~factorgraph_loc.experiments.experiment_file.Experiment`.
@@ -83,11 +83,11 @@ def compare(
     ``jobs``: number of parallel processes, None for one per core.
     ``progress``: called with the number of finished runs and of all runs.
 
-    A run that fails, or whose process dies, has a row with the reason, and does not stop other runs. Runs with stored results are
-    not repeated. The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
-    :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html`` (see
-    :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the folder ``store``
-    (see :class:`~factorgraph_loc.experiments.store.Store`).
+    A run that fails, or whose process dies, has a row with the reason, and does not stop other runs. Runs with stored
+    results are not repeated. The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run),
+    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html``
+    (see :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the
+    folder ``store`` (see :class:`~factorgraph_loc.experiments.store.Store`).
 
     Raises InputError before any run if the input is invalid, or ``out`` contains results and ``overwrite`` is not set.
     """

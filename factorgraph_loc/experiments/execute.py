@@ -42,9 +42,9 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 class Planned(Protocol):
     """A planned run, which can be pickled and sent to other processes.
 
-    ``key``: key of its results in the store. ``source``: identifies the data that it loads. Runs with the same source are computed
-    in the same process if possible. ``shown``: a description that distinguishes the run from others. ``columns``: the first columns
-    of its row in the table of results.
+    ``key``: key of its results in the store. ``source``: identifies the data that it loads. Runs with the same source
+    are computed in the same process if possible. ``shown``: a description that distinguishes the run from others.
+    ``columns``: the first columns of its row in the table of results.
     """
 
     @property

@@ -64,8 +64,8 @@ class Prepared(Generic[Run]):
 class Done:
     """The results of several runs.
 
-    ``table``: a row for each run, see :func:`~factorgraph_loc.experiments.result_table.load_results`. ``failures``: a text for each
-    failed run. ``warnings``: each warning once.
+    ``table``: a row for each run, see :func:`~factorgraph_loc.experiments.result_table.load_results`. ``failures``: a
+    text for each failed run. ``warnings``: each warning once.
     """
 
     table: pl.DataFrame
@@ -146,8 +146,8 @@ def prepare(
     """Read an experiment file and plan its runs. Return the experiment, and the runs with the states of stored results.
 
     ``changes``: values by dotted key that replace those of the file, see
-    :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``data_root``: the data folder, None for the environment
-    variable FGLOC_DATA. ``out``: folder of the results, None for the folder that the file names.
+    :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``data_root``: the data folder, None for the
+    environment variable FGLOC_DATA. ``out``: folder of the results, None for the folder that the file names.
 
     Raises InputError for errors in the file and for too many runs, and StoreError if the folder for results cannot be written.
     """
@@ -172,8 +172,8 @@ def run_experiment(
 ) -> Done:
     """Execute the runs without stored results, and write the table of all results. ``again``: whether to repeat failed runs.
 
-    For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The table is written also after an error or an interrupt.
-    Raises StoreError if the store cannot be written.
+    For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The table is written also after an error or an
+    interrupt. Raises StoreError if the store cannot be written.
     """
     from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
 

@@ -83,10 +83,10 @@ def _seeds(value: Any) -> Any:
 class LogEntry(FileModel):
     """An entry of ``logs``: either recorded logs (``log``) or simulated logs (``simulate``).
 
-    ``log``: a name that ``fgloc datasets`` lists, a path relative to the folder of the experiment file, or a glob for several names
-    or paths. With ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world`` that replace those of the
-    log. ``simulate``: a preset or a TOML file. With ``simulate`` there may be ``settings`` of the simulation, and ``seeds``. There
-    is one simulated log per seed.
+    ``log``: a name that ``fgloc datasets`` lists, a path relative to the folder of the experiment file, or a glob for
+    several names or paths. With ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world``
+    that replace those of the log. ``simulate``: a preset or a TOML file. With ``simulate`` there may be ``settings`` of
+    the simulation, and ``seeds``. There is one simulated log per seed.
     """
 
     log: Name | None = None
@@ -159,8 +159,8 @@ class Sweep(FileModel):
     def points(self, *words: str) -> list[dict[str, Scalar]]:
         """Return the combinations of values of swept settings, without duplicates. Each is a dictionary by dotted name.
 
-        ``words``: only settings whose names start with one of these words are combined; none for all settings. Without settings,
-        the result is one empty combination. At most :data:`MOST_RUNS` + 1 combinations are returned.
+        ``words``: only settings whose names start with one of these words are combined; none for all settings. Without
+        settings, the result is one empty combination. At most :data:`MOST_RUNS` + 1 combinations are returned.
         """
         columns = {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
         combined: Iterable[tuple[Scalar, ...]] = itertools.product(*map(dict.fromkeys, columns.values()))

@@ -106,8 +106,8 @@ class LogFacts:
 
 @dataclass(frozen=True)
 class EstimatorFacts:
-    """Facts about an estimator. ``effective``: its settings, including defaults. ``deterministic``: whether it uses no random
-    numbers."""
+    """Facts about an estimator. ``effective``: its settings, including defaults. ``deterministic``: whether it uses no
+    random numbers."""
 
     effective: Mapping[str, Any]
     deterministic: bool
@@ -116,8 +116,8 @@ class EstimatorFacts:
 class _Kept(BaseModel):
     """The content of a cache of facts. ``version``: hash of the code and libraries that computed them.
 
-    ``files``: by path, the size, modification time and sha256 of a file. ``logs``: by hash of a source, facts about its logs.
-    ``estimators``: by name and settings.
+    ``files``: by path, the size, modification time and sha256 of a file. ``logs``: by hash of a source, facts about its
+    logs. ``estimators``: by name and settings.
     """
 
     version: str = ""

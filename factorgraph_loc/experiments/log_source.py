@@ -184,8 +184,8 @@ class GivenSource(LogSource):
 def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSource]:
     """Return the sources for a name in an experiment file: a known name, a path relative to ``folder``, or a glob for either.
 
-    ``options``: further fields of the sources. Raises InputError if a glob matches no log, or if a path leads out of ``folder`` and
-    of the data folder.
+    ``options``: further fields of the sources. Raises InputError if a glob matches no log, or if a path leads out of
+    ``folder`` and of the data folder.
     """
     known = manifests()
     if name in known:

@@ -66,15 +66,15 @@ Progress = Callable[[float], None]
 class MapOptions:
     """How a map is made.
 
-    ``of``: landmarks, tags or points. None: points if the log has images, landmarks if it has sightings of them, else tags.
-    ``estimator``, ``settings``: the estimator of landmarks, and its settings.
+    ``of``: landmarks, tags or points. None: points if the log has images, landmarks if it has sightings of them, else
+    tags. ``estimator``, ``settings``: the estimator of landmarks, and its settings.
     ``points``: settings of a map of points, fields of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`.
     ``extend``: whether to keep the log's map and to add what it lacks.
-    ``poses``: source of the robot poses for a map of tags: "reference", or "odometry" to estimate the poses together with the tags.
-    None: "reference" if the log has one, else "odometry".
-    ``height`` [m]: height of tags or landmarks that the log's map lacks, None for the height of the antennas or of the radio.
-    ``drop_dead``: if set, nothing is mapped, and the log's map is written without the tags that are believed dead.
-    ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
+    ``poses``: source of the robot poses for a map of tags: "reference", or "odometry" to estimate the poses together
+    with the tags. None: "reference" if the log has one, else "odometry".
+    ``height`` [m]: height of tags or landmarks that the log's map lacks, None for the height of the antennas or of the
+    radio. ``drop_dead``: if set, nothing is mapped, and the log's map is written without the tags that are believed
+    dead. ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
 
     of: str | None = None
@@ -90,8 +90,8 @@ class MapOptions:
 
 @dataclass(frozen=True)
 class DroppedTags:
-    """The result of the removal of dead tags. ``dropped``: by removed tag, its probability of being dead. ``kept``: number of the
-    remaining tags."""
+    """The result of the removal of dead tags. ``dropped``: by removed tag, its probability of being dead. ``kept``:
+    number of the remaining tags."""
 
     dropped: Mapping[str, float]
     kept: int
@@ -129,8 +129,8 @@ def plot_path(out: Path, *, overwrite: bool) -> Path:
 def make_map(log: Log, options: MapOptions | None = None, progress: Progress = lambda _share: None) -> MadeMap:
     """Make a map from a log. If the log has a map already, it is compared with the new map, or extended.
 
-    ``progress``: called with the fraction done. Raises InputError if options contradict each other or do not fit the log, and
-    RunFailedError if nothing could be located.
+    ``progress``: called with the fraction done. Raises InputError if options contradict each other or do not fit the
+    log, and RunFailedError if nothing could be located.
     """
     options = options or MapOptions()
     if options.drop_dead:
@@ -215,8 +215,8 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _at_height(world: World, names: Iterable[str], height: float | None) -> World:
-    """Return the world with ``height`` [m] for the landmarks ``names``. Those that the world lacks are added at its origin, for
-    estimators that use only their heights. Without a height the world is returned unchanged."""
+    """Return the world with ``height`` [m] for the landmarks ``names``. Those that the world lacks are added at its
+    origin, for estimators that use only their heights. Without a height the world is returned unchanged."""
     if height is None:
         return world
     marks = {name: world.landmarks.get(name, Landmark(x=0.0, y=0.0)).model_copy(update={"z": height}) for name in names}

@@ -91,8 +91,8 @@ def write_run(
 def save_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Write the files of a run as :func:`write_run`. If that fails, they are written to a new folder in the temporary folder of the
-    system, and the raised InputError names this folder."""
+    """Write the files of a run as :func:`write_run`. If that fails, they are written to a new folder in the temporary
+    folder of the system, and the raised InputError names this folder."""
     try:
         return write_run(result, log, out, align=align, overwrite=overwrite)
     except InputError as error:
@@ -254,8 +254,8 @@ def _slowest_update(result: RunResult) -> Array:
 def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:
     """Return the content of the files of a run by name, for the store of an experiment.
 
-    The files are those of :func:`write_run`, except that times are in a file of their own and ``update_ms`` is empty. Therefore all
-    other files are reproducible. ``started``: value of ``perf_counter`` at the start of the run.
+    The files are those of :func:`write_run`, except that times are in a file of their own and ``update_ms`` is empty.
+    Therefore all other files are reproducible. ``started``: value of ``perf_counter`` at the start of the run.
     """
     scores = score(result, log, align)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}

@@ -99,15 +99,15 @@ def plan(
 ) -> list[PlannedRun]:
     """Return all runs of an experiment.
 
-    ``folder``: paths in the experiment are relative to it. ``cache``: folder for cached facts about logs and estimators.
-    ``data_root``: the data folder, None for the environment variable FGLOC_DATA. ``given``: sources of logs that replace those of
-    the experiment.
+    ``folder``: paths in the experiment are relative to it. ``cache``: folder for cached facts about logs and
+    estimators. ``data_root``: the data folder, None for the environment variable FGLOC_DATA. ``given``: sources of logs
+    that replace those of the experiment.
 
-    Swept settings of one estimator do not multiply the runs of other estimators. Deterministic estimators run only with the first
-    seed.
+    Swept settings of one estimator do not multiply the runs of other estimators. Deterministic estimators run only with
+    the first seed.
 
-    Raises InputError for more than :data:`MOST_RUNS` runs, an unreadable log, two logs with the same name, invalid settings, an
-    invalid prior, or a sensor that no log has.
+    Raises InputError for more than :data:`MOST_RUNS` runs, an unreadable log, two logs with the same name, invalid
+    settings, an invalid prior, or a sensor that no log has.
     """
     facts = Facts(cache / "facts.json")
     experiment = _placed(experiment, folder, data_root)
@@ -176,8 +176,8 @@ def _check_count(count: int, experiment: Experiment) -> None:
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
-    """Return the combinations of swept settings of an estimator and of simulated logs. Combinations with equal settings of the
-    simulation form a group, whose key is the tuple of their values."""
+    """Return the combinations of swept settings of an estimator and of simulated logs. Combinations with equal settings
+    of the simulation form a group, whose key is the tuple of their values."""
     points: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
         points.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)

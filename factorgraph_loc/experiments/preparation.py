@@ -98,8 +98,8 @@ def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """Return the names of the sensors that a run uses.
 
-    ``asked``: the requested sensors, None for all sensors of the rig whose measurements the log has. Raises InputError if a
-    requested sensor is not available, or if no sensor is available.
+    ``asked``: the requested sensors, None for all sensors of the rig whose measurements the log has. Raises InputError
+    if a requested sensor is not available, or if no sensor is available.
     """
     available = (*log.streams, *_filled_columns(log))
     asked = None if asked is None else log.rig.expanded(asked)
@@ -150,8 +150,8 @@ def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel
 
 
 def checked_use(use: Use) -> Use:
-    """Check that the settings of a run fit its log, by the function ``check`` of each sensor package. Return the run with the
-    settings and warnings that these functions have changed.
+    """Check that the settings of a run fit its log, by the function ``check`` of each sensor package. Return the run
+    with the settings and warnings that these functions have changed.
 
     Raises InputError if a setting does not fit the log.
     """

@@ -48,8 +48,8 @@ def report(
 def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) -> Report:
     """Write the report of all existing results of an experiment into its folder.
 
-    All results are compared with their checksums. Damaged results are listed and excluded. Maps and references of the logs are
-    cached in the store. Raises InputError if there are no results, or if the page cannot be written.
+    All results are compared with their checksums. Damaged results are listed and excluded. Maps and references of the
+    logs are cached in the store. Raises InputError if there are no results, or if the page cannot be written.
     """
     prepared = Prepared.of(prepared.folder, prepared.runs, prepared.limits)
     damaged = [run.shown for run in prepared.damaged()]

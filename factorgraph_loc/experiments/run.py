@@ -55,10 +55,10 @@ def run(
     ``progress``: called with the fraction done. If features are extracted from images, this is the first half.
     ``watch``: called with the time and the estimator after each tick, for instance to inspect its belief.
 
-    Causal estimates are recorded at ticks, which are at 10 Hz from the time of the prior on, except inside long gaps between
-    measurements (``config.tick_gap``). The estimator processes all measurements that arrive up to a tick before the estimate is
-    recorded. Odometry older than the prior is processed before the estimator is initialized, because it determines the initial
-    velocity. Other measurements older than the prior are counted as ignored.
+    Causal estimates are recorded at ticks, which are at 10 Hz from the time of the prior on, except inside long gaps
+    between measurements (``config.tick_gap``). The estimator processes all measurements that arrive up to a tick before
+    the estimate is recorded. Odometry older than the prior is processed before the estimator is initialized, because it
+    determines the initial velocity. Other measurements older than the prior are counted as ignored.
 
     With an unknown start, ticks begin at the first measurement. The final trajectory begins at the first estimate and may be empty.
     A log with neither start nor reference, and without a map that its sensors observe, starts at the pose (0, 0, 0).

@@ -134,8 +134,8 @@ class Store:
     def row(self, key: str) -> dict[str, Any]:
         """Return the columns of a run for the table of results.
 
-        They are ``status`` (ok, failed), the ``kind`` and ``reason`` of a failure, scores and times that are single numbers, and
-        ``warnings``, one on each line. Raises DamagedError as :meth:`read`.
+        They are ``status`` (ok, failed), the ``kind`` and ``reason`` of a failure, scores and times that are single
+        numbers, and ``warnings``, one on each line. Raises DamagedError as :meth:`read`.
         """
         return self._row(self._manifest(key))
 

@@ -1,8 +1,8 @@
 """Exports a log and its runs as a Rerun recording (https://rerun.io).
 
-All positions are in the world frame [m], z up. The timeline ``log_time`` counts seconds from the start of the log. All data are
-sent as columns, because Rerun 0.41 writes broken files for single values logged with ``set_time(duration=...)``. The library
-``rerun-sdk`` is optional. Without it, this module cannot be imported.
+All positions are in the world frame [m], z up. The timeline ``log_time`` counts seconds from the start of the log. All
+data are sent as columns, because Rerun 0.41 writes broken files for single values logged with
+``set_time(duration=...)``. The library ``rerun-sdk`` is optional. Without it, this module cannot be imported.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
     """Show a log and its runs in the Rerun viewer. A viewer that is open is used.
 
-    ``bind``: the IP address on which a new viewer listens. Only this machine reaches the default address. Raises InputError if an
-    image cannot be read, if there is no display, or if the viewer does not start.
+    ``bind``: the IP address on which a new viewer listens. Only this machine reaches the default address. Raises
+    InputError if an image cannot be read, if there is no display, or if the viewer does not start.
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         raise InputError(

@@ -1,7 +1,7 @@
 """Starts the process of the Rerun viewer.
 
-The viewer requires no password, and ``rerun.spawn`` makes it listen on all network interfaces. This module starts it instead, so
-that it listens on one address.
+The viewer requires no password, and ``rerun.spawn`` makes it listen on all network interfaces. This module starts it
+instead, so that it listens on one address.
 """
 
 import ipaddress
@@ -27,8 +27,8 @@ PATIENCE = 30.0  # s: maximum time for the viewer to start
 def open_viewer(bind: str) -> Iterator[str]:
     """Yield the URL of a viewer for :meth:`rerun.RecordingStream.connect_grpc`. Starts a viewer unless one is open.
 
-    A new viewer listens on the IP address ``bind`` and stays open after the end of this process. Raises InputError if ``bind`` is
-    no IP address, if the viewer does not start, or if it is closed before the end of the block.
+    A new viewer listens on the IP address ``bind`` and stays open after the end of this process. Raises InputError if
+    ``bind`` is no IP address, if the viewer does not start, or if it is closed before the end of the block.
     """
     host = _reachable(bind)
     url = f"rerun+http://{f'[{host}]' if ':' in host else host}:{PORT}/proxy"

@@ -1,7 +1,7 @@
 """Exports a log and its runs as an MCAP file (https://mcap.dev) with standard messages of ROS 2.
 
-Foxglove, RViz and ``ros2 bag play`` read such files. Poses are in the frame ``map``, with absolute timestamps. The library
-``rosbags`` is optional and imported only where it is used.
+Foxglove, RViz and ``ros2 bag play`` read such files. Poses are in the frame ``map``, with absolute timestamps. The
+library ``rosbags`` is optional and imported only where it is used.
 """
 
 import heapq
@@ -209,8 +209,8 @@ class _Maker:
     ) -> dict[str, Any]:
         """Return the fields of a ``visualization_msgs/Marker`` that describe its shape, for :meth:`markers`.
 
-        ``name``: namespace. ``kind``: type of the marker. ``size``: diameter, width or height [m]. ``points``: its points [m].
-        ``text``: its text, at the position ``at`` [m].
+        ``name``: namespace. ``kind``: type of the marker. ``size``: diameter, width or height [m]. ``points``: its
+        points [m]. ``text``: its text, at the position ``at`` [m].
         """
         red, green, blue = (value / 255.0 for value in colour)
         return {

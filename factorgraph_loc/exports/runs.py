@@ -98,8 +98,8 @@ def _stored(path: Path) -> list[Path]:
 def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
     """Read the runs on ``log`` in ``folders``.
 
-    The name of a run is its estimator. If such names are not unique, the seed is appended, and also the folder if needed. Raises
-    InputError if a run is not of this log, or if a file is damaged.
+    The name of a run is its estimator. If such names are not unique, the seed is appended, and also the folder if
+    needed. Raises InputError if a run is not of this log, or if a file is damaged.
     """
     names = [folder.estimator for folder in folders]
     with_seeds = [f"{folder.estimator}-seed{folder.seed}" for folder in folders]

@@ -22,8 +22,8 @@ REFERENCE, DARK, DETECTION, SIGHTING = (128, 128, 128), (160, 160, 160), (230, 1
 
 @dataclass(frozen=True)
 class Lights:
-    """The objects of a map that are highlighted over time. The objects ``names[i]`` are highlighted from ``t[i]`` to ``t[i + 1]``
-    [s]."""
+    """The objects of a map that are highlighted over time. The objects ``names[i]`` are highlighted from ``t[i]`` to
+    ``t[i + 1]`` [s]."""
 
     t: Array
     names: tuple[tuple[str, ...], ...]

@@ -52,8 +52,8 @@ class NoFileNameError(InputError):
 def kind(path: Path, source: object = None) -> str:
     """Return the kind of a path: "a file", "a folder", "a named pipe", "a socket", "a device", or "" if nothing exists there.
 
-    ``source``: the file or option that contains the path, for messages; None for the path itself. Raises NoFileNameError if no file
-    can have that name, and InputError if access is denied.
+    ``source``: the file or option that contains the path, for messages; None for the path itself. Raises
+    NoFileNameError if no file can have that name, and InputError if access is denied.
     """
     try:
         return _kind(path.stat())
@@ -112,8 +112,8 @@ def read_bytes(path: Path, limit: int) -> bytes:
 
 
 def copy_file(source: Path, target: Path) -> None:
-    """Copy the regular file ``source`` to the new file ``target``. Raises InputError if ``source`` cannot be read, and OSError if
-    ``target`` exists or cannot be written."""
+    """Copy the regular file ``source`` to the new file ``target``. Raises InputError if ``source`` cannot be read, and
+    OSError if ``target`` exists or cannot be written."""
     with opened(source, sys.maxsize) as file, target.open("xb") as copy:
         shutil.copyfileobj(file, copy, 2**20)
 
@@ -122,9 +122,9 @@ def copy_file(source: Path, target: Path) -> None:
 def foreign(source: object, what: str) -> Iterator[None]:
     """Convert any exception of a parser in this block to an InputError with the message "SOURCE: WHAT: ...".
 
-    ``source``: the file. ``what``: the problem, such as "is not TOML". The block should contain only the call of the parser. On
-    damaged files parsers raise unusual exceptions: numpy tokenize.TokenError, zlib its own error, and polars PanicException, which
-    does not derive from Exception.
+    ``source``: the file. ``what``: the problem, such as "is not TOML". The block should contain only the call of the
+    parser. On damaged files parsers raise unusual exceptions: numpy tokenize.TokenError, zlib its own error, and polars
+    PanicException, which does not derive from Exception.
     """
     try:
         yield
@@ -198,8 +198,8 @@ def _require_file(path: Path, kind: str) -> None:
 def quiet() -> Iterator[None]:
     """Discard all output to descriptor 2 (stderr) in this block. No effect outside of the main thread.
 
-    All threads share the descriptor, so messages of other threads are discarded too. Therefore the block should contain only the
-    call that reads one file. If several threads did this at once, the descriptor could stay redirected.
+    All threads share the descriptor, so messages of other threads are discarded too. Therefore the block should contain
+    only the call that reads one file. If several threads did this at once, the descriptor could stay redirected.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -32,9 +32,9 @@ class Cells:
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file.
     ``columns``: for each field N texts, or numbers (N,) with NaN for empty cells.
     ``labels``: by field, the name of the column in the file, if it differs from the field.
-    ``units``: by field, the name of the unit in the file, or the factor from it to ``Column.unit``. ``decimal``: the decimal mark.
-    ``left_out``: columns of the file that are not read. ``passed``: number of JSON objects that lack needed columns.
-    ``unwanted``: number of rows that ``where`` of the manifest excludes.
+    ``units``: by field, the name of the unit in the file, or the factor from it to ``Column.unit``. ``decimal``: the
+    decimal mark. ``left_out``: columns of the file that are not read. ``passed``: number of JSON objects that lack
+    needed columns. ``unwanted``: number of rows that ``where`` of the manifest excludes.
     ``rules``: whether the manifest permits to skip invalid rows and to sort late rows, None without a manifest.
     ``unread``: number and error of each row that could not be split into cells.
     ``resumed`` (N,): True for each row that follows a skipped row.
@@ -83,8 +83,8 @@ class Cells:
     def stamps(self, name: str, offset: float = 0.0) -> Integers:
         """Return the timestamps (N,) [ns] in a field, plus ``offset`` [s].
 
-        The unit of the field is s, ms, us, ns or iso: a date and time, which is UTC if it has no time zone. Raises InputError for
-        other units, invalid cells, and timestamps that are too far apart.
+        The unit of the field is s, ms, us, ns or iso: a date and time, which is UTC if it has no time zone. Raises
+        InputError for other units, invalid cells, and timestamps that are too far apart.
         """
         return self._of_one_log(self._known(self._stamps(name, offset)))
 
@@ -93,8 +93,8 @@ class Cells:
     ) -> "Cells":
         """Return the cells without invalid rows if the manifest skips them, and in order of time if the manifest sorts them.
 
-        ``columns``: the description of each field, the timestamps first. ``offset`` [s]: is added to the timestamps. ``more``:
-        further invalid cells. The numbers of skipped and of sorted rows are appended to ``warnings``.
+        ``columns``: the description of each field, the timestamps first. ``offset`` [s]: is added to the timestamps.
+        ``more``: further invalid cells. The numbers of skipped and of sorted rows are appended to ``warnings``.
         """
         rules = self.rules
         if rules is None or rules.refuse:
@@ -131,8 +131,8 @@ class Cells:
         return replace(self, rows=self.rows[which], columns=columns, unread=(), resumed=self.resumed[which])
 
     def require(self, faults: Sequence[Fault]) -> None:
-        """Raise InputError at the first invalid cell of ``faults``. If few rows are invalid, the message names the key of the
-        manifest that skips them."""
+        """Raise InputError at the first invalid cell of ``faults``. If few rows are invalid, the message names the key
+        of the manifest that skips them."""
         for fault in faults:
             if fault.wrong.any():
                 is_few = self.rules is not None and fault.wrong.mean() <= MOST_SKIPPED
@@ -213,8 +213,8 @@ class Cells:
         return bad_field(self.path, self.labels.get(name, name), self.columns[name][i], expected, row=int(self.rows[i]))
 
     def _floats(self, texts: Sequence[Any]) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Convert N texts of a field to numbers (N,), with NaN for empty and invalid texts. Also return a mask (N,) of the
-        empty texts and a mask (N,) of the invalid ones.
+        """Convert N texts of a field to numbers (N,), with NaN for empty and invalid texts. Also return a mask (N,) of
+        the empty texts and a mask (N,) of the invalid ones.
         """
         if self.decimal == ".":
             with suppress(ValueError):  # several times as fast, if no text is empty or invalid
@@ -243,8 +243,8 @@ class Cells:
 
 
 def _converted(cells: Iterable[Any], convert: Callable[[Any], T], blank: T) -> tuple[list[T], NDArray[np.bool_]]:
-    """Convert N cells by the function ``convert``. Return the N results, and a mask (N,) of the cells for which ``convert`` raises
-    an exception. The result of such a cell is ``blank``."""
+    """Convert N cells by the function ``convert``. Return the N results, and a mask (N,) of the cells for which
+    ``convert`` raises an exception. The result of such a cell is ``blank``."""
     out: list[T] = []
     wrong: list[int] = []
     for cell in cells:

@@ -38,8 +38,8 @@ def in_order(
 ) -> Integers:
     """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last one.
 
-    ``rules``: the rules of the manifest, from which the message names a remedy; None without a manifest. Raises InputError if a
-    timestamp is older than the one before it.
+    ``rules``: the rules of the manifest, from which the message names a remedy; None without a manifest. Raises
+    InputError if a timestamp is older than the one before it.
     """
     _require_order(source, rows, t_ns, rules)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
@@ -100,8 +100,8 @@ def arrivals(
 ) -> None:
     """Check the delays of timestamps ``t_ns`` (N,) in order of arrival. A timestamp older than a previous one is late.
 
-    Late timestamps cause a warning. Raises InputError if one is older than the newest before it by more than ``max_late_ns``; None
-    permits any delay.
+    Late timestamps cause a warning. Raises InputError if one is older than the newest before it by more than
+    ``max_late_ns``; None permits any delay.
     """
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
@@ -129,8 +129,8 @@ def last_in_order(
 ) -> Integers:
     """Return the indices (M,) of the rows to keep, in order of arrival: of rows with equal timestamps only the last one.
 
-    ``t_ns`` (N,): timestamps, which are checked by :func:`arrivals`. ``names``: N landmarks; if given, only rows with equal
-    timestamp and landmark count as equal.
+    ``t_ns`` (N,): timestamps, which are checked by :func:`arrivals`. ``names``: N landmarks; if given, only rows with
+    equal timestamp and landmark count as equal.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)

@@ -123,8 +123,8 @@ def _mapped(
 ) -> Cells:
     """Return the cells of a file by field.
 
-    ``columns``: cells by column of the file. ``available``: names of all columns of the file. ``unwanted``: number of rows that
-    ``where`` excludes. ``passed``: number of JSON objects that lack needed columns.
+    ``columns``: cells by column of the file. ``available``: names of all columns of the file. ``unwanted``: number of
+    rows that ``where`` excludes. ``passed``: number of JSON objects that lack needed columns.
     """
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
@@ -142,8 +142,8 @@ def _rules(mapping: ColumnMapping) -> RowRules | None:
 class TableFolder:
     """Reads the tables of a folder, and records which rows and columns are not read.
 
-    ``warnings``: warnings about the content of the tables. Several mappings may read one file. A row or column of the file counts
-    as read if any of them reads it.
+    ``warnings``: warnings about the content of the tables. Several mappings may read one file. A row or column of the
+    file counts as read if any of them reads it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -156,8 +156,8 @@ class TableFolder:
         return inside(self.path, name, self.path)
 
     def read(self, mapping: TimedMapping, shapes: Sequence[Collection[str]], columns: Mapping[str, Column]) -> Cells:
-        """Read the file of a mapping by :func:`read_mapped`, and record what was read by :meth:`noted`. ``columns``: the
-        description of each field.
+        """Read the file of a mapping by :func:`read_mapped`, and record what was read by :meth:`noted`. ``columns``:
+        the description of each field.
         """
         return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
 
@@ -176,8 +176,8 @@ class TableFolder:
         return cells.usable(own, self.warnings, offset=mapping.clock_offset, more=more)
 
     def left_out(self) -> list[Notice]:
-        """Return warnings about rows and columns that no mapping reads. Each file with unread rows has a warning. Files with the
-        same unread columns have one warning together."""
+        """Return warnings about rows and columns that no mapping reads. Each file with unread rows has a warning. Files
+        with the same unread columns have one warning together."""
         warnings = []
         columns: dict[tuple[str, ...], list[str]] = {}
         for path, tables in self._read.items():
@@ -205,8 +205,8 @@ class TableFolder:
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
-    """Convert EPCs to the letter case ``case``, or decode hexadecimal digits if it is "ascii-hex". EPCs that cannot be decoded
-    stay unchanged."""
+    """Convert EPCs to the letter case ``case``, or decode hexadecimal digits if it is "ascii-hex". EPCs that cannot be
+    decoded stay unchanged."""
     if case == "as written":
         return list(epcs)
     if case == "ascii-hex":
@@ -223,8 +223,8 @@ def text_of_hex(digits: str) -> str:
 
 
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """Read the mapped columns of a CSV file, in the rows that ``where`` selects. Raises InputError if a column of ``needed`` is
-    missing."""
+    """Read the mapped columns of a CSV file, in the rows that ``where`` selects. Raises InputError if a column of
+    ``needed`` is missing."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     if not content:
@@ -268,8 +268,8 @@ def _is_chosen(parts: Sequence[str], header: Sequence[str], where: Mapping[str, 
 def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
     """Separate comments from rows of data. ``lines``: line numbers and texts.
 
-    Returns the comments before the first row of data, without comment marks, and the rows of data. Both have their line numbers.
-    The last of these comments may be the header.
+    Returns the comments before the first row of data, without comment marks, and the rows of data. Both have their line
+    numbers. The last of these comments may be the header.
     """
     content = [(row, line) for row, line in lines if not line.lstrip().startswith(COMMENT)]
     until = content[0][0] if content else 0
@@ -293,8 +293,8 @@ def _has(names: Collection[str], needed: Sequence[Alternatives]) -> bool:
 def _require_columns(
     path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives], header: Sequence[str], row: int
 ) -> None:
-    """Raise InputError if a needed column is missing in ``header``, or a mapped column occurs twice. ``row``: line number of the
-    header."""
+    """Raise InputError if a needed column is missing in ``header``, or a mapped column occurs twice. ``row``: line
+    number of the header."""
     counts = Counter(header)
     for columns in [*needed, *((column,) for column in mapping.where)]:
         if not _has(counts, [columns]):
@@ -356,8 +356,8 @@ def _text(value: Any) -> str:
 
 
 def _objects(path: Path, unread: list[tuple[int, str]]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Return the line number and the content of each object of JSON lines. The key of a nested value is the path of keys to it,
-    joined by dots.
+    """Return the line number and the content of each object of JSON lines. The key of a nested value is the path of
+    keys to it, joined by dots.
 
     The number and the error of each invalid line are appended to ``unread``.
     """

@@ -1,7 +1,7 @@
 """Descriptions of the tables of sensors: columns with unit, bounds and meaning, used for all input of measurements.
 
-Bounds are wide enough for any real recording and narrow enough to avoid overflow. A value outside has a wrong unit or is damaged.
-Readers of logs and :class:`~factorgraph_loc.live.localizer.Localizer` reject such values.
+Bounds are wide enough for any real recording and narrow enough to avoid overflow. A value outside has a wrong unit or
+is damaged. Readers of logs and :class:`~factorgraph_loc.live.localizer.Localizer` reject such values.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def symmetric(upper: Sequence[Array]) -> Array:
 class Column:
     """Description of a column of a table.
 
-    ``units``: names of the units that a file may use, with the factors to the first one. Values are converted to the first one.
-    ``low``, ``high``: inclusive bounds of converted values. ``may_lack``: whether a cell may be empty.
+    ``units``: names of the units that a file may use, with the factors to the first one. Values are converted to the
+    first one. ``low``, ``high``: inclusive bounds of converted values. ``may_lack``: whether a cell may be empty.
     ``doc``: meaning of the column. ``field``: name of the values in a stream object, if it differs from ``name``.
     ``left_out_below``: smaller values are treated as empty cells, with a warning.
     """
@@ -132,8 +132,8 @@ class Column:
     ) -> None:
         """Raise InputError if any of the ``values`` (N,) is invalid. The message names the first one.
 
-        ``rows`` (N,): row numbers in the file ``source``. ``values`` are given in :attr:`unit`, which may differ from the unit in
-        the file. ``name``: name of the column in the file, None for ``self.name``.
+        ``rows`` (N,): row numbers in the file ``source``. ``values`` are given in :attr:`unit`, which may differ from
+        the unit in the file. ``name``: name of the column in the file, None for ``self.name``.
         """
         expected = self.expected + (", or nothing" if self.may_lack else "")
         require(~self.outside(values), source, rows, name or self.name, values, expected)
@@ -166,8 +166,8 @@ class Table:
         return ",".join(column.name for column in self.in_file(())) + "".join(optional)
 
     def in_file(self, header: Collection[str]) -> tuple[Column, ...]:
-        """Return the columns that a file must have. ``header``: the columns that the file has. An optional group is required if
-        ``header`` has any of its columns."""
+        """Return the columns that a file must have. ``header``: the columns that the file has. An optional group is
+        required if ``header`` has any of its columns."""
         omitted = {name for group in self.optional if not set(group) & set(header) for name in group}
         return tuple(column for column in self.columns if column.name not in omitted)
 
@@ -175,8 +175,8 @@ class Table:
 def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
     """Find an outlier among timestamps. ``tables``: arrays of timestamps.
 
-    Returns the index of the table and the row of the timestamp that is farthest from the median, and the median. Returns None if no
-    two timestamps differ by more than ``most``.
+    Returns the index of the table and the row of the timestamp that is farthest from the median, and the median.
+    Returns None if no two timestamps differ by more than ``most``.
     """
     stamps = np.sort(np.concatenate(tables))
     if not len(stamps) or stamps[-1] - stamps[0] <= most:

@@ -42,8 +42,8 @@ class FileModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy with the values of ``update``. Numbers are clipped to the bounds of their fields, so that a file with the
-        copy can be read again."""
+        """Return a copy with the values of ``update``. Numbers are clipped to the bounds of their fields, so that a
+        file with the copy can be read again."""
         return super().model_copy(update={k: _within(type(self), k, v) for k, v in (update or {}).items()}, deep=deep)
 
     @classmethod
@@ -92,8 +92,8 @@ def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
 
 
 def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
-    """Return ``value`` clipped to the bounds of the field ``name`` of the model ``kind``. NaN and values that are not numbers are
-    returned unchanged."""
+    """Return ``value`` clipped to the bounds of the field ``name`` of the model ``kind``. NaN and values that are not
+    numbers are returned unchanged."""
     field = kind.model_fields.get(name)
     if field is None or isinstance(value, bool) or not isinstance(value, (int, float)):
         return value
@@ -115,8 +115,8 @@ def read_text(path: Path, limit: int = bounded.DATA) -> str:
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
-    Raises InputError if the file cannot be read or is not TOML. Also if it is nested deeper than :data:`DEEPEST`, or contains more
-    than :data:`MOST_ENTRIES` values, a date, or an integer of more than 64 bits.
+    Raises InputError if the file cannot be read or is not TOML. Also if it is nested deeper than :data:`DEEPEST`, or
+    contains more than :data:`MOST_ENTRIES` values, a date, or an integer of more than 64 bits.
     """
     return parse_toml(read_text(path, bounded.SETTINGS), path)
 
@@ -262,12 +262,12 @@ def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
 def inside(root: Path, name: str, source: object, *others: Path, expected: str = "a path below it") -> Path:
     """Resolve a path that a file contains, and check that it does not leave the permitted folders.
 
-    ``name``: the path. ``source``: the file that contains it, for messages. ``root`` and ``others``: the permitted folders.
-    ``expected``: end of the message if the path leaves them.
+    ``name``: the path. ``source``: the file that contains it, for messages. ``root`` and ``others``: the permitted
+    folders. ``expected``: end of the message if the path leaves them.
 
-    A relative path is taken from the first of the folders in which it exists, or else from ``root``. Links are resolved. The path
-    need not exist. Raises InputError if the path leaves all folders (by dots, as an absolute path or by a link), or is neither a
-    regular file nor a folder. Raises NoFileNameError if no file can have that name.
+    A relative path is taken from the first of the folders in which it exists, or else from ``root``. Links are
+    resolved. The path need not exist. Raises InputError if the path leaves all folders (by dots, as an absolute path or
+    by a link), or is neither a regular file nor a folder. Raises NoFileNameError if no file can have that name.
     """
     try:
         folders = [os.path.realpath(folder) for folder in (root, *others)]
@@ -315,8 +315,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically. Use it for content that a library has written to memory, because libraries report a full disk by
-    exceptions of their own."""
+    """Write a file atomically. Use it for content that a library has written to memory, because libraries report a full
+    disk by exceptions of their own."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 

@@ -1,5 +1,5 @@
-"""The keys of a manifest for rows that are invalid or out of order. Such rows are an error, or they are skipped or sorted, with a
-warning that counts them.
+"""The keys of a manifest for rows that are invalid or out of order. Such rows are an error, or they are skipped or
+sorted, with a warning that counts them.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ MOST_SKIPPED = 0.5  # maximum fraction of rows to skip; if more are invalid, a s
 class Fault:
     """The cells of one field that are invalid for one reason.
 
-    ``field``: the name of the field in errors. ``values``: the N cells of the field. ``wrong`` (N,): True for each invalid cell.
-    ``expected``: a description of valid cells.
+    ``field``: the name of the field in errors. ``values``: the N cells of the field. ``wrong`` (N,): True for each
+    invalid cell. ``expected``: a description of valid cells.
     """
 
     field: str
@@ -33,8 +33,8 @@ class Fault:
     expected: str
 
     def error(self, source: object, rows: Integers, remedy: str = "") -> InputError:
-        """Return the error for the first invalid cell. ``rows`` (N,): row numbers in the file ``source``. ``remedy``: the end of
-        the message."""
+        """Return the error for the first invalid cell. ``rows`` (N,): row numbers in the file ``source``. ``remedy``:
+        the end of the message."""
         i = int(self.wrong.argmax())
         value = self.values[i]
         value = value.tolist() if hasattr(value, "tolist") else value
@@ -60,9 +60,9 @@ class RowRules(FileModel):
     ) -> Integers:
         """Return the indices of the rows without a fault, and append a warning with the number of invalid rows and the first error.
 
-        ``rows`` (N,): row numbers in the file ``source``. ``faults``: the invalid cells. ``unread``: number and error of further
-        rows that could not be split into cells. Raises InputError at the first fault if ``bad_rows`` is "refuse", or if more than
-        half of all rows are invalid.
+        ``rows`` (N,): row numbers in the file ``source``. ``faults``: the invalid cells. ``unread``: number and error
+        of further rows that could not be split into cells. Raises InputError at the first fault if ``bad_rows`` is
+        "refuse", or if more than half of all rows are invalid.
         """
         wrong = np.zeros(len(rows), dtype=bool)
         for fault in faults:
@@ -84,8 +84,8 @@ class RowRules(FileModel):
         return np.flatnonzero(~wrong)
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
-        """Return indices (N,) that sort the rows by their timestamps ``t_ns`` (N,). If ``order`` is "refuse", the indices are 0 to
-        N - 1. If rows are sorted, a warning has the number of late rows."""
+        """Return indices (N,) that sort the rows by their timestamps ``t_ns`` (N,). If ``order`` is "refuse", the
+        indices are 0 to N - 1. If rows are sorted, a warning has the number of late rows."""
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))
@@ -127,8 +127,8 @@ def require_read(unread: Sequence[tuple[int, str]], count: int, rules: RowRules 
 
 
 def require_none(source: object, rows: Integers, faults: Sequence[Fault], remedy: str = "") -> None:
-    """Raise InputError at the first invalid cell of ``faults``. ``rows`` (N,): row numbers in the file ``source``. ``remedy``: the
-    end of the message."""
+    """Raise InputError at the first invalid cell of ``faults``. ``rows`` (N,): row numbers in the file ``source``.
+    ``remedy``: the end of the message."""
     for fault in faults:
         if fault.wrong.any():
             raise fault.error(source, rows, remedy)

@@ -1,7 +1,7 @@
 """Descriptions of settings: keys, defaults, bounds, units and meanings, read from the models that define them.
 
-The bounds of a field of a :class:`~factorgraph_loc.files.models.FileModel` come from ``Field`` in its annotation, the unit from
-:class:`~factorgraph_loc.files.models.InUnit` there, and the meaning from the docstring below the field.
+The bounds of a field of a :class:`~factorgraph_loc.files.models.FileModel` come from ``Field`` in its annotation, the
+unit from :class:`~factorgraph_loc.files.models.InUnit` there, and the meaning from the docstring below the field.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The manifests, rigs and reader descriptions that are installed with the package. For fast shell completion, this module imports
-no numerical library."""
+"""The manifests, rigs and reader descriptions that are installed with the package. For fast shell completion, this
+module imports no numerical library."""
 
 from importlib import resources
 from pathlib import Path

@@ -45,9 +45,9 @@ def rows_of_length(
 ) -> tuple[Integers, dict[str, list[str]], tuple[tuple[int, str], ...]]:
     """Collect the rows of a CSV file by column. ``rows``: line number and cells of each row.
 
-    Returns the line numbers (N,), the N cells of each column by its name in ``header``, and line number and error of each row with
-    a wrong number of cells. Raises InputError at the first such row, unless ``rules`` skip invalid rows and at most half of the
-    rows are invalid.
+    Returns the line numbers (N,), the N cells of each column by its name in ``header``, and line number and error of
+    each row with a wrong number of cells. Raises InputError at the first such row, unless ``rules`` skip invalid rows
+    and at most half of the rows are invalid.
     """
     numbers: list[int] = []
     table: list[list[str]] = []
@@ -67,8 +67,8 @@ def rows_of_length(
 def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = None) -> tuple[Cells, tuple[Column, ...]]:
     """Read a CSV file that contains one of several possible ``tables``.
 
-    Returns the cells and the columns of the table that the header of the file fits best. Raises InputError with file and row if the
-    content is invalid.
+    Returns the cells and the columns of the table that the header of the file fits best. Raises InputError with file
+    and row if the content is invalid.
     """
     lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
     parsed = csv_rows(path, lines)
@@ -108,8 +108,8 @@ def _unread(header: Sequence[str], columns: Sequence[Column]) -> tuple[str, ...]
 def rows_by_name(kind: type[Model], cells: Cells, table: Table, names: Sequence[str]) -> dict[str, Model]:
     """Convert the N rows of a table to models of class ``kind``, such as the tags of a map. Return them by name.
 
-    ``names``: N names, the first column of ``table``. The fields of ``kind`` are the other columns. For an empty cell the field
-    has its default. Raises InputError with file and row for an empty or repeated name, or an invalid value.
+    ``names``: N names, the first column of ``table``. The fields of ``kind`` are the other columns. For an empty cell
+    the field has its default. Raises InputError with file and row for an empty or repeated name, or an invalid value.
     """
     column, *fields = table.columns
     numbers = {known.name: cells.numbers(known.name, known) for known in fields if known.name in cells.columns}
@@ -164,8 +164,8 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
 class TableRows:
     """The parsed values of N rows of a table.
 
-    ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps [ns].
-    ``numbers``: by column, numbers (N,) in ``Column.unit``, NaN for empty cells. ``names``: by column, N texts.
+    ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps
+    [ns]. ``numbers``: by column, numbers (N,) in ``Column.unit``, NaN for empty cells. ``names``: by column, N texts.
     ``left_out``: columns of the file that are not read.
     ``rules``: whether the manifest permits to skip invalid rows and to sort late rows, None without a manifest.
     ``resumed`` (N,): True for each row that follows a skipped row.
@@ -208,8 +208,8 @@ class TableRows:
 def read_table(path: Path, tables: Sequence[Table], rules: RowRules, warnings: list[Notice]) -> TableRows:
     """Read a CSV or Parquet file that contains one of several possible ``tables``. Other columns of the file are ignored.
 
-    Raises InputError with file, row and column if a value is missing, is not a number, or is out of bounds, unless ``rules``
-    skip such rows. Skipped and sorted rows are counted in ``warnings``.
+    Raises InputError with file, row and column if a value is missing, is not a number, or is out of bounds, unless
+    ``rules`` skip such rows. Skipped and sorted rows are counted in ``warnings``.
     """
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
         cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables, rules)

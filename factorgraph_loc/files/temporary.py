@@ -83,8 +83,8 @@ def remove_own() -> None:
 
 @contextmanager
 def _created(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Path]:
-    """Create a temporary file or ``folder`` next to ``path``, with parts of ``name`` and ``suffix`` in its name. Remove it at the
-    end of the block."""
+    """Create a temporary file or ``folder`` next to ``path``, with parts of ``name`` and ``suffix`` in its name. Remove
+    it at the end of the block."""
     if path.parent not in _swept:
         _swept.add(path.parent)
         sweep(path.parent)

@@ -92,8 +92,8 @@ def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
 
 
 def integers(where: str, column: Column, value: object, count: int) -> NDArray[np.int64]:
-    """Return ``count`` integers as an array (count,). Raises InputError if there are more or fewer, or one is not whole or exceeds
-    the bounds of ``column``."""
+    """Return ``count`` integers as an array (count,). Raises InputError if there are more or fewer, or one is not whole
+    or exceeds the bounds of ``column``."""
     array = numbers(where, column.name, value)
     if array.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
         raise bad_field(where, column.name, value, f"{count} whole numbers")

@@ -41,8 +41,8 @@ class Parameter:
 
 
 class LikelihoodTerms(NamedTuple):
-    """A likelihood at given values of P parameters. ``cost``: the negative log-likelihood. ``scores`` (B, P): its gradient in each
-    of B blocks of time. ``information`` (P, P): the Fisher information of all blocks together."""
+    """A likelihood at given values of P parameters. ``cost``: the negative log-likelihood. ``scores`` (B, P): its
+    gradient in each of B blocks of time. ``information`` (P, P): the Fisher information of all blocks together."""
 
     cost: float
     scores: Array
@@ -54,9 +54,9 @@ Likelihood = Callable[[Array], LikelihoodTerms]
 
 @dataclass(frozen=True)
 class Posterior:
-    """The estimate of P parameters. ``values`` (P,): the values with the largest posterior density. ``covariance`` (P, P): the
-    covariance of their errors. ``share``: the fraction of independent information in the measurements, from 0 to 1, because errors
-    of measurements that are close in time are correlated."""
+    """The estimate of P parameters. ``values`` (P,): the values with the largest posterior density. ``covariance`` (P,
+    P): the covariance of their errors. ``share``: the fraction of independent information in the measurements, from 0
+    to 1, because errors of measurements that are close in time are correlated."""
 
     parameters: tuple[Parameter, ...]
     values: Array
@@ -141,10 +141,10 @@ def maximise(
 def independent_share(scores: Array, information: Array, precision: Array | float = 0.0) -> float:
     """The fraction of independent information in correlated measurements, at most 1. A likelihood is multiplied by this fraction.
 
-    ``scores`` (B, P): gradients of the log-likelihood in B blocks of time. ``information`` (P, P): the total Fisher information.
-    ``precision`` (P, P): the inverse covariance of the prior. If measurements are independent, the covariance of the scores equals
-    the information. The fraction is the ratio of the two (Varin, Reid and Firth, "An overview of composite likelihood methods",
-    Statistica Sinica 21, 2011, section 2.2).
+    ``scores`` (B, P): gradients of the log-likelihood in B blocks of time. ``information`` (P, P): the total Fisher
+    information. ``precision`` (P, P): the inverse covariance of the prior. If measurements are independent, the
+    covariance of the scores equals the information. The fraction is the ratio of the two (Varin, Reid and Firth, "An
+    overview of composite likelihood methods", Statistica Sinica 21, 2011, section 2.2).
     """
     inverse = np.linalg.pinv(information + precision)
     ratio = np.trace(inverse @ information) / max(float(np.trace(inverse @ (scores.T @ scores))), 1e-12)
@@ -154,8 +154,8 @@ def independent_share(scores: Array, information: Array, precision: Array | floa
 def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Parameter], block: Integers) -> Likelihood:
     """Make a likelihood of ``parameters`` from a function of residuals, with numerical derivatives and the soft-L1 loss.
 
-    ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``block`` (M,): the number of
-    the time block of each row. Residuals of different blocks count as independent.
+    ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``block`` (M,):
+    the number of the time block of each row. Residuals of different blocks count as independent.
     """
     steps = STEP * np.diag([p.sigma for p in parameters])
 
@@ -179,8 +179,8 @@ def by_block(scores: Array, block: Integers) -> Array:
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """Divide several logs into blocks of ``length`` seconds, which are numbered consecutively. ``times``: the times [s] of each
-    log. Returns the block number of each time, for all logs in one array."""
+    """Divide several logs into blocks of ``length`` seconds, which are numbered consecutively. ``times``: the times [s]
+    of each log. Returns the block number of each time, for all logs in one array."""
     out: list[Integers] = []
     first = 0
     for t in times:
@@ -190,8 +190,8 @@ def blocks(times: Sequence[Array], length: float) -> Integers:
 
 
 def robust_sigma(values: Array) -> Array:
-    """The robust standard deviation (D,) about zero of the columns of ``values`` (M, D), from their median absolute value. NaN is
-    ignored."""
+    """The robust standard deviation (D,) about zero of the columns of ``values`` (M, D), from their median absolute
+    value. NaN is ignored."""
     return np.asarray(MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0))
 
 

@@ -22,11 +22,11 @@ EVERY: Container[str] = _Every()  # the modalities of an estimator that accepts 
 class Estimator(Protocol):
     """An estimator of the robot's pose. It processes measurements in the order of arrival, and returns estimates at any time.
 
-    A class has the attribute ``causal = False`` if its estimates are useful only after the last measurement. It has ``smoothed =
-    False`` if its final trajectory equals the estimates during the run.
+    A class has the attribute ``causal = False`` if its estimates are useful only after the last measurement. It has
+    ``smoothed = False`` if its final trajectory equals the estimates during the run.
 
-    Only :meth:`initialize`, :meth:`process` and ``forget`` change an estimator. Requests for results never change later results,
-    not even their rounding errors.
+    Only :meth:`initialize`, :meth:`process` and ``forget`` change an estimator. Requests for results never change later
+    results, not even their rounding errors.
     """
 
     diagnostics: Diagnostics
@@ -34,21 +34,21 @@ class Estimator(Protocol):
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian prior of the pose. Before this call every estimate is ``unlocalized``.
 
-        Odometry from before the start may arrive before or after this call, but not after the first measurement of another sensor.
-        A prior without a heading is allowed if :func:`finds_heading` is true for the estimator. Then no estimate is ``localized``
-        before the measurements determine the heading.
+        Odometry from before the start may arrive before or after this call, but not after the first measurement of
+        another sensor. A prior without a heading is allowed if :func:`finds_heading` is true for the estimator. Then no
+        estimate is ``localized`` before the measurements determine the heading.
         """
 
     def process(self, measurement: Measurement) -> None:
         """Process one measurement. A measurement that is late by more than the setting ``max_delay`` is counted and ignored."""
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the time of the newest measurement, from all measurements so far. If ``t`` [s] is later, the pose is
-        predicted to ``t`` by odometry."""
+        """The pose at the time of the newest measurement, from all measurements so far. If ``t`` [s] is later, the pose
+        is predicted to ``t`` by odometry."""
 
     def belief(self, t: float | None = None) -> Belief:
-        """The whole probability distribution of the pose, at the time of :meth:`estimate`. It has Gaussian modes, and particles if
-        the estimator uses them."""
+        """The whole probability distribution of the pose, at the time of :meth:`estimate`. It has Gaussian modes, and
+        particles if the estimator uses them."""
 
     def learnt(self) -> Learnt:
         """The estimates of sensor constants and landmarks from all measurements, consistent with :meth:`trajectory`."""
@@ -74,7 +74,7 @@ class ForgettingEstimator(Protocol):
 
 
 def finds_heading(estimator: Estimator) -> bool:
-    """True if the estimator can start at a known position with an unknown heading. This includes estimators that can start at an
-    unknown position."""
+    """True if the estimator can start at a known position with an unknown heading. This includes estimators that can
+    start at an unknown position."""
     names = ("supports_unknown_start", "supports_unknown_heading")
     return any(getattr(estimator, name, False) for name in names)

@@ -64,8 +64,8 @@ class Cloud:
         return mean[3:], covariance
 
     def _errors(self) -> tuple[Array, Array, Array]:
-        """For each particle the body-frame perturbation of its pose from the mean pose, and its constants (N, 3+P). Also returns
-        their mean (3+P,) and covariance (3+P, 3+P)."""
+        """For each particle the body-frame perturbation of its pose from the mean pose, and its constants (N, 3+P).
+        Also returns their mean (3+P,) and covariance (3+P, 3+P)."""
         errors = np.concatenate((se2.twists_to(self.moments[0], self.poses), self.constants), axis=1)
         return errors, *vector_moments(errors, self.weights)
 
@@ -127,8 +127,8 @@ class Cloud:
         return cloud, kernel + _inflated(covariance - explained, lost)
 
     def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
-        """Draw particles of equal weight from a kernel density. ``rows`` (M,): the indices of the particles to draw around.
-        ``kernel`` (3+P, 3+P): the covariance of the kernel."""
+        """Draw particles of equal weight from a kernel density. ``rows`` (M,): the indices of the particles to draw
+        around. ``kernel`` (3+P, 3+P): the covariance of the kernel."""
         noise = positive.draws(kernel, len(rows), rng)
         return replace(
             self,
@@ -174,11 +174,11 @@ def corrected(
     left: float = 1.0,
     to_end: bool = True,
 ) -> Steps[Corrected]:
-    """Progressive correction of particles by a likelihood (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in
-    Practice", 2001, section 12.4).
+    """Progressive correction of particles by a likelihood (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods
+    in Practice", 2001, section 12.4).
 
-    The likelihood is written as a product of powers, whose exponents have the sum 1. The powers are applied one by one. Each
-    exponent is the largest that keeps enough effective particles. The particles are resampled after each step.
+    The likelihood is written as a product of powers, whose exponents have the sum 1. The powers are applied one by one.
+    Each exponent is the largest that keeps enough effective particles. The particles are resampled after each step.
 
     ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a resampled cloud.
     ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the time of the measurement.
@@ -221,8 +221,8 @@ def finished(steps: Steps[T]) -> T:
 
 
 def systematic(weights: Array, rng: np.random.Generator, count: int | None = None) -> NDArray[np.int64]:
-    """Draw ``count`` indices with probabilities proportional to ``weights`` (N,), by systematic resampling (Kitagawa, 1996). The
-    default count is N."""
+    """Draw ``count`` indices with probabilities proportional to ``weights`` (N,), by systematic resampling (Kitagawa,
+    1996). The default count is N."""
     count = len(weights) if count is None else count
     positions = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
@@ -268,8 +268,8 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
     """Replace values of a log-likelihood (N,) that are not finite by ``-inf``, which gives these particles no weight.
 
-    ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement, for the message. Raises RunFailedError
-    if no particle with a nonzero weight has a finite log-likelihood.
+    ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement, for the message. Raises
+    RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """
     possible = np.isfinite(likelihood)
     if possible.all():
@@ -291,14 +291,14 @@ def normalised(log_weights: Array) -> Array:
 
 
 def silverman(count: int, size: int) -> float:
-    """The bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions, as a fraction of the points' standard
-    deviation (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
+    """The bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions, as a fraction of the points'
+    standard deviation (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
     return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
 
 
 def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) in the world frame.
-    ``weights`` (N,): must have the sum 1."""
+    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) in the
+    world frame. ``weights`` (N,): must have the sum 1."""
     mean, covariance = se2.moments(poses, weights)
     return mean, covariance + np.diag(np.full(3, MINIMUM_VARIANCE))
 

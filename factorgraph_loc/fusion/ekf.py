@@ -1,9 +1,9 @@
 """Extended Kalman filter on SE(2), with Rauch-Tung-Striebel smoothing for its final trajectory.
 
-The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by named blocks. A
-block has the estimated constants of the odometry or of a sensor, or a landmark that the map lacks (EKF-SLAM: Smith, Self,
-Cheeseman, 1990). A measurement whose innovation is too large is not rejected. Its noise is increased instead, so that a wrong
-estimate does not reject all further measurements.
+The error state is a body-frame perturbation of the pose (Sola, Deray, Atchuthan, 2018, section IV), followed by named
+blocks. A block has the estimated constants of the odometry or of a sensor, or a landmark that the map lacks (EKF-SLAM:
+Smith, Self, Cheeseman, 1990). A measurement whose innovation is too large is not rejected. Its noise is increased
+instead, so that a wrong estimate does not reject all further measurements.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ class EkfSettings(FilterSettings):
     """Settings of the EKF."""
 
     iterations: Annotated[int, Field(ge=1, le=20)] = 1
-    """number of linearisations of an update; more than 1 is the iterated EKF (Bell and Cathey, 1993); updates by pixels and
-    tags ignore this setting and iterate as often as needed"""
+    """number of linearisations of an update; more than 1 is the iterated EKF (Bell and Cathey, 1993); updates by pixels
+    and tags ignore this setting and iterate as often as needed"""
     self_calibration: bool = True
     """whether sensor constants that have an uncertainty in the rig are estimated"""
     landmarks: MapUse = "known"
-    """known: landmarks of the map are fixed, others are ignored; extended: landmarks that the map lacks are estimated too; unknown:
-    all landmarks are estimated"""
+    """known: landmarks of the map are fixed, others are ignored; extended: landmarks that the map lacks are estimated
+    too; unknown: all landmarks are estimated"""
 
 
 class _State(NamedTuple):
@@ -74,8 +74,8 @@ class _State(NamedTuple):
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def on_pose(self, observation: Observation) -> Observation:
-        """The observation as a function of the pose only. Its blocks are fixed at this state, and their covariances are added to
-        the noise."""
+        """The observation as a function of the pose only. Its blocks are fixed at this state, and their covariances are
+        added to the noise."""
         values, columns = self.layout.values(self.rest), self.layout.columns
         spreads = {name: self.covariance[columns[name], columns[name]] for name in observation.blocks}
         return observation.on_pose({name: values[name] for name in spreads}, spreads)
@@ -201,8 +201,8 @@ class Ekf(Filter):
         return at_ticks(self._ticks, times, np.array(poses[::-1]), np.array(covariances[::-1]))
 
     def _smoothed(self, state: _State, step: _Step, later: _State) -> _State:
-        """One backward step of the smoother. ``step``: the prediction from ``state`` to the next record. ``later``: the smoothed
-        state of the next record. Returns the smoothed ``state``."""
+        """One backward step of the smoother. ``step``: the prediction from ``state`` to the next record. ``later``: the
+        smoothed state of the next record. Returns the smoothed ``state``."""
         later = later.first(len(state.covariance))
         change = np.concatenate((se2.twist_to(step.pose, later.pose), later.rest - state.rest))
         return state.plus(*positive.smoothed(state.covariance, step.transition, step.noise, change, later.covariance))
@@ -254,8 +254,8 @@ class Ekf(Filter):
         self._doubt(tick)
 
     def _doubt(self, m: Measurement) -> None:
-        """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do, continue at the
-        pose that the search has found."""
+        """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do,
+        continue at the pose that the search has found."""
         view = _View(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         best = self._search.best if refuted is not None else None

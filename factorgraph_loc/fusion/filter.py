@@ -39,8 +39,8 @@ class FilterSettings(FileModel):
 class _Checkpoint(NamedTuple):
     """A copy of a filter's state, to return to if a late measurement arrives.
 
-    ``state``: the estimate. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time. ``records``, ``ticks``:
-    the numbers of records and ticks so far.
+    ``state``: the estimate. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time. ``records``,
+    ``ticks``: the numbers of records and ticks so far.
     """
 
     state: Any
@@ -51,8 +51,8 @@ class _Checkpoint(NamedTuple):
 
 
 class FilterView:
-    """Read access to a filter's present state, for the sensors. ``offset`` is None and ``newest`` True, because a measurement
-    always belongs to the present pose."""
+    """Read access to a filter's present state, for the sensors. ``offset`` is None and ``newest`` True, because a
+    measurement always belongs to the present pose."""
 
     offset = None
     newest = True
@@ -192,8 +192,8 @@ class Filter(Timeline):
         return ahead
 
     def _anchor(self) -> None:
-        """Store the integrated odometry at the start. This is called at the first measurement after the start, because then all
-        odometry from before the start has arrived."""
+        """Store the integrated odometry at the start. This is called at the first measurement after the start, because
+        then all odometry from before the start has arrived."""
         if not self._moves:
             self._odometry, self._moves = self._motion.state(self._t), True
 
@@ -209,8 +209,8 @@ class Filter(Timeline):
         self._t = t
 
     def _begin(self, m: Measurement) -> None:
-        """Process a measurement before the start. The filter starts at the first measurement that determines the pose, or when the
-        search has found the pose."""
+        """Process a measurement before the start. The filter starts at the first measurement that determines the pose,
+        or when the search has found the pose."""
         if self._seeking is not None:
             super()._begin(m)
         elif not isinstance(m, Tick):
@@ -253,8 +253,8 @@ class Filter(Timeline):
 def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:
     """Make a trajectory at the times ``ticks`` from records at times ``t`` (N,).
 
-    ``poses`` (N, 3), ``body_covariances`` (N, 3, 3): the estimates, with covariances in the body frame. If several records have one
-    time, the last one is used.
+    ``poses`` (N, 3), ``body_covariances`` (N, 3, 3): the estimates, with covariances in the body frame. If several
+    records have one time, the last one is used.
     """
     rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
     covariances = se2.body_to_world(poses[rows], body_covariances[rows])

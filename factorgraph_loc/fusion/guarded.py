@@ -1,9 +1,9 @@
 """Conversion of an estimator's numerical failures and impossible results to errors of one line.
 
-Every run calls its estimator through a :class:`Guard`. Valid measurements and settings can still make a matrix singular or a sum
-overflow. NumPy, GTSAM and compiled code raise different errors then. The guard converts them to a
-:class:`~factorgraph_loc.errors.RunFailedError` that names the estimator, the time and the measurement. Errors of the program (a
-name, a type, a key) are not converted.
+Every run calls its estimator through a :class:`Guard`. Valid measurements and settings can still make a matrix singular
+or a sum overflow. NumPy, GTSAM and compiled code raise different errors then. The guard converts them to a
+:class:`~factorgraph_loc.errors.RunFailedError` that names the estimator, the time and the measurement. Errors of the
+program (a name, a type, a key) are not converted.
 """
 
 import math
@@ -34,9 +34,9 @@ LEAST = 1e-9  # smaller eigenvalues of a correlation matrix are raised to this v
 class Guard:
     """Calls an estimator and converts its failures to a RunFailedError.
 
-    Use it as ``guard.process(estimator, measurement)`` or ``with guard.computing(what): ...``. ``who``: the name of the estimator,
-    and of the log if there is one, for messages. Warnings of NumPy are silenced inside, because :func:`sound` and
-    :func:`sound_trajectory` check the results.
+    Use it as ``guard.process(estimator, measurement)`` or ``with guard.computing(what): ...``. ``who``: the name of the
+    estimator, and of the log if there is one, for messages. Warnings of NumPy are silenced inside, because
+    :func:`sound` and :func:`sound_trajectory` check the results.
     """
 
     def __init__(self, who: str) -> None:
@@ -49,8 +49,8 @@ class Guard:
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """A context that silences NumPy's warnings for a whole run. To silence them separately for each measurement takes as long
-        as processing one measurement of odometry."""
+        """A context that silences NumPy's warnings for a whole run. To silence them separately for each measurement
+        takes as long as processing one measurement of odometry."""
         with np.errstate(all="ignore"):
             self._is_quiet = True
             try:
@@ -65,8 +65,8 @@ class Guard:
             estimator.process(measurement)
 
     def computing(self, what: str, t: float | None = None) -> Self:
-        """A context for a request to the estimator. ``what``: the requested result, such as "the estimate", for messages. ``t``
-        [s]: its time, or None."""
+        """A context for a request to the estimator. ``what``: the requested result, such as "the estimate", for
+        messages. ``t`` [s]: its time, or None."""
         self._computing, self._of = what, t
         return self
 
@@ -93,9 +93,9 @@ class Guard:
 def sound(estimate: PoseEstimate) -> PoseEstimate:
     """Check an estimate. Returns it with a covariance that is symmetric and positive definite.
 
-    A covariance that is indefinite because of rounding is replaced by the nearest positive definite one. Raises ValueError if the
-    pose is not finite, or if the covariance cannot be repaired. An ``unlocalized`` estimate is returned unchecked. Call this inside
-    a :class:`Guard`, which converts the error.
+    A covariance that is indefinite because of rounding is replaced by the nearest positive definite one. Raises
+    ValueError if the pose is not finite, or if the covariance cannot be repaired. An ``unlocalized`` estimate is
+    returned unchecked. Call this inside a :class:`Guard`, which converts the error.
     """
     if estimate.status == "unlocalized":
         return estimate
@@ -137,8 +137,8 @@ def sound_trajectory(trajectory: Trajectory) -> Trajectory:
 
 
 def _positive(covariance: Array, where: str = "") -> Array:
-    """Return the result of :func:`nearest_positive`, or raise ValueError if it is None. ``where``: a text such as the time of the
-    pose, which is inserted in the message."""
+    """Return the result of :func:`nearest_positive`, or raise ValueError if it is None. ``where``: a text such as the
+    time of the pose, which is inserted in the message."""
     repaired = nearest_positive(covariance)
     if repaired is None:
         why = "is not positive definite" if np.all(np.isfinite(covariance)) else "is not finite"
@@ -147,8 +147,8 @@ def _positive(covariance: Array, where: str = "") -> Array:
 
 
 def nearest_positive(covariance: Array) -> Array | None:
-    """Return a covariance (D, D) unchanged if it is symmetric and positive definite. If only rounding prevents that, return the
-    nearest covariance that is. Otherwise return None."""
+    """Return a covariance (D, D) unchanged if it is symmetric and positive definite. If only rounding prevents that,
+    return the nearest covariance that is. Otherwise return None."""
     sigmas = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(covariance)) and np.all(sigmas > 0.0)):
         return None

@@ -15,8 +15,8 @@ KERNEL = 0.25  # standard deviation of a kernel as a fraction of the distance be
 
 
 def enough(cells: Array | NDArray[np.int64]) -> Array:
-    """The number of particles that represent a distribution well enough if they occupy this number of ``cells`` of a grid (Fox,
-    2003, eq. 7, with the approximation of Wilson and Hilferty)."""
+    """The number of particles that represent a distribution well enough if they occupy this number of ``cells`` of a
+    grid (Fox, 2003, eq. 7, with the approximation of Wilson and Hilferty)."""
     freedom = np.maximum(np.asarray(cells, dtype=float) - 1.0, 1.0)
     a = 2.0 / (9.0 * freedom)
     return np.asarray(freedom / (2.0 * ERROR) * (1.0 - a + np.sqrt(a) * QUANTILE) ** 3)
@@ -25,8 +25,8 @@ def enough(cells: Array | NDArray[np.int64]) -> Array:
 def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int64]:
     """Select a random subset of ``poses`` (N, 3) that is large enough by KLD sampling, and has at least ``least`` poses.
 
-    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy. If it never is, all
-    are selected. Returns the indices of the selected poses.
+    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy. If it
+    never is, all are selected. Returns the indices of the selected poses.
     """
     order = rng.permutation(len(poses))
     _, first = np.unique(cell_numbers(poses[order], CELL), return_index=True)

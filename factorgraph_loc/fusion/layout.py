@@ -23,8 +23,8 @@ POSE = 3  # number of components of the pose, which are the first components of 
 
 @dataclass(frozen=True)
 class Layout:
-    """The order of the blocks of an error state that follow the pose: sensor constants and landmarks. ``sizes``: the number of
-    components of each block, by name."""
+    """The order of the blocks of an error state that follow the pose: sensor constants and landmarks. ``sizes``: the
+    number of components of each block, by name."""
 
     sizes: Mapping[str, int] = field(default_factory=dict)
 
@@ -57,8 +57,8 @@ def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Est
 
 
 def on_pose(observation: Observation, view: View) -> Observation:
-    """Convert an observation to one that depends on the pose only. Sensor constants and landmarks are fixed at their estimates in
-    ``view``, and their covariances are added to the noise."""
+    """Convert an observation to one that depends on the pose only. Sensor constants and landmarks are fixed at their
+    estimates in ``view``, and their covariances are added to the noise."""
     values = {name: np.asarray(view.value(name)) for name in observation.blocks}
     return observation.on_pose(values, {name: view.block_covariance(name) for name in observation.blocks})
 

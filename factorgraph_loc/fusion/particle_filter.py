@@ -1,14 +1,14 @@
 """Particle filter with systematic resampling, and backward simulation for its final trajectory.
 
-The filter is sequential importance resampling (Gordon, Salmond, Smith, 1993) with log-weights. It resamples when the effective
-sample size falls below a fraction of the number of particles. It draws new particles from a kernel density instead of copying
-particles (regularised particle filter: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, chapter
-12). The particles therefore stay distinct when the motion adds almost no noise. Each particle has its own estimated constants of
-odometry and sensors. Resampling moves their mean at random, so their reported covariance is slightly too small if landmarks hardly
-inform them.
+The filter is sequential importance resampling (Gordon, Salmond, Smith, 1993) with log-weights. It resamples when the
+effective sample size falls below a fraction of the number of particles. It draws new particles from a kernel density
+instead of copying particles (regularised particle filter: Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods
+in Practice", 2001, chapter 12). The particles therefore stay distinct when the motion adds almost no noise. Each
+particle has its own estimated constants of odometry and sensors. Resampling moves their mean at random, so their
+reported covariance is slightly too small if landmarks hardly inform them.
 
-Particles move by odometry at each observation, and when a cloud (all particles at one time) is stored for smoothing. Between these
-times the estimate is the Gaussian of poses and constants, predicted as in the EKF.
+Particles move by odometry at each observation, and when a cloud (all particles at one time) is stored for smoothing.
+Between these times the estimate is the Gaussian of poses and constants, predicted as in the EKF.
 
 At an unknown start, and after the track is rejected, particles are drawn from the posterior of the search
 (:mod:`~factorgraph_loc.fusion.search`). A start with an unknown heading is an unknown start.
@@ -74,8 +74,8 @@ class ParticleFilterSettings(FilterSettings):
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0), InUnit("s")] = 1.0
     """time between the stored particle sets through which these trajectories are drawn"""
     self_calibration: bool = True
-    """whether each particle estimates the sensor constants that have an uncertainty in the rig, except the time offset of
-    landmarks, and constants of a camera, which increase its noise instead"""
+    """whether each particle estimates the sensor constants that have an uncertainty in the rig, except the time offset
+    of landmarks, and constants of a camera, which increase its noise instead"""
 
 
 class _CloudView(FilterView):
@@ -206,9 +206,9 @@ class ParticleFilter(Filter):
         return self._sampled_cloud(self._t) if self._search.look(m, self._odometry) else None
 
     def _sampled_cloud(self, since: float) -> Cloud | None:
-        """Draw particles from the posterior of the search, or return None if it has none yet. If the search has found one clear
-        pose, the filter is localized, and sensors restart at the time ``since`` [s]. If the filter was localized before ``since``,
-        the particles keep their sensor constants from then."""
+        """Draw particles from the posterior of the search, or return None if it has none yet. If the search has found
+        one clear pose, the filter is localized, and sensors restart at the time ``since`` [s]. If the filter was
+        localized before ``since``, the particles keep their sensor constants from then."""
         clouds = (r.cloud for r in reversed(self._records) if r.cloud is not None and r.t < since)
         previous = next((cloud for cloud in clouds if cloud.localized), None)
         sample = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
@@ -335,9 +335,9 @@ class ParticleFilter(Filter):
         self._changes = [(rejected, change) for rejected, change in self._changes if rejected <= self._t]
 
     def _weigh(self, observation: Observation) -> float:
-        """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`). Returns the logarithm of the
-        mean likelihood. If weighing is costly, only a few particles are corrected by most of the likelihood. All particles are then
-        drawn from these few, and corrected by the rest."""
+        """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`). Returns the
+        logarithm of the mean likelihood. If weighing is costly, only a few particles are corrected by most of the
+        likelihood. All particles are then drawn from these few, and corrected by the rest."""
         cloud, count, enough = self._state, self._settings.particles, self._settings.resample_below
 
         @in_one_step

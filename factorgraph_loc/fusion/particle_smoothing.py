@@ -1,16 +1,16 @@
 """The final trajectory of a particle filter, by backward simulation.
 
-A cloud is the set of weighted particles at one time. Trajectories are drawn backwards through the stored clouds (Godsill, Doucet,
-West, JASA 99(465), 2004): for each state of a trajectory, an ancestor is drawn among the particles of the previous cloud. A resting
-robot and constants have almost no noise between two clouds. Each state would then have one possible ancestor, and the trajectories
-would soon coalesce. Therefore each particle stands for a Gaussian kernel (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo
-Methods in Practice", 2001, section 12.2). The state is drawn from the kernel of the ancestor, given the later state, by one step of
-Rauch, Tung and Striebel.
+A cloud is the set of weighted particles at one time. Trajectories are drawn backwards through the stored clouds
+(Godsill, Doucet, West, JASA 99(465), 2004): for each state of a trajectory, an ancestor is drawn among the particles of
+the previous cloud. A resting robot and constants have almost no noise between two clouds. Each state would then have
+one possible ancestor, and the trajectories would soon coalesce. Therefore each particle stands for a Gaussian kernel
+(Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods in Practice", 2001, section 12.2). The state is drawn from
+the kernel of the ancestor, given the later state, by one step of Rauch, Tung and Striebel.
 
 The ancestors are drawn in compiled code, because NumPy takes ten times as long.
 
-If no particle explains a later state, the filter jumped to another pose in between. If the earlier cloud was wrong, the later pose
-is moved back by odometry. Otherwise the trajectory continues with a particle of the earlier cloud.
+If no particle explains a later state, the filter jumped to another pose in between. If the earlier cloud was wrong, the
+later pose is moved back by odometry. Otherwise the trajectory continues with a particle of the earlier cloud.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ BREAK = 100.0  # a state with a larger squared Mahalanobis distance from its anc
 class Record:
     """The state of the filter at time ``t`` [s].
 
-    ``odometry``: the integrated odometry. ``mean`` (3,), ``covariance`` (3, 3): the causal estimate, in the world frame. ``cloud``:
-    the particles if they are stored for smoothing, otherwise None.
+    ``odometry``: the integrated odometry. ``mean`` (3,), ``covariance`` (3, 3): the causal estimate, in the world
+    frame. ``cloud``: the particles if they are stored for smoothing, otherwise None.
     """
 
     t: float
@@ -55,8 +55,8 @@ class BackwardSimulation:
 
     ``kept``: records with clouds, in order of time. ``count``: the number of trajectories.
     ``increment(start, end)``: returns the odometry between two records.
-    ``moved(cloud, increment)``: returns the poses (N, 3) of a cloud after an increment, without noise, and their transition
-    (3, 3+P) from body-frame perturbation and constants.
+    ``moved(cloud, increment)``: returns the poses (N, 3) of a cloud after an increment, without noise, and their
+    transition (3, 3+P) from body-frame perturbation and constants.
     ``changes``: the intervals [s] in which the robot was carried to another place.
     """
 
@@ -83,8 +83,8 @@ class BackwardSimulation:
             self._missed.insert(0, missed)
 
     def at(self, record: Record) -> tuple[Array, Array]:
-        """The mean (3,) and covariance (3, 3), in the world frame, of the trajectories at any record. Between two clouds they are
-        interpolated along the odometry."""
+        """The mean (3,) and covariance (3, 3), in the world frame, of the trajectories at any record. Between two
+        clouds they are interpolated along the odometry."""
         k = int(np.searchsorted(self._t, record.t, side="right")) - 1
         if any(self._t[k] < end <= record.t for _, end in self._changes):
             # the robot was carried since the earlier cloud: move the later cloud back by odometry
@@ -101,8 +101,8 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """Draw an ancestor from ``cloud`` for each of the M later states ``later``. ``increment``: the odometry in between. Returns
-        the ancestors, and the noise (M, 3) of the odometry that they imply."""
+        """Draw an ancestor from ``cloud`` for each of the M later states ``later``. ``increment``: the odometry in
+        between. Returns the ancestors, and the noise (M, 3) of the odometry that they imply."""
         smooth, kernel = cloud.density()
         later = replace(
             later, constants=later.constants[:, : cloud.constants.shape[1]]
@@ -143,8 +143,8 @@ class BackwardSimulation:
 
 
 def _moments(poses: Array, extra: Array) -> tuple[Array, Array]:
-    """The mean (3,) and covariance (3, 3), in the world frame, of poses (N, 3). ``extra`` (3, 3): a body-frame covariance of each
-    pose, which is added."""
+    """The mean (3,) and covariance (3, 3), in the world frame, of poses (N, 3). ``extra`` (3, 3): a body-frame
+    covariance of each pose, which is added."""
     mean, covariance = pose_moments(poses, np.full(len(poses), 1.0 / len(poses)))
     return mean, covariance + se2.body_to_world(mean, extra)
 
@@ -158,13 +158,13 @@ def draw_ancestors(
     covariance: Array,
     uniform: Array,
 ) -> Integers:
-    """Draw an ancestor among N particles for each of M later states (Godsill et al., 2004, eq. 7). The probability of an ancestor
-    is proportional to its weight times the transition density to the later state.
+    """Draw an ancestor among N particles for each of M later states (Godsill et al., 2004, eq. 7). The probability of
+    an ancestor is proportional to its weight times the transition density to the later state.
 
-    ``predicted`` (N, 3): the particles' poses after the motion, without noise. ``constants`` (N, P): the particles' sensor
-    constants. ``log_weights`` (N,): their log-weights. ``later`` (M, 3), ``later_constants`` (M, P): poses and constants of the
-    later states. ``covariance`` (3+P, 3+P): the covariance of the transition, of the body-frame pose error and of the constants.
-    ``uniform`` (M,): random numbers from [0, 1).
+    ``predicted`` (N, 3): the particles' poses after the motion, without noise. ``constants`` (N, P): the particles'
+    sensor constants. ``log_weights`` (N,): their log-weights. ``later`` (M, 3), ``later_constants`` (M, P): poses and
+    constants of the later states. ``covariance`` (3+P, 3+P): the covariance of the transition, of the body-frame pose
+    error and of the constants. ``uniform`` (M,): random numbers from [0, 1).
 
     Returns the indices (M,) of the ancestors.
     """

@@ -76,8 +76,8 @@ class Evidence(Protocol):
 
 
 class WeighedObservation(NamedTuple):
-    """An observation with the integrated ``odometry`` at its time. ``evidence``: the log-probability of the observation if the
-    estimator's pose (the track) is right, zero if the estimator has no pose."""
+    """An observation with the integrated ``odometry`` at its time. ``evidence``: the log-probability of the observation
+    if the estimator's pose (the track) is right, zero if the estimator has no pose."""
 
     odometry: ChainState
     observation: Evidence
@@ -149,8 +149,8 @@ class Population:
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
-        """Queue an observation with the fields of :class:`WeighedObservation`. Returns False if it is ignored, because it is older
-        than the last queued observation."""
+        """Queue an observation with the fields of :class:`WeighedObservation`. Returns False if it is ignored, because
+        it is older than the last queued observation."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
         if newest is not None and odometry.t < newest.t:
             return False
@@ -172,8 +172,8 @@ class Population:
         return done
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw ``count`` poses (N, 3) at the last observation, around :attr:`best`, or from all particles if that is None. Empty
-        before the first observation."""
+        """Draw ``count`` poses (N, 3) at the last observation, around :attr:`best`, or from all particles if that is
+        None. Empty before the first observation."""
         if self._cloud is None:
             return np.empty((0, 3))
         best, weights = self.best, self._cloud.weights
@@ -260,8 +260,8 @@ class Population:
         return float(area) * 2.0 * math.pi
 
     def _room_of(self, count: int) -> Array:
-        """The volume (N,) per particle, in grid cells, if ``count`` particles are drawn from the whole space of poses. Zero if the
-        start position is known."""
+        """The volume (N,) per particle, in grid cells, if ``count`` particles are drawn from the whole space of poses.
+        Zero if the start position is known."""
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:

@@ -19,8 +19,8 @@ class Description:
     """The description of an estimator for users.
 
     ``about``: one sentence. ``sensors``: the names of the sensor channels that the estimator uses.
-    ``causal``: True if the estimator has estimates during a run. ``smoothed``: True if its final trajectory uses all measurements.
-    ``settings``: all its settings.
+    ``causal``: True if the estimator has estimates during a run. ``smoothed``: True if its final trajectory uses all
+    measurements. ``settings``: all its settings.
     """
 
     name: str
@@ -32,8 +32,8 @@ class Description:
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
-    """The settings of the estimator ``name``: the defaults, changed by ``overrides``. These are values by dotted key, without the
-    estimator's name in the key.
+    """The settings of the estimator ``name``: the defaults, changed by ``overrides``. These are values by dotted key,
+    without the estimator's name in the key.
 
     Raises InputError if the estimator or a key is unknown, or if a value is out of bounds.
     """
@@ -80,7 +80,7 @@ def estimator_type(name: str) -> type[Any]:
 
 
 def settings_type(name: str) -> type[FileModel]:
-    """The settings class of the estimator with this name, such as ``EkfSettings`` in the module of ``Ekf``. Raises InputError if
-    the name is unknown."""
+    """The settings class of the estimator with this name, such as ``EkfSettings`` in the module of ``Ekf``. Raises
+    InputError if the name is unknown."""
     check_names([name])
     return cast(type[FileModel], load(f"{ESTIMATORS.place(name)}Settings"))

@@ -1,10 +1,10 @@
 """The global search for the robot's pose: at an unknown start, with an unknown heading, after a lost track, in active localization.
 
-Some sensors can find a pose from their own measurements (:class:`~factorgraph_loc.sensors.base.Finder`). Other sensors, such as
-RFID, can only weigh given poses. For these, particles anywhere in the map (:mod:`.population`) are weighed by the measurements of
-all sensors together. The particles are weighed in slices of fixed cost (:meth:`Search.advance`), so that measurements are not
-delayed. :mod:`.tracking` compares the estimated poses with their observations, and starts a search if they contradict each
-other.
+Some sensors can find a pose from their own measurements (:class:`~factorgraph_loc.sensors.base.Finder`). Other sensors,
+such as RFID, can only weigh given poses. For these, particles anywhere in the map (:mod:`.population`) are weighed by
+the measurements of all sensors together. The particles are weighed in slices of fixed cost (:meth:`Search.advance`), so
+that measurements are not delayed. :mod:`.tracking` compares the estimated poses with their observations, and starts a
+search if they contradict each other.
 """
 
 from __future__ import annotations
@@ -100,11 +100,11 @@ class Search:
         return self.advance(odometry.t) or is_informative
 
     def queue(self, observation: Evidence, odometry: ChainState) -> None:
-        """Queue an observation that does not come from the search's sensors, such as the free distances of a proximity sensor.
-        ``odometry``: the integrated odometry at its time.
+        """Queue an observation that does not come from the search's sensors, such as the free distances of a proximity
+        sensor. ``odometry``: the integrated odometry at its time.
 
-        :meth:`advance` then weighs the particles by it. The observation is ignored before the particles have processed their first
-        one.
+        :meth:`advance` then weighs the particles by it. The observation is ignored before the particles have processed
+        their first one.
         """
         if self._population is not None and self._population.newest is not None:
             self._population.add(odometry, observation)
@@ -140,8 +140,8 @@ class Search:
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
-        """The hypotheses of the pose at time ``t`` [s], most likely first. The list is empty if nothing is known. At a known start
-        position there is at least one."""
+        """The hypotheses of the pose at time ``t`` [s], most likely first. The list is empty if nothing is known. At a
+        known start position there is at least one."""
         now, leading = self._motion.state(t), self._leading
         if leading is None or leading.newest is None or not leading.hypotheses:
             return [] if self.start is None else [self.start.mode(now)]
@@ -160,8 +160,8 @@ class Search:
         return se2.compose(poses, self._motion.relative(leading.newest, self._motion.state(t)).delta), weights
 
     def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> tuple[Array, ChainState] | None:
-        """Draw ``count`` poses from the result of the search. Returns poses (N, 3) and the integrated odometry at their time, which
-        is not later than ``now``. Returns None before the first informative measurement."""
+        """Draw ``count`` poses from the result of the search. Returns poses (N, 3) and the integrated odometry at their
+        time, which is not later than ``now``. Returns None before the first informative measurement."""
         leading = self._leading
         if leading is None:
             return None
@@ -177,8 +177,8 @@ class Search:
 
     @property
     def _leading(self) -> Finder | Population | None:
-        """The source of the present result: a finder that needs only one measurement, otherwise the particles, otherwise any
-        finder. None if no source is informative yet."""
+        """The source of the present result: a finder that needs only one measurement, otherwise the particles,
+        otherwise any finder. None if no source is informative yet."""
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):

@@ -42,8 +42,8 @@ class SwitchingSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class _PoseBelief:
-    """The causal estimate at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3). ``odometry``: the integrated
-    odometry at that time."""
+    """The causal estimate at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3). ``odometry``: the
+    integrated odometry at that time."""
 
     odometry: ChainState
     pose: Array

@@ -29,8 +29,8 @@ from factors.motion import Increment
 
 
 class Taken(NamedTuple):
-    """A processed measurement. ``checkpoint``: the estimator's state before the measurement, None if it is not needed. ``added``:
-    what the measurement added to the diagnostics, to remove it again if the measurement is replayed."""
+    """A processed measurement. ``checkpoint``: the estimator's state before the measurement, None if it is not needed.
+    ``added``: what the measurement added to the diagnostics, to remove it again if the measurement is replayed."""
 
     measurement: Measurement
     checkpoint: Any = None
@@ -70,9 +70,9 @@ class Timeline(ABC):
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """The pose at the time of the newest measurement or tick, or at ``t`` [s] if that is later.
 
-        Before the start, the estimate is the most likely hypothesis of the search with the status ``ambiguous``, or NaN with the
-        status ``unlocalized`` if there is none. After the start, the status is ``ambiguous`` while a search is in progress, and
-        while the estimated poses do not explain the measurements.
+        Before the start, the estimate is the most likely hypothesis of the search with the status ``ambiguous``, or NaN
+        with the status ``unlocalized`` if there is none. After the start, the status is ``ambiguous`` while a search is
+        in progress, and while the estimated poses do not explain the measurements.
         """
         if self._begun < math.inf:
             estimate = self._estimate_at(t)
@@ -85,8 +85,8 @@ class Timeline(ABC):
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
 
     def belief(self, t: float | None = None) -> Belief:
-        """The probability distribution behind :meth:`estimate`. Before the start it has all hypotheses of the search, and the
-        search's particles."""
+        """The probability distribution behind :meth:`estimate`. Before the start it has all hypotheses of the search,
+        and the search's particles."""
         if self._begun < math.inf or self._seeking is None:
             return gaussian_belief(self.estimate(t))
         at = self._t if t is None else max(t, self._t)
@@ -124,8 +124,8 @@ class Timeline(ABC):
         search.begin(KnownPosition(prior, self._motion))
 
     def _seek_start(self, m: Measurement, search: Tracking) -> None:
-        """Update the search for the start pose by the measurement ``m``. If this gives one clear pose, start the estimator there
-        and process all measurements since the start again."""
+        """Update the search for the start pose by the measurement ``m``. If this gives one clear pose, start the
+        estimator there and process all measurements since the start again."""
         start = search.start
         if start is not None:
             start.settle()
@@ -152,8 +152,8 @@ class Timeline(ABC):
     def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
         """The prior for a start at time ``t`` [s], from the result of the search.
 
-        ``best``: the pose that the search found, at a later time. ``moved``: the robot's motion from ``t`` to that time. ``start``:
-        the known position at ``t``, or None.
+        ``best``: the pose that the search found, at a later time. ``moved``: the robot's motion from ``t`` to that
+        time. ``start``: the known position at ``t``, or None.
         """
         raise NotImplementedError
 

@@ -1,12 +1,12 @@
 """Detection of observations that contradict the track: the robot is at another pose, or the odometry is wrong.
 
-A track is the sequence of estimated poses since the last (re)start of the estimator. Recent observations are kept with their
-log-probabilities given the track. When a sensor doubts the track, a search with particles begins with these observations. The track
-is rejected when the log-odds of another pose exceed :data:`REFUTING`.
+A track is the sequence of estimated poses since the last (re)start of the estimator. Recent observations are kept with
+their log-probabilities given the track. When a sensor doubts the track, a search with particles begins with these
+observations. The track is rejected when the log-odds of another pose exceed :data:`REFUTING`.
 
-The odometry is wrong if the wheels slip, or if the robot is carried. One observation that contradicts the track may be an outlier.
-Several observations that agree on a different motion are not. Two alternatives are therefore compared with the track and with the
-odometry, by the robust likelihoods of the same observations:
+The odometry is wrong if the wheels slip, or if the robot is carried. One observation that contradicts the track may be
+an outlier. Several observations that agree on a different motion are not. Two alternatives are therefore compared with
+the track and with the odometry, by the robust likelihoods of the same observations:
 
 - the robot has moved a different fraction of the distance that the odometry reports;
 - the wheels are at rest, but the robot moves with a constant velocity.
@@ -84,8 +84,8 @@ SLIPS = "the odometry contradicts the observations since {since:.1f} s: the moti
 
 
 class Tracked(NamedTuple):
-    """The newest estimated pose of an estimator: ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the integrated
-    ``odometry`` at its time."""
+    """The newest estimated pose of an estimator: ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the
+    integrated ``odometry`` at its time."""
 
     odometry: ChainState
     pose: Array
@@ -121,8 +121,8 @@ class Tracking(Search):
     def is_unsure(self, t: float, covariance: Array) -> bool:
         """True if the estimated pose at ``t`` [s], with ``covariance`` (3, 3), should not be reported as localized.
 
-        This is so if the position error exceeds :data:`NEAR` with a probability above 1 - :data:`SURE`, if the motion is unknown,
-        or if the previous track was rejected less than :data:`PROBATION` ago.
+        This is so if the position error exceeds :data:`NEAR` with a probability above 1 - :data:`SURE`, if the motion
+        is unknown, or if the previous track was rejected less than :data:`PROBATION` ago.
         """
         if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True
@@ -145,8 +145,8 @@ class Tracking(Search):
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
-        """Store an observation for a later search, after it has corrected the estimated pose. ``evidence()``: returns the
-        log-probability of the observation if the estimated pose (the track) is right."""
+        """Store an observation for a later search, after it has corrected the estimated pose. ``evidence()``: returns
+        the log-probability of the observation if the estimated pose (the track) is right."""
         current = observation.at_its_time() if self._weighs else None
         if current is None or not self._is_due(sensor, odometry.t):
             return
@@ -159,9 +159,9 @@ class Tracking(Search):
     def refuted(self, m: Any, track: Callable[[], Tracked], pose_at: Callable[[float, Array], Array]) -> Refuted | None:
         """Check whether the track must be rejected. Call this after each measurement and at each tick.
 
-        ``m``: the measurement or tick. ``track()``: returns the track's estimate at that time. ``pose_at(t, best)``: returns the
-        robot's pose (3,) at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now. Returns None if the track is not
-        rejected. If it is rejected, :attr:`best` is the robot's pose.
+        ``m``: the measurement or tick. ``track()``: returns the track's estimate at that time. ``pose_at(t, best)``:
+        returns the robot's pose (3,) at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now. Returns None if
+        the track is not rejected. If it is rejected, :attr:`best` is the robot's pose.
         """
         if isinstance(m, Tick) and not self.waits:
             return None
@@ -211,8 +211,8 @@ class Tracking(Search):
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> tuple[float, Change]:
         """Find when the robot left the track. Returns the most likely time [s], and the interval that contains it.
 
-        ``best``: the robot's present pose. Observations before that time are more likely given the track, later ones given
-        ``best``.
+        ``best``: the robot's present pose. Observations before that time are more likely given the track, later ones
+        given ``best``.
         """
         times: list[float] = []
         likelihoods: list[float] = []  # logarithms, of a change just before each time
@@ -232,8 +232,8 @@ class Tracking(Search):
         return times[int(np.argmax(likelihoods))], (last, times[possible[0]])
 
     def begin_track(self, *, by_search: bool) -> None:
-        """End the search, because the estimator continues at a new pose. ``by_search``: True if the search found this pose, so that
-        the estimator processes the stored observations again. False if a prior gave the pose."""
+        """End the search, because the estimator continues at a new pose. ``by_search``: True if the search found this
+        pose, so that the estimator processes the stored observations again. False if a prior gave the pose."""
         self.end()
         if by_search:
             self._kept.clear()
@@ -256,8 +256,8 @@ class _Compared(NamedTuple):
     correction: Correction
 
     def fit(self, observation: Observation) -> float:
-        """The log-likelihood of the observation given the track: at the corrected pose, minus half the squared Mahalanobis distance
-        of the correction."""
+        """The log-likelihood of the observation given the track: at the corrected pose, minus half the squared
+        Mahalanobis distance of the correction."""
         delta = self.correction.delta[:3]
         moved = float(positive.squared(delta, self.covariance))
         return float(observation.log_likelihood(self.corrected()[None], {})[0]) - 0.5 * moved
@@ -269,8 +269,8 @@ class _Compared(NamedTuple):
 
 
 class SlipMonitor:
-    """A detector of wrong odometry (wheel slip, carried robot), which uses the observations that corrected the pose. While the
-    odometry is wrong, it marks the ``motion`` as unknown. It adds an event to the ``diagnostics``."""
+    """A detector of wrong odometry (wheel slip, carried robot), which uses the observations that corrected the pose.
+    While the odometry is wrong, it marks the ``motion`` as unknown. It adds an event to the ``diagnostics``."""
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
@@ -282,8 +282,8 @@ class SlipMonitor:
     ) -> None:
         """Process an observation that has corrected a track.
 
-        ``observed()``: returns the observation as a function of the pose at its own time, or None. ``odometry``: the integrated
-        odometry at that time. ``view``: the estimator's state before the correction.
+        ``observed()``: returns the observation as a function of the pose at its own time, or None. ``odometry``: the
+        integrated odometry at that time. ``view``: the estimator's state before the correction.
         """
         t = odometry.t
         # a late measurement: remove the later observations, because they will be processed again
@@ -312,9 +312,9 @@ class SlipMonitor:
         return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the exact start time that they assume. This
-        is the time of the first observation from ``begin`` on that is not surprising. The log-odds are zero with too few
-        observations or too little motion."""
+        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the exact start time that they
+        assume. This is the time of the first observation from ``begin`` on that is not surprising. The log-odds are
+        zero with too few observations or too little motion."""
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > 1.0:
             del rows[0]
@@ -364,8 +364,8 @@ def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
 
 
 def beyond(covariance: Array, distance: float) -> float:
-    """The probability that the position of a Gaussian pose with ``covariance`` (3, 3) differs from its mean by more than
-    ``distance`` [m]."""
+    """The probability that the position of a Gaussian pose with ``covariance`` (3, 3) differs from its mean by more
+    than ``distance`` [m]."""
     angle = math.pi * np.arange(180) / 180.0
     direction = np.column_stack((np.cos(angle), np.sin(angle)))
     curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)
@@ -376,8 +376,8 @@ def beyond(covariance: Array, distance: float) -> float:
 def laplace_evidence(observation: Observation, pose: Array, covariance: Array, correction: Correction) -> float:
     """The marginal log-likelihood of an observation under a Gaussian prediction, by Laplace's method.
 
-    ``observation``: depends on the pose only. ``pose`` (3,), ``covariance`` (3, 3): the prediction and its body-frame covariance.
-    ``correction``: the correction of this prediction by the observation.
+    ``observation``: depends on the pose only. ``pose`` (3,), ``covariance`` (3, 3): the prediction and its body-frame
+    covariance. ``correction``: the correction of this prediction by the observation.
     """
     if correction.evidence is not None:
         return correction.evidence

@@ -1,7 +1,7 @@
 """Checks of whole logs: bounds of values, the time span, and warnings.
 
-A reader checks the values that it can attribute to a row of a file. This module also checks values that a reader computes from
-several rows, or converts from foreign formats.
+A reader checks the values that it can attribute to a row of a file. This module also checks values that a reader
+computes from several rows, or converts from foreign formats.
 """
 
 from collections.abc import Sequence
@@ -95,8 +95,8 @@ def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]
 def without_false_headings(log: Log) -> Log:
     """Return the log, with a reference without headings if its headings are evidently meaningless.
 
-    Headings are meaningless if they never change while the odometry turns by more than :data:`TURNED`. Systems that measure only
-    positions may report an orientation of zero.
+    Headings are meaningless if they never change while the odometry turns by more than :data:`TURNED`. Systems that
+    measure only positions may report an orientation of zero.
     """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not reference.has_heading or len(reference.t) < 2 or np.ptp(reference.poses[:, 2]) > 1e-9:

@@ -60,8 +60,8 @@ class _Roles:
 def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
     """Propose a manifest for the folder ``tables``.
 
-    The manifest is to be saved in ``folder`` if ``tables`` is below ``folder``, else in the folder that contains ``tables``.
-    Raises InputError if no file in ``tables`` is a table with times.
+    The manifest is to be saved in ``folder`` if ``tables`` is below ``folder``, else in the folder that contains
+    ``tables``. Raises InputError if no file in ``tables`` is a table with times.
     """
     path, folder = Path(os.path.realpath(tables)), folder.resolve()
     guesses = _guesses(path)
@@ -222,8 +222,8 @@ def _sides(table: Guess) -> tuple[str, ...]:
 
 
 def _described(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
-    """Return the settings that describe a table with a ``role`` in the manifest. ``roles``: the tables of all roles. ``path``: the
-    folder of the tables."""
+    """Return the settings that describe a table with a ``role`` in the manifest. ``roles``: the tables of all roles.
+    ``path``: the folder of the tables."""
     sides = _sides(table) if role == "odometry" else ()
     if sides:
         settings = table.mapping(("t", *sides))

@@ -51,8 +51,8 @@ class WheelSizes(FileModel):
     def metres(self, source: object, what: str, *, turns: bool) -> float:
         """Return the distance on the ground per unit of a wheel's value: the radius for angles, 1 for distances.
 
-        ``turns``: True if the values are angles or angular rates. ``source``, ``what``: the file and the setting to name in errors.
-        Raises InputError if a needed size is missing.
+        ``turns``: True if the values are angles or angular rates. ``source``, ``what``: the file and the setting to
+        name in errors. Raises InputError if a needed size is missing.
         """
         if self.track is None or (turns and self.radius is None):
             lacking = "track" if self.track is None else "radius"
@@ -62,9 +62,9 @@ class WheelSizes(FileModel):
     def twists(self, source: object, wheels: Array, warnings: list[Notice]) -> Array:
         """Return the motion (N, 3) of the robot ahead [m], to the left [m] and about the vertical [rad].
 
-        ``wheels`` (N, 2 or 4): the distances [m] of the left and the right wheel, and of the rear left and the rear right wheel.
-        Speeds [m/s] of the wheels give rates. Mecanum wheels: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum
-        wheeled mobile robot", 2015, eq. 22 to 24.
+        ``wheels`` (N, 2 or 4): the distances [m] of the left and the right wheel, and of the rear left and the rear
+        right wheel. Speeds [m/s] of the wheels give rates. Mecanum wheels: Taheri, Qiao, Ghaeminezhad, "Kinematic model
+        of a four mecanum wheeled mobile robot", 2015, eq. 22 to 24.
         """
         assert self.track is not None
         left, right, rear_left, rear_right = (wheels if wheels.shape[1] == 4 else np.hstack((wheels, wheels))).T
@@ -91,9 +91,9 @@ def between_poses(
 ) -> Array:
     """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
-    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause or after null poses.
-    At a reset, the previous motion is continued, with a warning. ``lost_ns``: the timestamps of null poses, which a device reports
-    while it has lost its pose. ``source``: the file to name in the warning.
+    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause or after
+    null poses. At a reset, the previous motion is continued, with a warning. ``lost_ns``: the timestamps of null poses,
+    which a device reports while it has lost its pose. ``source``: the file to name in the warning.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -112,9 +112,9 @@ def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Int
     """Return timestamps (M,) [ns] and increments (M, 4) of odometry with null poses, which a device reports while it is lost.
 
     An increment is the motion x, y [m], heading [rad], and the part [s] of its duration in which the motion is unknown.
-    ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of null poses. The motion
-    is unknown from a valid pose, over null poses, to the next valid pose. Up to the last null pose the previous motion is
-    continued, for at most :data:`HOLD_TIME`. Without null poses the increments are (N, 3).
+    ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of null poses.
+    The motion is unknown from a valid pose, over null poses, to the next valid pose. Up to the last null pose the
+    previous motion is continued, for at most :data:`HOLD_TIME`. Without null poses the increments are (N, 3).
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):
@@ -151,8 +151,8 @@ def after_rest(moves: Array) -> Array:
 def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[Notice]) -> Array:
     """Return the motions (N - 1, W) [m] of W wheels between N timestamps [ns].
 
-    ``distances`` (N, W): the distances of the wheels [m]. ``scales`` (W,): metres per encoder count. Encoders that wrap to 0 are
-    continued. At a reset, a fast jump to zero, the previous motion is continued, with a warning.
+    ``distances`` (N, W): the distances of the wheels [m]. ``scales`` (W,): metres per encoder count. Encoders that wrap
+    to 0 are continued. At a reset, a fast jump to zero, the previous motion is continued, with a warning.
     """
     steps = np.stack([wheel_steps(distances[:, i], float(scale)) for i, scale in enumerate(scales)], axis=-1)
     durations = _durations(t_ns)

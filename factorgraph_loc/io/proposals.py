@@ -22,8 +22,8 @@ COMPANIONS = {
 class Proposal:
     """A proposed manifest.
 
-    ``content``: its keys and values. ``text``: the manifest as TOML, with ``remarks`` as comments. ``folder``: the folder in which
-    to save it; paths in the manifest are relative to this folder.
+    ``content``: its keys and values. ``text``: the manifest as TOML, with ``remarks`` as comments. ``folder``: the
+    folder in which to save it; paths in the manifest are relative to this folder.
     """
 
     content: Mapping[str, Any]
@@ -37,9 +37,9 @@ def proposal_of(
 ) -> Proposal:
     """Return the manifest of the log at ``path`` with the ``options`` of a reader.
 
-    It is to be saved in ``folder`` if the log is below ``folder``, else in the folder that contains the log. Rig and map are files
-    beside the log: those with the log's name, or the only ones. A remark asks for a missing rig or map. If ``with_map`` is false,
-    the options describe the map, and no remark asks for one.
+    It is to be saved in ``folder`` if the log is below ``folder``, else in the folder that contains the log. Rig and
+    map are files beside the log: those with the log's name, or the only ones. A remark asks for a missing rig or map.
+    If ``with_map`` is false, the options describe the map, and no remark asks for one.
     """
     root = folder if path.is_relative_to(folder) else path.parent
     kind = "bag" if reader == "rosbag" else "folder"
@@ -85,8 +85,8 @@ def _sensors(key: str, value: Any) -> dict[str, Any]:
 def distinct(names: Sequence[str]) -> list[str]:
     """Return short distinct names of several sensors.
 
-    ``names``: topics or files. A short name has the words that are not common to all: ``/uwb/left``, ``/uwb/right`` give ``left``,
-    ``right``. If a short name is empty or two are equal, all are numbered: ``sensor_1``, ``sensor_2``.
+    ``names``: topics or files. A short name has the words that are not common to all: ``/uwb/left``, ``/uwb/right``
+    give ``left``, ``right``. If a short name is empty or two are equal, all are numbered: ``sensor_1``, ``sensor_2``.
     """
     words = [re.findall(r"[^\W_]+", name) for name in names]
     common = set.intersection(*map(set, words))

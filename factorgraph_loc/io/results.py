@@ -31,8 +31,8 @@ FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)
 class Estimates:
     """The estimates of one kind, causal or final, from a stored run.
 
-    ``trajectory``: N estimated poses. ``errors``: by the names in :data:`ERRORS`, the errors of position (N,) [m] and heading (N,)
-    [rad], and the normalised estimation error squared (N,). An unknown error is NaN.
+    ``trajectory``: N estimated poses. ``errors``: by the names in :data:`ERRORS`, the errors of position (N,) [m] and
+    heading (N,) [rad], and the normalised estimation error squared (N,). An unknown error is NaN.
     """
 
     trajectory: Trajectory
@@ -57,9 +57,8 @@ class ResultFiles:
     """The files of a stored run.
 
     ``read``: a function that returns the content of a file by its name.
-    ``t0_ns``: the absolute time of t = 0 [ns]. If None, estimates begin at t = 0; events and innovations have absolute times.
-    ``folder``: the folder to name in errors.
-    Methods raise InputError if a file is damaged.
+    ``t0_ns``: the absolute time of t = 0 [ns]. If None, estimates begin at t = 0; events and innovations have absolute
+    times. ``folder``: the folder to name in errors. Methods raise InputError if a file is damaged.
     """
 
     read: Callable[[str], bytes]

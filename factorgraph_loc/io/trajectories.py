@@ -1,7 +1,7 @@
 """Reads trajectories from files of poses, topics of bags, results of runs, or references of logs, and writes trajectories.
 
-Also converts trajectories to and from those of evo (https://github.com/MichaelGrupp/evo) and messages of ROS. The libraries evo
-and rosbags are imported only when these functions are called.
+Also converts trajectories to and from those of evo (https://github.com/MichaelGrupp/evo) and messages of ROS. The
+libraries evo and rosbags are imported only when these functions are called.
 """
 
 from collections.abc import Iterable
@@ -74,9 +74,9 @@ def _reference(log: str) -> PosePath:
 def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
     """Write a trajectory in TUM format, or in KITTI format if ``path`` ends with .kitti. Returns the written files.
 
-    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. In KITTI format, times [s] are written to ``NAME.times.txt``.
-    The times of a planar trajectory are written relative to its t = 0. A pose in KITTI format is the pose of the robot (x forward,
-    z up), not of a camera, and it is not relative to the first pose.
+    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. In KITTI format, times [s] are written to
+    ``NAME.times.txt``. The times of a planar trajectory are written relative to its t = 0. A pose in KITTI format is
+    the pose of the robot (x forward, z up), not of a camera, and it is not relative to the first pose.
     """
     path = Path(path)
     if path.suffix != ".kitti":
@@ -124,8 +124,8 @@ def from_evo(trajectory: Any) -> PosePath:
 def to_ros(trajectory: Trajectory | PosePath, frame_id: str = "map", t0_ns: int = 0) -> Any:
     """Return a trajectory as a ``nav_msgs/Path`` message: of ROS 2 if its environment is sourced, else of the library rosbags.
 
-    ``frame_id``: the frame of the poses. ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. Raises InputError if
-    neither ROS 2 nor rosbags is available, or if a pose is not finite.
+    ``frame_id``: the frame of the poses. ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. Raises
+    InputError if neither ROS 2 nor rosbags is available, or if a pose is not finite.
     """
     make = _messages()
     path = _posed(trajectory, t0_ns)
@@ -147,9 +147,9 @@ def to_ros(trajectory: Trajectory | PosePath, frame_id: str = "map", t0_ns: int 
 def from_ros(messages: Any) -> PosePath:
     """Return the poses of a ``nav_msgs/Path`` message, or of a sequence of messages.
 
-    Their types may be ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``, ``TransformStamped`` or ``PointStamped``, which
-    has no rotation. Messages of rclpy and of rosbags are accepted. Times are those of the headers. Raises InputError with the
-    number of an invalid message.
+    Their types may be ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``, ``TransformStamped`` or
+    ``PointStamped``, which has no rotation. Messages of rclpy and of rosbags are accepted. Times are those of the
+    headers. Raises InputError with the number of an invalid message.
     """
     given: Iterable[Any] = getattr(messages, "poses", messages)
     rows, stamps, points = [], [], set()

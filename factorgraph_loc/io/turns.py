@@ -35,8 +35,8 @@ class Turns:
 class SameTurns:
     """The comparison of two tables that show the same turns.
 
-    ``offset`` [s]: the clock of the first table minus the clock of the second; None if the turns agree at several offsets.
-    ``ratio``: the angle of the first table divided by the angle of the second.
+    ``offset`` [s]: the clock of the first table minus the clock of the second; None if the turns agree at several
+    offsets. ``ratio``: the angle of the first table divided by the angle of the second.
     """
 
     offset: float | None

@@ -45,15 +45,15 @@ class Localizer:
     """An estimator for online use. Any number of threads may push measurements and pull estimates.
 
     ``rig``, ``world``: the robot and the map.
-    ``estimator``: the name of the estimator. ``settings``: overrides of its default settings. The smoother has a fixed lag of 10 s
-    by default. With ``lag = None`` it keeps the whole past.
-    ``sensors``: names of the sensors to use, by default those in the rig. Measurements of other sensors are counted as ignored.
-    ``history``: length of the past that :meth:`trajectory` returns [s], which limits the memory.
+    ``estimator``: the name of the estimator. ``settings``: overrides of its default settings. The smoother has a fixed
+    lag of 10 s by default. With ``lag = None`` it keeps the whole past.
+    ``sensors``: names of the sensors to use, by default those in the rig. Measurements of other sensors are counted as
+    ignored. ``history``: length of the past that :meth:`trajectory` returns [s], which limits the memory.
     ``seed``: the seed of the random generator.
 
-    Call :meth:`initialize` first, and again to restart. Timestamps are seconds of any clock that all sensors share. The time
-    offsets of the rig are added to them. A lock protects the estimator: a push waits while another measurement is processed.
-    The same measurements in the same order give the same results. Queries do not change the results.
+    Call :meth:`initialize` first, and again to restart. Timestamps are seconds of any clock that all sensors share. The
+    time offsets of the rig are added to them. A lock protects the estimator: a push waits while another measurement is
+    processed. The same measurements in the same order give the same results. Queries do not change the results.
 
     Raises InputError if an argument is invalid.
     """
@@ -87,15 +87,15 @@ class Localizer:
     ) -> None:
         """Start or restart the estimator.
 
-        ``pose`` (3,): x, y [m] and heading [rad] in the world frame. None starts at an unknown pose in the map. A NaN heading is
-        unknown; the status is then not ``localized`` until measurements determine the heading.
-        ``covariance`` (3, 3) of the pose, or (2, 2) of the position if the heading is NaN. The default has standard deviations of
-        0.05 m and 0.05 rad.
-        ``t``: time of the pose [s], by default the time of the first measurement. The last velocity from before ``t`` applies at
-        ``t``. Measurements of other sensors than odometry from before ``t`` are ignored.
+        ``pose`` (3,): x, y [m] and heading [rad] in the world frame. None starts at an unknown pose in the map. A NaN
+        heading is unknown; the status is then not ``localized`` until measurements determine the heading.
+        ``covariance`` (3, 3) of the pose, or (2, 2) of the position if the heading is NaN. The default has standard
+        deviations of 0.05 m and 0.05 rad.
+        ``t``: time of the pose [s], by default the time of the first measurement. The last velocity from before ``t``
+        applies at ``t``. Measurements of other sensors than odometry from before ``t`` are ignored.
 
-        Raises InputError if an argument is invalid or if the estimator does not support an unknown pose, and RunFailedError if it
-        cannot start at the pose. The previous state is kept in both cases.
+        Raises InputError if an argument is invalid or if the estimator does not support an unknown pose, and
+        RunFailedError if it cannot start at the pose. The previous state is kept in both cases.
         """
         start = None if pose is None else prior_of(pose, covariance, t)
         setup = model_setup.Setup(self._rig, self._world, self._sensors, np.random.default_rng(self._seed))
@@ -138,9 +138,9 @@ class Localizer:
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """Return the pose at the newest timestamp of all measurements, or predicted by odometry to a later time ``t`` [s].
 
-        This does not change the state: later measurements from before ``t`` are not late. Before the start, the status is
-        ``unlocalized`` and the pose is NaN. Raises RunFailedError if the estimator has failed, if the estimate is not finite, or if
-        its covariance is not positive. After the last two errors the localizer can still be used.
+        This does not change the state: later measurements from before ``t`` are not late. Before the start, the status
+        is ``unlocalized`` and the pose is NaN. Raises RunFailedError if the estimator has failed, if the estimate is
+        not finite, or if its covariance is not positive. After the last two errors the localizer can still be used.
         """
         with self._lock:
             return self._estimate(t)

@@ -42,8 +42,8 @@ class Bundle:
     ``tracks``: the observations without outliers. ``points`` (T, 3) [m]: the adjusted positions of their points.
     ``old`` (T,): the index of each point in the input. ``errors`` (N, 2) [px]: the residuals, predicted minus measured.
     ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first.
-    ``point_covariances`` (T, 3, 3) [m^2]: of the points. Both include the uncertainty of cameras and points, but not that of the
-    calibration.
+    ``point_covariances`` (T, 3, 3) [m^2]: of the points. Both include the uncertainty of cameras and points, but not
+    that of the calibration.
     """
 
     model: CameraModel
@@ -69,10 +69,10 @@ def adjust(
 ) -> Bundle:
     """Adjust points and camera poses.
 
-    ``cameras``, ``covariances`` (F, 6, 6): the prior poses and their covariances, in the cameras' own frames, rotation first.
-    ``tracks``: the observations. ``points`` (T, 3): the initial positions. ``focal``: estimate the focal lengths too. ``lens``:
-    estimate the focal lengths, the principal point and the distortion (Brown's model) too. ``progress``: is called with the
-    fraction done. Raises RuntimeError if the graph cannot be solved.
+    ``cameras``, ``covariances`` (F, 6, 6): the prior poses and their covariances, in the cameras' own frames, rotation
+    first. ``tracks``: the observations. ``points`` (T, 3): the initial positions. ``focal``: estimate the focal lengths
+    too. ``lens``: estimate the focal lengths, the principal point and the distortion (Brown's model) too. ``progress``:
+    is called with the fraction done. Raises RuntimeError if the graph cannot be solved.
     """
     old = np.arange(len(points))
     fixed = gtsam.NonlinearFactorGraph()
@@ -97,8 +97,8 @@ def adjust(
 
 
 def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
-    """Return a mask (N,) of the observations whose residual is at most ``limit`` standard deviations. If a point has only one such
-    observation, the mask is False for it too, because one observation does not determine the point."""
+    """Return a mask (N,) of the observations whose residual is at most ``limit`` standard deviations. If a point has
+    only one such observation, the mask is False for it too, because one observation does not determine the point."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     count = np.bincount(tracks.track[right], minlength=tracks.count)
@@ -108,8 +108,8 @@ def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array
 def marginals(
     model: CameraModel, cameras: Cameras, information: Array, tracks: Tracks, points: Array
 ) -> tuple[Array, Array]:
-    """Return the marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised at the given poses and
-    points.
+    """Return the marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised at the given
+    poses and points.
 
     ``information`` (F, 6, 6): the inverse covariances of the cameras' prior poses.
     """
@@ -201,8 +201,8 @@ def _optimized(
 
 
 def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:
-    """Return the sparse matrix of ``shape`` with ``blocks`` (N, r, c) at the block rows ``rows`` (N,) and block columns ``columns``
-    (N,). Blocks at the same place are added."""
+    """Return the sparse matrix of ``shape`` with ``blocks`` (N, r, c) at the block rows ``rows`` (N,) and block columns
+    ``columns`` (N,). Blocks at the same place are added."""
     _, height, width = blocks.shape
     i = np.broadcast_to(height * rows[:, None, None] + np.arange(height)[:, None], blocks.shape)
     j = np.broadcast_to(width * columns[:, None, None] + np.arange(width), blocks.shape)

@@ -50,8 +50,8 @@ def dropped_figure(
 ) -> Figure:
     """Plot a map of tags with those that are believed dead crossed out.
 
-    ``places``: the position (2,) of each tag by EPC. ``dead``: by EPC of each dead tag, the probability that it is dead. ``poses``
-    (N, 3): the trajectory. ``walls``: (x1, y1, x2, y2) of each wall.
+    ``places``: the position (2,) of each tag by EPC. ``dead``: by EPC of each dead tag, the probability that it is
+    dead. ``poses`` (N, 3): the trajectory. ``walls``: (x1, y1, x2, y2) of each wall.
     """
     kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
     out, axis = _from_above(f"{log}: dead tags of the map", (np.array(list(places.values())), poses[:, :2]), walls)
@@ -68,8 +68,8 @@ def dropped_figure(
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
     """Plot a new map of landmarks with 2-sigma ellipses, the landmarks of the given map, and the trajectory.
 
-    ``log``: the name of the log. ``poses`` (N, 3): the trajectory in the frame of the new map. ``label``: the number of last
-    characters of a landmark's name that are shown; 0 shows the whole name.
+    ``log``: the name of the log. ``poses`` (N, 3): the trajectory in the frame of the new map. ``label``: the number of
+    last characters of a landmark's name that are shown; 0 shows the whole name.
     """
     given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
     learnt = [e for e in made.entries if e.learnt is not None]
@@ -110,8 +110,8 @@ def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tup
 
 
 def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float, ...]] = ()) -> tuple[Figure, Axes]:
-    """Create a figure with one pair of axes, in the shape of the area of all ``places`` (N, 2), and draw the walls. Returns figure
-    and axes."""
+    """Create a figure with one pair of axes, in the shape of the area of all ``places`` (N, 2), and draw the walls.
+    Returns figure and axes."""
     width, depth = np.maximum(np.ptp(np.concatenate(places), axis=0), 1.0)
     out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), title)
     axis: Axes = axes[0, 0]

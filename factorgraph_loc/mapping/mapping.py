@@ -6,9 +6,9 @@ The alignment is robust, because some given landmarks may be wrong. It starts wi
 the least median of squares (Rousseeuw and Leroy, "Robust Regression and Outlier Detection", 1987, chapter 5). Weighted least
 squares on the inliers follow. The inliers are selected again in each iteration.
 
-The covariances of the run include the drift between its start and the landmarks. This part is common to all landmarks, and the
-alignment removes it. The covariances are therefore scaled by the variance of unit weight of the inliers (Koch, "Parameter
-Estimation and Hypothesis Testing in Linear Models", 1999).
+The covariances of the run include the drift between its start and the landmarks. This part is common to all landmarks,
+and the alignment removes it. The covariances are therefore scaled by the variance of unit weight of the inliers (Koch,
+"Parameter Estimation and Hypothesis Testing in Linear Models", 1999).
 """
 
 from collections import Counter
@@ -79,9 +79,9 @@ class Entry:
 class LandmarkMap:
     """A new map of landmarks, and its comparison with the given map.
 
-    ``world``: the new map. ``entries``: one per landmark of both maps. ``frame`` (3,): the pose of the run's frame in the frame of
-    the new map. ``judged``: True if the new map was compared with the given map; both then have the same frame. ``notes``: messages
-    for the user.
+    ``world``: the new map. ``entries``: one per landmark of both maps. ``frame`` (3,): the pose of the run's frame in
+    the frame of the new map. ``judged``: True if the new map was compared with the given map; both then have the same
+    frame. ``notes``: messages for the user.
     """
 
     world: World
@@ -114,8 +114,8 @@ class LandmarkMap:
 class Alignment:
     """The alignment of a new map with a given map.
 
-    ``pose`` (3,): the transform from the frame of the new map to that of the given map. ``covariance`` (3, 3): of its x, y and
-    angle.
+    ``pose`` (3,): the transform from the frame of the new map to that of the given map. ``covariance`` (3, 3): of its
+    x, y and angle.
     ``inliers``: the number of landmarks that agree. ``factor``: the covariances of the new landmarks must be multiplied by it.
     """
 
@@ -137,9 +137,9 @@ def make_map(
     unchanged. False if the run used no map. If the log has a map, the learnt landmarks are aligned and compared with it.
     ``in_frame``: True if the learnt landmarks are in the frame of the log's map already and need no alignment.
 
-    A given landmark is wrong if two conditions are met. Its distance from the learnt landmark is more than ``TOLERANCE``. The
-    squared Mahalanobis distance exceeds ``GATE``, with the sum of the covariances of learnt landmark, alignment and given landmark.
-    Raises RunFailedError if nothing was learnt.
+    A given landmark is wrong if two conditions are met. Its distance from the learnt landmark is more than
+    ``TOLERANCE``. The squared Mahalanobis distance exceeds ``GATE``, with the sum of the covariances of learnt
+    landmark, alignment and given landmark. Raises RunFailedError if nothing was learnt.
     """
     if not learnt and not extend:
         raise RunFailedError(
@@ -175,8 +175,8 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     """Align K points with their targets by one rotation and translation, robust to wrong targets. K must be at least
     ``MIN_COMMON``.
 
-    ``points``: the estimated landmarks. ``targets`` (K, 2), ``surveys`` (K, 2, 2): their given positions, and the covariances of
-    these.
+    ``points``: the estimated landmarks. ``targets`` (K, 2), ``surveys`` (K, 2, 2): their given positions, and the
+    covariances of these.
     """
     positions = np.array([p.position for p in points])
     covariances = np.array([p.covariance for p in points])
@@ -238,8 +238,8 @@ def _rotation(pose: Array) -> Array:
 
 
 def _by_alignment(pose: Array, positions: Array) -> Array:
-    """Return the Jacobians (K, 2, 3) of the transformed ``positions`` (K, 2) with respect to x, y and angle of the alignment
-    ``pose``."""
+    """Return the Jacobians (K, 2, 3) of the transformed ``positions`` (K, 2) with respect to x, y and angle of the
+    alignment ``pose``."""
     x, y = (se2.transform_from(pose, positions) - pose[:2]).T
     jacobian = np.zeros((len(positions), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
@@ -285,9 +285,9 @@ def _assemble(
 ) -> LandmarkMap:
     """Build the new map: first the landmarks of the given map in their order, then the new ones.
 
-    ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new map's frame.
-    ``verdicts``: by name, "new" if missing. ``keep``: names of the landmarks whose given position is used. ``flagged``: names of
-    the landmarks whose given position is wrong.
+    ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new
+    map's frame. ``verdicts``: by name, "new" if missing. ``keep``: names of the landmarks whose given position is used.
+    ``flagged``: names of the landmarks whose given position is wrong.
     """
     entries, landmarks = [], {}
     sensors = [log.rig.of(BearingRangeSettings, name) for name in log.rig.names("bearing_range")]

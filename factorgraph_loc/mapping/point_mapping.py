@@ -1,8 +1,8 @@
 """Maps of 3-D points from images with known camera poses.
 
-The steps are these. Keyframes are selected. Their features are matched near epipolar lines, and matches are chained into tracks.
-Tracks with enough parallax are triangulated. Points and cameras are adjusted together. Points with enough observations and small
-enough covariances become points of the map, with descriptors from a few directions.
+The steps are these. Keyframes are selected. Their features are matched near epipolar lines, and matches are chained
+into tracks. Tracks with enough parallax are triangulated. Points and cameras are adjusted together. Points with enough
+observations and small enough covariances become points of the map, with descriptors from a few directions.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ ASKEW, AFLOAT = 0.003, 0.003  # rad, m: standard deviations of tilt and height o
 
 @dataclass(frozen=True, eq=False)
 class PosedFrames:
-    """F images with known camera poses. ``frames``: their features. ``cameras``: their camera poses. ``covariances`` (F, 6, 6): of
-    perturbations in the cameras' own frames, rotation first."""
+    """F images with known camera poses. ``frames``: their features. ``cameras``: their camera poses. ``covariances``
+    (F, 6, 6): of perturbations in the cameras' own frames, rotation first."""
 
     frames: list[CameraFrame]
     cameras: Cameras
@@ -84,8 +84,8 @@ class PointSettings(FileModel):
     views: Annotated[int, Field(ge=1, le=100)] = 4
     """largest number of descriptors of a point in the map, each from another keyframe"""
     most: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
-    """largest number of points in the map; in each part of space the points with the smallest covariances are kept. Without this
-    setting all points are kept"""
+    """largest number of points in the map; in each part of space the points with the smallest covariances are kept.
+    Without this setting all points are kept"""
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ class PointReport:
 
     ``keyframes``, ``pairs``, ``tracks``, ``triangulated``, ``points``, ``observations``: the counts after each step.
     ``rms``, ``mad`` [px]: root mean square and median absolute value of the pixel errors of the kept observations.
-    ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard deviation in the worst direction.
-    ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses. ``focal`` [px]: the focal length fx.
-    ``fused``: the number of points that the extended map contained already.
+    ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard deviation in the worst
+    direction. ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses. ``focal`` [px]: the focal
+    length fx. ``fused``: the number of points that the extended map contained already.
     """
 
     keyframes: int
@@ -117,8 +117,8 @@ class PointReport:
 
 @dataclass(frozen=True, eq=False)
 class MadePoints:
-    """A new map of points. ``points``: the map. ``cameras``: the adjusted poses of its keyframes. ``model``: the calibration of the
-    camera, adjusted if that was requested. ``report``: statistics."""
+    """A new map of points. ``points``: the map. ``cameras``: the adjusted poses of its keyframes. ``model``: the
+    calibration of the camera, adjusted if that was requested. ``report``: statistics."""
 
     points: PointMap
     cameras: Cameras
@@ -134,9 +134,9 @@ def map_points(
 ) -> MadePoints:
     """Make a map of points from images with known camera poses, ``posed``.
 
-    ``progress``: is called with the fraction done. Raises RunFailedError if no point is observed from several places, if points and
-    cameras cannot be adjusted, or if no point fulfils the settings. Raises InputError if the settings adjust a calibration with an
-    unsupported distortion.
+    ``progress``: is called with the fraction done. Raises RunFailedError if no point is observed from several places,
+    if points and cameras cannot be adjusted, or if no point fulfils the settings. Raises InputError if the settings
+    adjust a calibration with an unsupported distortion.
     """
     settings = settings or PointSettings()
     posed = posed[chosen_keyframes(posed, settings)]
@@ -197,8 +197,8 @@ def point_map(
 ) -> PointMap:
     """Return a map of T points, each with the descriptors of at most ``views`` observations.
 
-    ``points`` (T, 3), ``covariances`` (T, 3, 3): positions and their covariances. ``cameras``: camera poses. ``tracks``:
-    observations.
+    ``points`` (T, 3), ``covariances`` (T, 3, 3): positions and their covariances. ``cameras``: camera poses.
+    ``tracks``: observations.
     """
     shown = _different_views(cameras, tracks, points, views)
     views_of = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
@@ -264,8 +264,8 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
 def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int) -> Integers:
     """Select at most ``views`` observations of each point, from viewpoints that differ. Returns their indices (V,).
 
-    The first selected observation is nearest to the mean of direction and logarithmic distance. Each further one differs most from
-    the observations that are selected already.
+    The first selected observation is nearest to the mean of direction and logarithmic distance. Each further one
+    differs most from the observations that are selected already.
     """
     chosen: list[int] = []
     order = np.argsort(tracks.track, kind="stable")

@@ -150,8 +150,8 @@ def _views(points: PointMap) -> list[Integers]:
 
 
 def _limit(points: PointMap, views: list[Integers]) -> float:
-    """Return a limit for the difference between views of the same point: the percentile :data:`PERCENTILE`, over points, of the
-    distance between the two most similar views of a point. Returns 0 if no point has two views."""
+    """Return a limit for the difference between views of the same point: the percentile :data:`PERCENTILE`, over
+    points, of the distance between the two most similar views of a point. Returns 0 if no point has two views."""
     least = []
     for mine in [mine for mine in views if len(mine) > 1][:COMPARED]:
         apart = distance_matrix(points.descriptors[mine], points.descriptors[mine])

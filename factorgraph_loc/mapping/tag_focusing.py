@@ -1,11 +1,11 @@
 """Positions of tags with centimetre accuracy, from the phases of reads at known robot poses.
 
-Phases of one tag, antenna and channel within a short time window are compared with the phases predicted for a tag position
-(:mod:`factors.rfid.signals`). The differences are equal only at the true position of the tag, as in a synthetic aperture
-(holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011). Unknown phase offsets and frequency hopping cancel within a window. Therefore
-only the relative poses within a window must be accurate to a fraction of the wavelength. The prior is the position estimated from
-reads and misses. The likelihood has side lobes. Therefore it is evaluated on a lattice first, and the best position is refined by
-Fisher scoring.
+Phases of one tag, antenna and channel within a short time window are compared with the phases predicted for a tag
+position (:mod:`factors.rfid.signals`). The differences are equal only at the true position of the tag, as in a
+synthetic aperture (holography: Miesen, Kirsch, Vossiek, IEEE RFID 2011). Unknown phase offsets and frequency hopping
+cancel within a window. Therefore only the relative poses within a window must be accurate to a fraction of the
+wavelength. The prior is the position estimated from reads and misses. The likelihood has side lobes. Therefore it is
+evaluated on a lattice first, and the best position is refined by Fisher scoring.
 """
 
 from __future__ import annotations
@@ -41,10 +41,9 @@ def focused(
 ) -> dict[int, LearntPoint]:
     """Improve positions of tags by the phases of their reads. Returns the new positions by index of the tag.
 
-    ``learnt``: the positions from reads and misses, by index of the tag. ``keyframes``: the estimated robot poses, which are
-    interpolated. If None, the poses of the log's reference are used.
-    A position does not change if the height of the tag is unknown or too few reads have a phase. No position changes if the rig has
-    no section ``[rfid.phase]``.
+    ``learnt``: the positions from reads and misses, by index of the tag. ``keyframes``: the estimated robot poses,
+    which are interpolated. If None, the poses of the log's reference are used. A position does not change if the height
+    of the tag is unknown or too few reads have a phase. No position changes if the rig has no section ``[rfid.phase]``.
     """
     rfid = log.rig.of(RfidSettings)
     if rfid.phase is None:
@@ -67,8 +66,8 @@ def focused(
 
 
 def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntPoint) -> LearntPoint:
-    """Improve the position ``prior`` of one tag at ``height`` [m]. ``reads``: the reads of this tag, with antenna poses in the
-    world frame."""
+    """Improve the position ``prior`` of one tag at ``height`` [m]. ``reads``: the reads of this tag, with antenna poses
+    in the world frame."""
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     position = prior
     for _ in range(SELECTIONS):
@@ -96,8 +95,8 @@ def _lattice(covariance: Array) -> Array:
 def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, offs: Array) -> Array:
     """Return the displacement of ``offs`` (G, 2) with the largest posterior density.
 
-    ``start`` (2,): the current position relative to the prior. ``information`` (2, 2): the inverse covariance of the prior. The
-    likelihood of a displaced tag is computed by displacing all poses by the opposite vector.
+    ``start`` (2,): the current position relative to the prior. ``information`` (2, 2): the inverse covariance of the
+    prior. The likelihood of a displaced tag is computed by displacing all poses by the opposite vector.
     """
     poses = np.column_stack((-offs, np.zeros(len(offs))))
     moved = offs + start
@@ -108,8 +107,8 @@ def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, informat
 def _refined(
     likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, off: Array
 ) -> tuple[Array, Array]:
-    """Maximise the posterior density by Fisher scoring, starting at the displacement ``off`` (2,). Returns the optimal displacement
-    (2,) and the information (2, 2) there. ``start``, ``information``: see :func:`_best`."""
+    """Maximise the posterior density by Fisher scoring, starting at the displacement ``off`` (2,). Returns the optimal
+    displacement (2,) and the information (2, 2) there. ``start``, ``information``: see :func:`_best`."""
 
     def at(off: Array) -> tuple[float, Array, Array]:
         score, moved = likelihood.score(np.array((*-off, 0.0)), reads), off + start

@@ -1,7 +1,7 @@
 """Maps of RFID tags from a log, and their comparison with a given map.
 
-The robot poses are those of the log's reference, or they are estimated together with the tags from odometry and reads. The map is
-written in the frame of the survey of the log's rig (``[survey]``), so that it can be used with this rig.
+The robot poses are those of the log's reference, or they are estimated together with the tags from odometry and reads.
+The map is written in the frame of the survey of the log's rig (``[survey]``), so that it can be used with this rig.
 """
 
 from collections.abc import Callable, Mapping
@@ -66,13 +66,13 @@ def map_tags(
     """Make a map of the tags that a log read.
 
     ``poses``: "reference" uses the poses of the log's reference, "odometry" estimates poses and tags together.
-    ``prior``: the start pose, which defines the frame of estimated poses. If it is None, the first pose is the origin, and the
-    facings of the log's map are not used. ``extend``: True keeps the tags of the log's map and uses them to estimate the poses.
-    False estimates all tags, and compares them with the log's map. ``height`` [m]: of tags that the map lacks; None uses the mean
-    height of the antennas. ``progress``: is called with the fraction done.
+    ``prior``: the start pose, which defines the frame of estimated poses. If it is None, the first pose is the origin,
+    and the facings of the log's map are not used. ``extend``: True keeps the tags of the log's map and uses them to
+    estimate the poses. False estimates all tags, and compares them with the log's map. ``height`` [m]: of tags that the
+    map lacks; None uses the mean height of the antennas. ``progress``: is called with the fraction done.
 
-    Raises InputError if the log has no reads, no antennas in its rig or no suitable reference. Raises RunFailedError if no tag
-    could be located.
+    Raises InputError if the log has no reads, no antennas in its rig or no suitable reference. Raises RunFailedError if
+    no tag could be located.
     """
     observations = tag_observations(log, height)
     given = np.isfinite(observations.positions[:, 0])
@@ -119,8 +119,8 @@ def _along_reference(
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
     """Locate the tags along the log's reference.
 
-    Returns the located tags by index, the facings (T,) [rad], the search result of each of T tags, and the robot poses (K, 3) of
-    the antenna observations.
+    Returns the located tags by index, the facings (T,) [rad], the search result of each of T tags, and the robot poses
+    (K, 3) of the antenna observations.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference: map its tags with poses from odometry instead")
@@ -149,8 +149,8 @@ def _along_reference(
 
 
 def _why(posterior: TagPosterior, reads: int) -> Notice:
-    """Return the reason why a tag is not in the map. The kinds of reasons are "unread", "chance" (false reads), "ambiguous" and
-    "uncertain". ``reads``: the number of reads of the tag."""
+    """Return the reason why a tag is not in the map. The kinds of reasons are "unread", "chance" (false reads),
+    "ambiguous" and "uncertain". ``reads``: the number of reads of the tag."""
     if not reads:
         return notice("unread", "never read")
     count = f"read {reads} times" if reads > 1 else "read once"

@@ -1,11 +1,11 @@
 """Search for the positions of tags, given known robot poses. All modes of the likelihood are found, not only the best one.
 
-The likelihood of all antenna observations is evaluated on a lattice, and its best positions are refined by Fisher scoring. After a
-straight drive, a tag on the left of the robot may be as likely as a tag on the right. Then there are two modes. Their weights are
-computed by Laplace's method under a uniform prior.
+The likelihood of all antenna observations is evaluated on a lattice, and its best positions are refined by Fisher
+scoring. After a straight drive, a tag on the left of the robot may be as likely as a tag on the right. Then there are
+two modes. Their weights are computed by Laplace's method under a uniform prior.
 
-If the detection model depends on the facing of a tag and the facing is unknown, :data:`DIRECTIONS` facings are tried on the
-lattice, and then intermediate facings near the best ones.
+If the detection model depends on the facing of a tag and the facing is unknown, :data:`DIRECTIONS` facings are tried on
+the lattice, and then intermediate facings near the best ones.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ PER_EVALUATION = 2000  # observations that are evaluated on the lattice at once,
 
 @dataclass(frozen=True, eq=False)
 class TagCandidates:
-    """C candidates for the positions of tags. ``tag`` (C,): index of the tag. ``places`` (C, 2) [m]: its position. ``facing`` (C,)
-    [rad]: its facing, NaN if it does not matter."""
+    """C candidates for the positions of tags. ``tag`` (C,): index of the tag. ``places`` (C, 2) [m]: its position.
+    ``facing`` (C,) [rad]: its facing, NaN if it does not matter."""
 
     tag: Integers
     places: Array
@@ -82,8 +82,8 @@ class TagMode:
 class TagPosterior:
     """The result of the search for one tag.
 
-    ``modes``: by descending weight; the weights sum to 1. ``reads``: the number of inventory rounds that read the tag. ``gain``:
-    the tempered log-likelihood at the best position, minus that of a tag out of reach of all antennas.
+    ``modes``: by descending weight; the weights sum to 1. ``reads``: the number of inventory rounds that read the tag.
+    ``gain``: the tempered log-likelihood at the best position, minus that of a tag out of reach of all antennas.
     """
 
     modes: tuple[TagMode, ...]
@@ -109,8 +109,8 @@ class TagPosterior:
 def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
     """Search for the positions of T tags. Returns a result per tag.
 
-    ``counts``: the reads of these tags; its ``offsets`` are the robot poses in the world frame. ``heights`` (T,) [m]. ``facing``
-    (T,) [rad]: NaN where unknown.
+    ``counts``: the reads of these tags; its ``offsets`` are the robot poses in the world frame. ``heights`` (T,) [m].
+    ``facing`` (T,) [rad]: NaN where unknown.
     """
     counts = merged(counts, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
@@ -240,8 +240,8 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
 
 
 def _modes(optima: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMode, ...]:
-    """Convert the local optima of one tag to modes. Equal optima are dropped, and overlapping ones, such as those that differ in
-    facing only, are merged.
+    """Convert the local optima of one tag to modes. Equal optima are dropped, and overlapping ones, such as those that
+    differ in facing only, are merged.
 
     ``optima``: C optima, best first. ``nll`` (C,): their negative log-likelihoods. ``covariances`` (C, 2, 2).
     """
@@ -327,9 +327,9 @@ def _refined(
 ) -> tuple[Array, Array, Array]:
     """Move C candidates to the nearest local optimum. Column c of ``counts.hits`` has the reads of candidate c.
 
-    ``heights``, ``facing`` (C,), ``places`` (C, 2): of the candidates. Returns positions (C, 2), negative log-likelihoods (C,) and
-    information matrices (C, 2, 2). The information is the observed curvature if it is positive definite, otherwise the Fisher
-    information.
+    ``heights``, ``facing`` (C,), ``places`` (C, 2): of the candidates. Returns positions (C, 2), negative
+    log-likelihoods (C,) and information matrices (C, 2, 2). The information is the observed curvature if it is positive
+    definite, otherwise the Fisher information.
     """
 
     def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:

@@ -55,8 +55,8 @@ class TagObservations:
     ``names``: the EPCs of the T tags. ``t`` (K,) [s]: times. ``antennas`` (K,): indices of the antennas in ``model``.
     ``rounds`` (K,): the number of inventory rounds. ``hits`` (K, T): the number of these rounds that read each tag.
     ``heights`` (T,) [m]: the heights of the tags. ``has_height`` (T,): False where the height is only assumed.
-    ``facing`` (T,) [rad]: the facings in the world frame, NaN where unknown. ``positions`` (T, 2) [m]: from the log's map, NaN
-    where the map lacks the tag.
+    ``facing`` (T,) [rad]: the facings in the world frame, NaN where unknown. ``positions`` (T, 2) [m]: from the log's
+    map, NaN where the map lacks the tag.
     """
 
     model: RfidModel
@@ -71,16 +71,16 @@ class TagObservations:
     has_height: NDArray[np.bool_]
 
     def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
-        """Return the read counts of the L selected observations. ``which``: mask (K,) that selects them, or a slice. ``poses``
-        (L, 3): the robot poses at the times of the selected observations, in the world frame."""
+        """Return the read counts of the L selected observations. ``which``: mask (K,) that selects them, or a slice.
+        ``poses`` (L, 3): the robot poses at the times of the selected observations, in the world frame."""
         return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 
 def tag_observations(log: Log, height: float | None = None) -> TagObservations:
     """Return the antenna observations of all tags that a log read or that its map contains.
 
-    Heights and facings are those of the log's map. Tags that are not in the map have an unknown facing and the height ``height``
-    [m]. If ``height`` is None, they have the mean height of the antennas.
+    Heights and facings are those of the log's map. Tags that are not in the map have an unknown facing and the height
+    ``height`` [m]. If ``height`` is None, they have the mean height of the antennas.
 
     Raises InputError if the log has no reads, or no reads by an antenna of its rig.
     """
@@ -234,8 +234,8 @@ class _Problem:
         return out
 
     def add_located(self, posteriors: list[TagPosterior]) -> bool:
-        """Add located tags to the map, and move mapped tags whose new position differs significantly. Returns True if any
-        changed."""
+        """Add located tags to the map, and move mapped tags whose new position differs significantly. Returns True if
+        any changed."""
         changed = False
         for tag, posterior in enumerate(posteriors):
             if self._known[tag] or not posterior.is_located:

@@ -1,7 +1,7 @@
 """Tracks of features in images with known camera poses, and triangulation of their points.
 
-Matches are searched near epipolar lines only (Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9). This separates
-similar features, so that more matches pass the ratio test.
+Matches are searched near epipolar lines only (Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 9). This
+separates similar features, so that more matches pass the ratio test.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Cameras:
 class Tracks:
     """N observations of T points.
 
-    ``track`` (N,): the index of the point, from 0 to T - 1. ``frame`` (N,): the index of the image. ``feature`` (N,): the index
-    of the feature in this image. ``pixels`` (N, 2): the observed pixel.
+    ``track`` (N,): the index of the point, from 0 to T - 1. ``frame`` (N,): the index of the image. ``feature`` (N,):
+    the index of the feature in this image. ``pixels`` (N, 2): the observed pixel.
     """
 
     track: Integers
@@ -69,8 +69,8 @@ class Tracks:
         return np.bincount(self.track, minlength=self.count)
 
     def kept(self, observations: Truths) -> tuple[Tracks, Integers]:
-        """Select observations by a mask (N,). Returns the tracks with renumbered points, and the old index of each of their T'
-        points (T',)."""
+        """Select observations by a mask (N,). Returns the tracks with renumbered points, and the old index of each of
+        their T' points (T',)."""
         old, track = np.unique(self.track[observations], return_inverse=True)
         left = (self.frame[observations], self.feature[observations], self.pixels[observations])
         return Tracks(track.astype(np.int64), *left), old
@@ -80,9 +80,9 @@ class Tracks:
 class Triangulated:
     """T triangulated points with N observations.
 
-    ``positions`` (T, 3) [m], ``covariances`` (T, 3, 3): of the points, for exact camera poses. ``errors`` (N, 2) [px]: the
-    residuals, predicted minus measured. ``depths`` (N,) [m]: the depth of the point in the camera of each observation.
-    ``parallax`` (T,) [rad]: the largest angle between two rays to a point.
+    ``positions`` (T, 3) [m], ``covariances`` (T, 3, 3): of the points, for exact camera poses. ``errors`` (N, 2) [px]:
+    the residuals, predicted minus measured. ``depths`` (N,) [m]: the depth of the point in the camera of each
+    observation. ``parallax`` (T,) [rad]: the largest angle between two rays to a point.
     """
 
     positions: Array
@@ -92,8 +92,8 @@ class Triangulated:
     parallax: Array
 
     def good(self, tracks: Tracks, model: CameraModel, parallax: float = PARALLAX) -> Truths:
-        """Return a mask (T,) of the points with two or more observations, an allowed depth in all their cameras, at least
-        ``parallax`` [rad], and small residuals."""
+        """Return a mask (T,) of the points with two or more observations, an allowed depth in all their cameras, at
+        least ``parallax`` [rad], and small residuals."""
         invalid = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))
@@ -105,9 +105,9 @@ class Triangulated:
 def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
     """Compute the residuals of N observations, with derivatives.
 
-    ``points`` (T, 3): positions in the world frame. Returns the residuals (N, 2) [px], predicted minus measured; their Jacobians
-    with respect to the camera pose (N, 2, 6), as in :func:`factors.camera.model.linearize_in_space`, and to the point (N, 2, 3);
-    the depths (N,) [m].
+    ``points`` (T, 3): positions in the world frame. Returns the residuals (N, 2) [px], predicted minus measured; their
+    Jacobians with respect to the camera pose (N, 2, 6), as in :func:`factors.camera.model.linearize_in_space`, and to
+    the point (N, 2, 3); the depths (N,) [m].
     """
     rotations = cameras.rotations[tracks.frame]
     local = np.einsum("nj,njk->nk", points[tracks.track] - cameras.positions[tracks.frame], rotations)
@@ -149,8 +149,8 @@ def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
 def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
     """Select keyframes. Returns their indices.
 
-    The first camera is a keyframe, and each later one that differs from all earlier keyframes by ``distance`` [m] or ``angle``
-    [rad]. A second drive through the same place therefore adds no keyframes.
+    The first camera is a keyframe, and each later one that differs from all earlier keyframes by ``distance`` [m] or
+    ``angle`` [rad]. A second drive through the same place therefore adds no keyframes.
     """
     chosen: list[int] = []
     for i in range(len(cameras)):
@@ -161,8 +161,8 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
 
 
 def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of images that probably overlap: for each image the nearest ones, and some that are farther
-    away."""
+    """Return pairs (i, j), i < j, of images that probably overlap: for each image the nearest ones, and some that are
+    farther away."""
     pairs = set()
     for i in range(len(cameras)):
         distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
@@ -180,8 +180,8 @@ def near_epipolar_lines(
 ) -> Truths:
     """Return a mask (N, M) of the pairs of pixels in images i and j that may show the same point.
 
-    ``first`` (N, 2), ``second`` (M, 2) [px]: pixels in image i and in image j. Each pixel of a pair must be at most ``gate`` [px]
-    from the epipolar line of the other pixel.
+    ``first`` (N, 2), ``second`` (M, 2) [px]: pixels in image i and in image j. Each pixel of a pair must be at most
+    ``gate`` [px] from the epipolar line of the other pixel.
     """
     rotation = cameras.rotations[j].T @ cameras.rotations[i]
     shift = cameras.rotations[j].T @ (cameras.positions[i] - cameras.positions[j])
@@ -202,8 +202,8 @@ def matched_pairs(
 ) -> list[tuple[int, int, Integers, Array]]:
     """Match the features of each of the ``pairs`` (i, j) of images. Pairs without a match are left out.
 
-    ``gate`` [px]: see :func:`near_epipolar_lines`. Returns i, j, the indices (K, 2) of matching features, and the distances (K,) of
-    their descriptors, divided by the median distance of the pair of images.
+    ``gate`` [px]: see :func:`near_epipolar_lines`. Returns i, j, the indices (K, 2) of matching features, and the
+    distances (K,) of their descriptors, divided by the median distance of the pair of images.
     """
     out = []
     for i, j in pairs:

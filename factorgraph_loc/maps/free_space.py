@@ -43,8 +43,8 @@ class FreeSpace:
 
     ``centres`` (K, 2): centres of the free cells [m]. ``graph`` (K, K): distances between neighbouring free cells [m].
     ``index`` (NX, NY): number of each free cell, -1 for other cells. ``origin`` (2,): corner of the first cell [m].
-    ``distance`` (NX, NY): distance from the centre of each cell to the nearest wall [m]. ``clearance``: minimum distance of free
-    cells from walls [m].
+    ``distance`` (NX, NY): distance from the centre of each cell to the nearest wall [m]. ``clearance``: minimum
+    distance of free cells from walls [m].
     """
 
     centres: Array
@@ -109,8 +109,8 @@ def distance_to_walls(world: Walled, points: Array) -> Array:
 
 
 def nearest_walls(world: Walled, points: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the distances (N,) [m] from ``points`` (N, 2) to the nearest wall, and the indices (N,) of these walls. Without walls
-    the distances are infinite and the indices are -1."""
+    """Return the distances (N,) [m] from ``points`` (N, 2) to the nearest wall, and the indices (N,) of these walls.
+    Without walls the distances are infinite and the indices are -1."""
     distances, indices = _nearest(_segments(world), np.ascontiguousarray(points))
     return np.asarray(distances), np.asarray(indices)
 

@@ -47,9 +47,9 @@ CORNER_NUMBERS = tuple(str(i) for i in range(len(CORNERS)))
 class Marker(FileModel):
     """A square marker in the map.
 
-    ``x``, ``y``, ``z``: position of its centre in the world [m]. ``size``: side of the black square [m].
-    ``facing``: heading of its normal [rad]. ``pitch``: upward tilt of its normal [rad], -pi/2 on a ceiling.
-    ``roll``: counter-clockwise rotation seen from the front [rad]. ``sigma``: standard deviation of each coordinate [m].
+    ``x``, ``y``, ``z``: position of its centre in the world [m]. ``size``: side of the black square [m]. ``facing``:
+    heading of its normal [rad]. ``pitch``: upward tilt of its normal [rad], -pi/2 on a ceiling. ``roll``:
+    counter-clockwise rotation seen from the front [rad]. ``sigma``: standard deviation of each coordinate [m].
     """
 
     x: Coordinate

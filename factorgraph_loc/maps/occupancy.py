@@ -26,8 +26,8 @@ MIN_EXTENT = 2.0  # cells: smaller groups of occupied cells are noise of the map
 
 
 class MapFile(FileModel):
-    """The YAML file of map_server (ROS or Nav2), whose documentation explains the keys. ``origin``: x, y [m] and yaw [rad] of the
-    lower left corner of the image."""
+    """The YAML file of map_server (ROS or Nav2), whose documentation explains the keys. ``origin``: x, y [m] and yaw
+    [rad] of the lower left corner of the image."""
 
     image: str
     resolution: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m per cell")]
@@ -42,8 +42,8 @@ class MapFile(FileModel):
 def read_walls(path: Path) -> tuple[Wall, ...]:
     """Read the outlines of the occupied cells of a map ``NAME.yaml`` as segments (x1, y1, x2, y2) [m] in the map's frame.
 
-    Segments run through the centres of the outermost occupied cells, within :data:`TOLERANCE`. Groups of cells smaller than
-    :data:`MIN_EXTENT` are omitted. Raises InputError with the file and the problem.
+    Segments run through the centres of the outermost occupied cells, within :data:`TOLERANCE`. Groups of cells smaller
+    than :data:`MIN_EXTENT` are omitted. Raises InputError with the file and the problem.
     """
     stated = parse_model(MapFile, read_yaml(path), path)
     if stated.free_thresh >= stated.occupied_thresh:

@@ -48,9 +48,9 @@ class PointMap:
     """A map of P points in space, and V views of them in images.
 
     ``names``: P unique names. ``positions`` (P, 3): in the world frame [m]. ``covariances`` (P, 3, 3) [m^2].
-    ``feature``: the kind of ``descriptors`` (V, D), "" if points are identified only by name (V = 0).
-    ``owners`` (V,): index of the point of each view. ``seen_from`` (V, 3): position of the camera at each view [m].
-    ``common`` (V, 3, 3): the error that all points in a view share, as a covariance of (x, y, heading) about the camera, see
+    ``feature``: the kind of ``descriptors`` (V, D), "" if points are identified only by name (V = 0). ``owners`` (V,):
+    index of the point of each view. ``seen_from`` (V, 3): position of the camera at each view [m]. ``common`` (V, 3,
+    3): the error that all points in a view share, as a covariance of (x, y, heading) about the camera, see
     :class:`CommonError`. None if the map was made with a reference.
     """
 
@@ -249,8 +249,8 @@ def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, pat
 def write_ply(points: PointMap, path: Path) -> None:
     """Write a PLY file for viewers of point clouds.
 
-    A point has its position, its standard deviation in the worst direction [m] and its number of views. Format: G. Turk, "The PLY
-    polygon file format", 1994.
+    A point has its position, its standard deviation in the worst direction [m] and its number of views. Format: G.
+    Turk, "The PLY polygon file format", 1994.
     """
     sigma = worst_sigma(points.covariances)
     views = np.bincount(points.owners, minlength=len(points))
@@ -264,8 +264,8 @@ def write_ply(points: PointMap, path: Path) -> None:
 class CommonError:
     """The error that all points near a place of a map share, if the map was made without a reference.
 
-    ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): unit vectors from the camera to
-    the points. ``covariances`` (K, 3, 3): the shared error of (x, y, heading) about each place.
+    ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): unit vectors from the
+    camera to the points. ``covariances`` (K, 3, 3): the shared error of (x, y, heading) about each place.
 
     Such a map is distorted like the estimated trajectory from which it was made. A robot that localizes in it has the same error.
     More points do not reduce this error. It is therefore not part of an image's noise, but is added to the covariance of the pose.

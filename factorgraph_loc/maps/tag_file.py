@@ -54,8 +54,8 @@ class TagFile(FileModel):
 
 
 class BundledTag(FileModel):
-    """A tag of the file. ``id``: its number. ``size``: side of its black square [m]. ``x``, ``y``, ``z`` [m] and the quaternion
-    ``qw``, ``qx``, ``qy``, ``qz``: its pose in the frame of the bundle."""
+    """A tag of the file. ``id``: its number. ``size``: side of its black square [m]. ``x``, ``y``, ``z`` [m] and the
+    quaternion ``qw``, ``qx``, ``qy``, ``qz``: its pose in the frame of the bundle."""
 
     id: Annotated[int, Field(ge=0, le=1_000_000)]
     size: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("m")]
@@ -84,8 +84,8 @@ class _Tags(FileModel):
 def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict[str, dict[str, float]]:
     """Return the markers of a file of apriltag_ros by name, each with the keys of a marker in a world file.
 
-    ``content``: the section ``[markers]`` of the world file ``source``, which names a file in ``folder``. A standalone tag without
-    a pose in ``at`` is not part of the map. Raises InputError if the file is invalid or gives no markers.
+    ``content``: the section ``[markers]`` of the world file ``source``, which names a file in ``folder``. A standalone
+    tag without a pose in ``at`` is not part of the map. Raises InputError if the file is invalid or gives no markers.
     """
     settings = parse_model(TagFile, content, f"{source} [markers]")
     path = inside(folder, settings.file, source)
@@ -122,8 +122,8 @@ def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict
 
 
 def _marker(path: Path, tag: BundledTag, rotation: Array, position: Array) -> dict[str, float]:
-    """Return the marker of a ``tag``, as keys and values of a world file. ``rotation`` (3, 3), ``position`` (3,): the pose of its
-    bundle in the world. ``path``: the file to name in errors."""
+    """Return the marker of a ``tag``, as keys and values of a world file. ``rotation`` (3, 3), ``position`` (3,): the
+    pose of its bundle in the world. ``path``: the file to name in errors."""
     quaternion = np.array((tag.qx, tag.qy, tag.qz, tag.qw))
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT:
         raise bad_field(path, f"tag {tag.id}: qx, qy, qz, qw", quaternion.tolist(), "a unit quaternion")

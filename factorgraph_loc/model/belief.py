@@ -24,8 +24,8 @@ Status = Literal["unlocalized", "ambiguous", "localized"]
 class PosePrior:
     """Gaussian prior of the start pose.
 
-    ``pose`` (3,) is (x, y, heading) at time ``t`` [s] with ``covariance`` (3, 3), in the world frame. ``has_heading`` is False if
-    the heading is unknown. The heading of ``pose`` is then 0, with the variance of a uniform distribution.
+    ``pose`` (3,) is (x, y, heading) at time ``t`` [s] with ``covariance`` (3, 3), in the world frame. ``has_heading``
+    is False if the heading is unknown. The heading of ``pose`` is then 0, with the variance of a uniform distribution.
     """
 
     t: float
@@ -45,9 +45,9 @@ class PosePrior:
 class PoseEstimate:
     """The pose at a time, estimated from the measurements up to that time.
 
-    ``t``: time [s]. ``pose`` (3,): x, y [m] and heading [rad] in the world frame. ``covariance`` (3, 3) of (x, y, heading).
-    ``status``: whether the pose is known, ambiguous or unknown. ``doubts_model``: True if measurements contradict the model of
-    their sensor, so that the covariance may be too small.
+    ``t``: time [s]. ``pose`` (3,): x, y [m] and heading [rad] in the world frame. ``covariance`` (3, 3) of (x, y,
+    heading). ``status``: whether the pose is known, ambiguous or unknown. ``doubts_model``: True if measurements
+    contradict the model of their sensor, so that the covariance may be too small.
     """
 
     t: float
@@ -70,8 +70,8 @@ class Mode:
 class Belief:
     """The belief of an estimator about the current pose.
 
-    ``modes``: weighted Gaussians. ``particles`` (N, 3): poses in the world frame, with ``weights`` (N,). Both are None if the
-    estimator uses no particles.
+    ``modes``: weighted Gaussians. ``particles`` (N, 3): poses in the world frame, with ``weights`` (N,). Both are None
+    if the estimator uses no particles.
     """
 
     modes: tuple[Mode, ...]
@@ -98,8 +98,8 @@ class LearntPoint:
 class Learnt:
     """Estimates of an estimator other than poses.
 
-    ``values``: constants of sensors by name, each as (value, standard deviation) in SI units. Constants of odometry have plain
-    names (``scale_distance``), those of other sensors have the sensor as a prefix (``bearing_range.x``).
+    ``values``: constants of sensors by name, each as (value, standard deviation) in SI units. Constants of odometry
+    have plain names (``scale_distance``), those of other sensors have the sensor as a prefix (``bearing_range.x``).
     ``landmarks``: estimated landmarks by name.
     ``points``: estimated points in space that the map lacks, or None.
     """

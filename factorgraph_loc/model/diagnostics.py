@@ -23,8 +23,8 @@ class Event(Notice):
 class Diagnostics:
     """Counts and consistency figures of a run.
 
-    ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the update.
-    ``nis``: by sensor, rows of (t [s], normalised innovation squared, degrees of freedom).
+    ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the
+    update. ``nis``: by sensor, rows of (t [s], normalised innovation squared, degrees of freedom).
     ``ignored``, ``rejected``: counts of detections by reason. ``late``: counts of late measurements by sensor.
     ``events``: events of the estimator, for example a rebuilt graph.
     ``doubted``: by kind of doubt (``moved_tags``), names of map elements, each with the probability that the map is wrong about it.
@@ -56,8 +56,8 @@ class Diagnostics:
         return "\n".join([*lines, *(f"{kind}: {', '.join(names)}" for kind, names in self.doubted.items())])
 
     def ignore(self, reason: str, count: int = 1) -> None:
-        """Add ``count`` to the number of detections that are ignored for a ``reason``. A negative ``count`` reverses an earlier
-        call, if these detections are used after all."""
+        """Add ``count`` to the number of detections that are ignored for a ``reason``. A negative ``count`` reverses an
+        earlier call, if these detections are used after all."""
         self.ignored[reason] = self.ignored.get(reason, 0) + count
         if not self.ignored[reason]:
             del self.ignored[reason]

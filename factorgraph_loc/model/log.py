@@ -37,8 +37,8 @@ class Log:
 
     ``rig``: the robot and its sensors. ``world``: the map. ``streams``: the measurements, by the name of the sensor.
     ``reference``: the reference trajectory. ``start``: the known start. ``t0_ns``: absolute time of t = 0 [ns].
-    ``warnings``: problems that the reader corrected or skipped. ``metadata``: licence, origin and other texts by key, see
-    :data:`NOT_READ` and :data:`RIG_NOTES`.
+    ``warnings``: problems that the reader corrected or skipped. ``metadata``: licence, origin and other texts by key,
+    see :data:`NOT_READ` and :data:`RIG_NOTES`.
     """
 
     name: str
@@ -74,8 +74,8 @@ class Log:
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
         """Return the measurements of ``sensors`` in order of arrival, with the time offsets of the rig added to their timestamps.
 
-        A late measurement keeps its timestamp and follows the measurements that arrived before it. Measurements with equal times
-        are ordered by the rank of their streams.
+        A late measurement keeps its timestamp and follows the measurements that arrived before it. Measurements with
+        equal times are ordered by the rank of their streams.
         """
 
         return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))
@@ -83,8 +83,8 @@ class Log:
     def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
         """Return the measurements as :meth:`measurements` does, but with rows of one stream joined, which is faster to process.
 
-        Successive rows of a stream with ``joins`` are one :class:`~factorgraph_loc.model.measurement.Rows` if no other measurement
-        arrives between them, and if each row is newer than the previous one.
+        Successive rows of a stream with ``joins`` are one :class:`~factorgraph_loc.model.measurement.Rows` if no other
+        measurement arrives between them, and if each row is newer than the previous one.
         """
         order = self._in_order(sensors)
         joined = next((rank for rank, name in enumerate(order) if self.streams[name].joins), None)
@@ -146,9 +146,9 @@ def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]
 def cut(log: Log, start: float, end: float) -> Log:
     """Return the part of a log, and of its reference, with timestamps from ``start`` to before ``end`` [s].
 
-    Timestamps are those of each sensor's own clock, and do not change. A known start is dropped. A velocity from before ``start``
-    does not apply in the part. The first increment of odometry is still the motion since the previous row of the whole log. Raises
-    InputError if no measurement is left.
+    Timestamps are those of each sensor's own clock, and do not change. A known start is dropped. A velocity from before
+    ``start`` does not apply in the part. The first increment of odometry is still the motion since the previous row of
+    the whole log. Raises InputError if no measurement is left.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:

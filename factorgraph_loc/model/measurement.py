@@ -145,8 +145,8 @@ class Stream:
         return (column for name, column in columns_of(self).items() if name != "t")
 
     def begun_anew(self) -> Self:
-        """Return the stream with zero motion in its first row, for a log in which the robot is carried to the pose of this row.
-        Streams that do not measure motion are returned unchanged."""
+        """Return the stream with zero motion in its first row, for a log in which the robot is carried to the pose of
+        this row. Streams that do not measure motion are returned unchanged."""
         return self
 
     def scans(self) -> Iterator[tuple[int, int]]:
@@ -171,8 +171,8 @@ S = TypeVar("S", bound=Stream)
 
 
 def of_sensor(stream: Stream, name: str) -> Stream:
-    """Return the stream with the sensor's ``name`` as its ``source``. If the name has no dot, the stream is returned unchanged,
-    because the sensor is then the only one of its kind."""
+    """Return the stream with the sensor's ``name`` as its ``source``. If the name has no dot, the stream is returned
+    unchanged, because the sensor is then the only one of its kind."""
     return stream if kind_of(name) == name else replace(stream, source=name)
 
 

@@ -92,8 +92,8 @@ AS_IT_IS = Turned()
 
 
 def not_unit(quaternions: Array) -> Fault:
-    """Return a :class:`Fault`, from which readers make an error message, with a mask of the ``quaternions`` (N, 4) whose length is
-    not 1."""
+    """Return a :class:`Fault`, from which readers make an error message, with a mask of the ``quaternions`` (N, 4)
+    whose length is not 1."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")
@@ -102,8 +102,8 @@ def not_unit(quaternions: Array) -> Fault:
 def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.bool_]:
     """Return a mask (N,) of null poses, which programs publish while they have lost track.
 
-    The quaternion (N, 4) of a null pose is zero, or a variance of x or y (N, 2) [m^2] is at least :data:`HUGE` and far above the
-    median. If more than half of the poses are of this kind, none is a null pose.
+    The quaternion (N, 4) of a null pose is zero, or a variance of x or y (N, 2) [m^2] is at least :data:`HUGE` and far
+    above the median. If more than half of the poses are of this kind, none is a null pose.
     """
     null = np.asarray(~quaternions.any(axis=1))
     if variances is not None and len(variances):
@@ -172,8 +172,8 @@ def on_floor(
 def about_z(source: object, rows: Integers, rates: Array, turned: Array) -> Array:
     """Return the turn rates (N,) about the robot's z axis from the ``rates`` (N, 3) about the axes of a sensor, in the same unit.
 
-    ``turned`` (3, 3): the rotation from the sensor frame to the robot frame. ``source``, ``rows`` (N,): the file and the row
-    numbers for errors. Raises InputError if a rate that contributes is not finite.
+    ``turned`` (3, 3): the rotation from the sensor frame to the robot frame. ``source``, ``rows`` (N,): the file and
+    the row numbers for errors. Raises InputError if a rate that contributes is not finite.
     """
     needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
     for i in needed.tolist():

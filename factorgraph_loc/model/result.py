@@ -20,8 +20,8 @@ class Reliability:
 
     ``what``: the plural name of the detections. ``groups`` (G,): names of the groups.
     ``observed``, ``predicted`` (G,): counts of detections.
-    ``sigma`` (G,): standard deviation of the observed count if the model is correct. It accounts for the correlation of successive
-    measurements.
+    ``sigma`` (G,): standard deviation of the observed count if the model is correct. It accounts for the correlation of
+    successive measurements.
     ``overdispersion``: number of correlated measurements that have the information of one independent measurement.
     """
 
@@ -43,8 +43,8 @@ class Timings:
     ``real_time_factor``: the duration of the log divided by ``causal_seconds``.
     ``final_seconds``: computing time of the final trajectory [s].
     ``peak_memory_mb``: peak resident memory of the process so far [10^6 bytes].
-    ``images``: number of images. ``frontend_seconds``: time to detect their features before the run, or to load them from the cache
-    [s].
+    ``images``: number of images. ``frontend_seconds``: time to detect their features before the run, or to load them
+    from the cache [s].
     """
 
     update_t: Array
@@ -61,10 +61,10 @@ class Timings:
 class RunResult:
     """The result of one estimator on one log.
 
-    ``log``: the name of the log. ``config``: the effective configuration, enough to repeat the run.
-    ``t`` (N,) [s], ``poses`` (N, 3), ``covariances`` (N, 3, 3), ``status`` (N): the causal estimates, in the world frame.
-    ``final``: the trajectory that is estimated from the whole log. ``learnt``: estimates other than poses.
-    ``reliability``: by sensor, a comparison of observed and predicted detections.
+    ``log``: the name of the log. ``config``: the effective configuration, enough to repeat the run. ``t`` (N,) [s],
+    ``poses`` (N, 3), ``covariances`` (N, 3, 3), ``status`` (N): the causal estimates, in the world frame. ``final``:
+    the trajectory that is estimated from the whole log. ``learnt``: estimates other than poses. ``reliability``: by
+    sensor, a comparison of observed and predicted detections.
     ``doubts_model`` (N): True where measurements contradicted the model of their sensor.
     """
 

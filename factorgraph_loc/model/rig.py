@@ -24,8 +24,8 @@ S = TypeVar("S", bound=FileModel)
 class Rig(FileModel):
     """A robot and its sensors. The settings of a sensor are an attribute with the name of its section, None if the robot lacks it.
 
-    Several sensors of a kind are a table of settings by name. ``bearing_range.front`` is then the name of one of them. In
-    ``sensors``, the name of a kind stands for all sensors of that kind.
+    Several sensors of a kind are a table of settings by name. ``bearing_range.front`` is then the name of one of them.
+    In ``sensors``, the name of a kind stands for all sensors of that kind.
     """
 
     name: str = "rig"

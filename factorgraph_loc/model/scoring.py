@@ -1,7 +1,7 @@
 """The configuration of a run, and its ticks, the times of the recorded estimates.
 
-Ticks are a grid of 10 Hz from the start of a run, except in long gaps between measurements. This module imports no numerical
-libraries, so that the command line starts quickly.
+Ticks are a grid of 10 Hz from the start of a run, except in long gaps between measurements. This module imports no
+numerical libraries, so that the command line starts quickly.
 """
 
 import math
@@ -34,8 +34,8 @@ class RunConfig:
     """The configuration of a run on a log.
 
     ``estimator``: the name of the estimator. ``settings``: overrides of its default settings.
-    ``sensors``: names of the sensors to use, None for those in the rig; ``rssi`` and ``phase`` are optional parts of ``rfid``.
-    ``prior``: the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
+    ``sensors``: names of the sensors to use, None for those in the rig; ``rssi`` and ``phase`` are optional parts of
+    ``rfid``. ``prior``: the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     ``seed``: the seed of the estimator's random generator.
     ``max_gap``: the longest gap between two estimates in which scoring interpolates poses [s].
     ``tick_gap``: the longest gap between measurements in which estimates are recorded [s].

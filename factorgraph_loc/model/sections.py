@@ -19,8 +19,8 @@ class Section:
 
     ``kind``: the class of its settings, a :class:`~factorgraph_loc.files.models.FileModel`.
     ``always``: True if a rig without the section gets the default settings.
-    ``several``: True if a rig may have several such sensors by name, ``[section.NAME]``. Their stream, its only table and the
-    modality of the measurements must then have the name of the section.
+    ``several``: True if a rig may have several such sensors by name, ``[section.NAME]``. Their stream, its only table
+    and the modality of the measurements must then have the name of the section.
     """
 
     kind: Place
@@ -34,10 +34,10 @@ class Layer:
 
     ``kind``: the class of an element, a :class:`~factorgraph_loc.files.models.FileModel`.
     ``table``: the description of a table with many elements.
-    ``read``: a function ``(content, source, folder) -> elements`` that converts the value in a world file, such as the name of a
-    table in ``folder``.
-    ``write``: a function ``(elements, path of the world file without suffixes) -> content``. It may write a table and returns the
-    value in the world file, or None to keep the elements there.
+    ``read``: a function ``(content, source, folder) -> elements`` that converts the value in a world file, such as the
+    name of a table in ``folder``.
+    ``write``: a function ``(elements, path of the world file without suffixes) -> content``. It may write a table and
+    returns the value in the world file, or None to keep the elements there.
     ``suffix``: the suffix of these tables.
     """
 

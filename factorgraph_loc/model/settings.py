@@ -61,8 +61,8 @@ def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Ar
 class Estimated:
     """The P calibration constants of a sensor that are estimated, as corrections to the values in the rig.
 
-    ``names`` (P,): their names. ``indices`` (P,): their indices among all constants of the sensor. ``sigmas`` (P,): their prior
-    standard deviations.
+    ``names`` (P,): their names. ``indices`` (P,): their indices among all constants of the sensor. ``sigmas`` (P,):
+    their prior standard deviations.
     """
 
     names: tuple[str, ...]

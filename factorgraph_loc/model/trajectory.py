@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 class Trajectory(Exchange):
     """A planar trajectory in the world frame.
 
-    ``t`` (N,): times [s], strictly increasing. ``poses`` (N, 3): x, y [m] and heading [rad] of the robot. ``covariances`` (N, 3, 3)
-    of (x, y, heading), or None. ``has_heading``: False if the headings are meaningless.
+    ``t`` (N,): times [s], strictly increasing. ``poses`` (N, 3): x, y [m] and heading [rad] of the robot.
+    ``covariances`` (N, 3, 3) of (x, y, heading), or None. ``has_heading``: False if the headings are meaningless.
     """
 
     t: Array
@@ -80,8 +80,8 @@ class Trajectory(Exchange):
     def covariances_at(self, t: Array, *, max_gap: float = np.inf) -> Array:
         """Return the covariances (M, 3, 3) at times ``t`` (M,) [s], interpolated linearly.
 
-        A covariance is NaN outside of the trajectory, and in a gap longer than ``max_gap`` [s]. Raises ValueError if the trajectory
-        has no covariances.
+        A covariance is NaN outside of the trajectory, and in a gap longer than ``max_gap`` [s]. Raises ValueError if
+        the trajectory has no covariances.
         """
         if self.covariances is None:
             raise ValueError("the trajectory has no covariances")
@@ -100,8 +100,8 @@ class Trajectory(Exchange):
     def from_polars(cls, table: pl.DataFrame) -> Self:
         """Return a trajectory from a table with the columns t [s], x, y [m] and heading [rad]. Other columns are ignored.
 
-        Optional columns of covariances are cov_xx, cov_xy, cov_xh, cov_yy, cov_yh and cov_hh. Raises InputError if a column is
-        missing, or if it has values that are not numbers.
+        Optional columns of covariances are cov_xx, cov_xy, cov_xh, cov_yy, cov_yh and cov_hh. Raises InputError if a
+        column is missing, or if it has values that are not numbers.
         """
         trajectory = super().from_polars(table)
         if not any(name in table.columns for name in COVARIANCES):
@@ -133,9 +133,9 @@ class Trajectory(Exchange):
 def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
     """Find the neighbours of the times ``t`` (M,) among sorted timestamps ``stamps`` (N,), N > 0, for interpolation.
 
-    Returns four arrays (M,): the index of the timestamp before, the index of the timestamp after, the fraction of the time between
-    them, and a mask. The two indices are equal at a timestamp. The mask is True if a time is between the first and the last
-    timestamp, and not in a gap longer than ``max_gap`` [s].
+    Returns four arrays (M,): the index of the timestamp before, the index of the timestamp after, the fraction of the
+    time between them, and a mask. The two indices are equal at a timestamp. The mask is True if a time is between the
+    first and the last timestamp, and not in a gap longer than ``max_gap`` [s].
     """
     t = np.asarray(t, dtype=float)
     last = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)

@@ -5,8 +5,8 @@ entropy. Choose a path and drive it. Update the particles once, by the actual re
 :mod:`~factorgraph_loc.planning.policies`, and the loop is in :mod:`~factorgraph_loc.planning.closed_loop`. The particles are those
 of the search for an unknown pose (:mod:`~factorgraph_loc.fusion.search`) over free space.
 
-The algorithm as printed in the paper is different. Each action has particles of its own, weighted by a scan that was not made. The
-index m denotes both the map and the particle.
+The algorithm as printed in the paper is different. Each action has particles of its own, weighted by a scan that was
+not made. The index m denotes both the map and the particle.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class ProximityReading:
 
 
 class ActiveMcl:
-    """The estimator ActiveMCL: a particle filter in the free ``space`` of a building, for an unknown start. ``particles``: the
-    least number of particles."""
+    """The estimator ActiveMCL: a particle filter in the free ``space`` of a building, for an unknown start.
+    ``particles``: the least number of particles."""
 
     deterministic = False
     supports_unknown_start = True
@@ -97,8 +97,8 @@ class ActiveMcl:
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:
-        """Return the modes and the particles. If the weight of one mode is above :data:`ONE_PLACE`, only its particles are
-        returned."""
+        """Return the modes and the particles. If the weight of one mode is above :data:`ONE_PLACE`, only its particles
+        are returned."""
         at = self._t if t is None else max(t, self._t)
         particles = self._search.particles(at) if self._search.newest is not None else None
         if particles is None:

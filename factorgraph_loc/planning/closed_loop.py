@@ -80,8 +80,8 @@ class ActiveRun:
     ``localized``: True if the robot was localized correctly; the run then ends.
     ``metres`` [m], ``seconds`` [s]: distance and time at the end of the run.
     ``error_position`` [m], ``error_heading`` [rad]: the errors of the estimate at the end.
-    ``claimed_wrong``: True if the estimate ever had the status ``localized`` with an error above :data:`WRONG` times the limit of
-    the settings.
+    ``claimed_wrong``: True if the estimate ever had the status ``localized`` with an error above :data:`WRONG` times
+    the limit of the settings.
     ``truth``: the true trajectory. ``steps``: the choices of paths.
     """
 
@@ -194,8 +194,8 @@ class _ClosedLoop:
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
     def _take(self, reports: Iterator[Measurement]) -> bool:
-        """Process the measurements ``reports`` of the robot. Stops and returns True as soon as the robot is localized correctly,
-        otherwise returns False at their end."""
+        """Process the measurements ``reports`` of the robot. Stops and returns True as soon as the robot is localized
+        correctly, otherwise returns False at their end."""
         for report in reports:
             self._feed(report)
             if isinstance(self._estimator, ActiveMcl) and self.robot.metres >= self._proximity_at + READING_DISTANCE:
@@ -263,8 +263,8 @@ class _ClosedLoop:
         return choice
 
     def _far(self, modes: Sequence[Mode]) -> list[Path]:
-        """Return the shortest paths from each mode to tags and to places in free space. Objects that distinguish the modes may be
-        far away."""
+        """Return the shortest paths from each mode to tags and to places in free space. Objects that distinguish the
+        modes may be far away."""
         out: list[Path] = []
         policy = self._settings.policy
         for mode in modes:
@@ -315,8 +315,8 @@ def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings,
 
 
 def _places(belief: Belief) -> tuple[Mode, ...]:
-    """Return at most :data:`MODES` modes of a belief with a weight of at least :data:`LIKELY`. Neighbouring modes are merged: the
-    pose of the heaviest is used, and the weights are added."""
+    """Return at most :data:`MODES` modes of a belief with a weight of at least :data:`LIKELY`. Neighbouring modes are
+    merged: the pose of the heaviest is used, and the weights are added."""
     places: list[Mode] = []
     for mode in belief.modes:
         if not np.all(np.isfinite(mode.pose)):
@@ -332,8 +332,8 @@ def _places(belief: Belief) -> tuple[Mode, ...]:
 
 
 def _sampled(belief: Belief, space: FreeSpace, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return particles (M, 3) and weights (M,) of a belief. If it has none, they are drawn from its modes. If it has no modes
-    either, they are drawn from free space."""
+    """Return particles (M, 3) and weights (M,) of a belief. If it has none, they are drawn from its modes. If it has no
+    modes either, they are drawn from free space."""
     if belief.particles is not None and belief.weights is not None and len(belief.particles):
         return belief.particles, belief.weights
     even = np.full(SAMPLES, 1.0 / SAMPLES)

@@ -5,13 +5,13 @@ Measurements are drawn from the sensor models at particles of the belief, and al
 that of the weighted particles. All paths use the same particles and random numbers. The differences between paths therefore have
 less variance than the information itself (common random numbers: Glasserman, Yao, Management Science 38(6), 1992).
 
-Entropies are differential, in nats. For a belief with one mode, the entropy is that of a Gaussian with the particles' covariance.
-For a belief with several modes, it is that of a histogram.
+Entropies are differential, in nats. For a belief with one mode, the entropy is that of a Gaussian with the particles'
+covariance. For a belief with several modes, it is that of a histogram.
 
-If the pose is nearly known, the information is computed in closed form (:func:`fisher_gain`), without drawing measurements. A
-Gaussian belief is propagated along the path with the noise of the odometry. At each pose of the path the expected Fisher
-information of the sensors is added (van Trees, "Detection, Estimation, and Modulation Theory", part I, 1968, section 2.4: the
-Cramer-Rao bound). This is valid while the sensor models are nearly linear over the belief.
+If the pose is nearly known, the information is computed in closed form (:func:`fisher_gain`), without drawing
+measurements. A Gaussian belief is propagated along the path with the noise of the odometry. At each pose of the path
+the expected Fisher information of the sensors is added (van Trees, "Detection, Estimation, and Modulation Theory", part
+I, 1968, section 2.4: the Cramer-Rao bound). This is valid while the sensor models are nearly linear over the belief.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ class Sensors:
         turn_rate: float,
         only: Collection[str],
     ) -> Sensors:
-        """Return the sensor models of a rig. ``only``: the names of the sensors that are used. ``settings``: the settings of the
-        simulation, with the rates of sensors. ``speed`` [m/s], ``turn_rate`` [rad/s]: of the robot."""
+        """Return the sensor models of a rig. ``only``: the names of the sensors that are used. ``settings``: the
+        settings of the simulation, with the rates of sensors. ``speed`` [m/s], ``turn_rate`` [rad/s]: of the robot."""
         made = [
             forecast(world, rig.alone(name), speed, settings)
             for name, forecast in functions("forecast", rig)
@@ -105,8 +105,8 @@ def gaussian_entropy(covariance: Array, dims: int = POSE) -> Array:
 def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
     """Return the entropy [nats] of a histogram of particles ``poses`` (M, 3) with ``weights`` (M,).
 
-    ``dims``: the number of leading coordinates that are considered. The result is comparable with :func:`gaussian_entropy` if the
-    belief is wider than a cell and there are more particles than cells.
+    ``dims``: the number of leading coordinates that are considered. The result is comparable with
+    :func:`gaussian_entropy` if the belief is wider than a cell and there are more particles than cells.
     """
     even: Array32 = weights[None].astype(np.float32)
     at = np.ascontiguousarray(poses, dtype=float)[None]
@@ -116,8 +116,8 @@ def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
 def has_several_modes(poses: Array, weights: Array) -> bool:
     """True if particles (M, 3) with ``weights`` (M,) are poorly described by a Gaussian.
 
-    This is so if the heading is unknown. It is also so if the entropy of a Gaussian with their covariance exceeds the entropy of
-    their positions by more than :data:`SEVERAL`.
+    This is so if the heading is unknown. It is also so if the entropy of a Gaussian with their covariance exceeds the
+    entropy of their positions by more than :data:`SEVERAL`.
     """
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
@@ -142,10 +142,10 @@ def expected_gain(
 ) -> Array:
     """Return the expected reduction of entropy (C,) [nats] on each of C paths.
 
-    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is the entropy of its end pose.
-    ``space``: a particle whose path leads into a wall stops there and makes no further measurements.
-    ``places`` (M,): the index of each particle's mode. If given, the entropy of this index is computed and not that of the pose.
-    ``noise``: the noise of the odometry on the path; None means no noise.
+    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is the entropy of
+    its end pose. ``space``: a particle whose path leads into a wall stops there and makes no further measurements.
+    ``places`` (M,): the index of each particle's mode. If given, the entropy of this index is computed and not that of
+    the pose. ``noise``: the noise of the odometry on the path; None means no noise.
     ``samples``: the number of particles that a scan weighs. ``scans``: the number of particles at which measurements are simulated.
     """
     if not paths:
@@ -188,9 +188,9 @@ def expected_gain(
 
 
 def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, several: bool) -> Array:
-    """Return J entropies of particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of each
-    entropy. ``weights`` (J, M): the particles' weights for each entropy. ``dims``: the number of leading coordinates that are
-    considered. ``several``: True to use a histogram, False to use a Gaussian."""
+    """Return J entropies of particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of
+    each entropy. ``weights`` (J, M): the particles' weights for each entropy. ``dims``: the number of leading
+    coordinates that are considered. ``several``: True to use a histogram, False to use a Gaussian."""
     if several:
         out = np.empty(len(index))
         particle_kernels.cell_entropies(poses, index, weights, CELL, dims, out)
@@ -203,8 +203,8 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, seve
 def _stations(passed: Array) -> Places:
     """Return the indices of stations among the poses of a path: the start, the places of predicted measurements, and the end.
 
-    ``passed`` (S,) [m]: the distance up to each pose of the path. The path is divided into equal parts, and the measurements of
-    each part are predicted in its middle.
+    ``passed`` (S,) [m]: the distance up to each pose of the path. The path is divided into equal parts, and the
+    measurements of each part are predicted in its middle.
     """
     count = min(max(1, round(passed[-1] / STATION_DISTANCE)), MOST_STATIONS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
@@ -213,8 +213,8 @@ def _stations(passed: Array) -> Places:
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
-    """Return the standard deviations (S, 3) of the motion to each of S stations from the previous one, in the robot frame.
-    ``steps`` (S,): the indices of the stations among the poses of ``path``. ``noise``: the noise of odometry."""
+    """Return the standard deviations (S, 3) of the motion to each of S stations from the previous one, in the robot
+    frame. ``steps`` (S,): the indices of the stations among the poses of ``path``. ``noise``: the noise of odometry."""
     distance = np.diff(path.metres[steps])
     rotation = np.diff(path.turned[steps])
     out = np.zeros((len(steps), 3))
@@ -226,8 +226,8 @@ def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
 def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sensors) -> Array:
     """Return the expected covariance (3, 3) of x, y and heading in the world frame at the end of a path.
 
-    ``mean`` (3,), ``covariance`` (3, 3): the belief at the start of the path. The sensors measure at each pose of the path except
-    the first.
+    ``mean`` (3,), ``covariance`` (3, 3): the belief at the start of the path. The sensors measure at each pose of the
+    path except the first.
     """
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)

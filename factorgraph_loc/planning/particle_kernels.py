@@ -18,8 +18,8 @@ def station_poses(
     ``particles`` (M, 3): the poses at the start. ``along`` (P, 3): the poses of the path, relative to the start.
     ``steps`` (S,): the indices of the stations among the poses of the path.
     ``last`` (M,): the index of the last pose that each particle reaches; the particle stays there.
-    ``sigmas`` (S, 3): standard deviations of the motion to each station, in the robot frame. ``normals`` (S, M, 3): standard normal
-    random numbers for the motion. ``out`` (S, M, 3): receives the poses.
+    ``sigmas`` (S, 3): standard deviations of the motion to each station, in the robot frame. ``normals`` (S, M, 3):
+    standard normal random numbers for the motion. ``out`` (S, M, 3): receives the poses.
     """
     count = len(particles)
     errors = np.zeros((count, 3))
@@ -53,9 +53,9 @@ def station_poses(
 def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> None:
     """Compute J weighted covariances of M particles.
 
-    ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of each covariance. ``weights`` (J, M): the
-    weights for each covariance. ``out`` (J, 3, 3): receives the covariances. Headings are computed relative to the first
-    particle's.
+    ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of each covariance. ``weights`` (J,
+    M): the weights for each covariance. ``out`` (J, 3, 3): receives the covariances. Headings are computed relative to
+    the first particle's.
     """
     count = poses.shape[1]
     d = np.empty(3)
@@ -85,8 +85,8 @@ def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> No
 def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, dims: int, out: Array) -> None:
     """Compute J entropies [nats] of histograms of M particles.
 
-    ``cell`` (3,): the size of a cell in x, y and heading. ``dims``: the number of leading coordinates that are considered. ``out``
-    (J,): receives the entropies. Other arguments: see :func:`covariances`.
+    ``cell`` (3,): the size of a cell in x, y and heading. ``dims``: the number of leading coordinates that are
+    considered. ``out`` (J,): receives the entropies. Other arguments: see :func:`covariances`.
     """
     stations, count, _ = poses.shape
     volume = 0.0

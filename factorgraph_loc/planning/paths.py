@@ -1,5 +1,5 @@
-"""Candidate paths of a robot: arcs, straight lines, and shortest paths in free space; and the part of a path that is free of
-walls."""
+"""Candidate paths of a robot: arcs, straight lines, and shortest paths in free space; and the part of a path that is
+free of walls."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ def full_turn() -> Path:
 def primitives(length: float) -> list[Path]:
     """Return arcs and straight paths in :data:`DIRECTIONS` directions.
 
-    Each path begins with a turn in place to its direction, except those straight ahead. In each direction there are a straight path
-    and two gentle arcs of ``length`` [m], and a straight path of half this length. Straight ahead there are also two sharper arcs.
-    Raises InputError if ``length`` is not positive.
+    Each path begins with a turn in place to its direction, except those straight ahead. In each direction there are a
+    straight path and two gentle arcs of ``length`` [m], and a straight path of half this length. Straight ahead there
+    are also two sharper arcs. Raises InputError if ``length`` is not positive.
     """
     if not (math.isfinite(length) and length > 0.0):
         raise InputError(f"policy.horizon is {length:g} m, expected a length above 0 m")
@@ -101,10 +101,10 @@ def waypoint_paths(
 ) -> list[Path]:
     """Return the shortest paths through free space to targets (Dijkstra, 1959). The paths are straightened.
 
-    ``pose`` (3,): the start. ``targets`` (K, 2) [m]: both are in the world frame. The robot turns in place at the start and at
-    corners. A start that is too close to a wall is replaced by the nearest free cell. Targets outside of free space, and those in
-    the cell of the robot, are left out. ``nearest``: the largest number of paths; those to the nearest targets are returned.
-    ``beyond``, ``within`` [m]: only targets at distances between these values are used.
+    ``pose`` (3,): the start. ``targets`` (K, 2) [m]: both are in the world frame. The robot turns in place at the start
+    and at corners. A start that is too close to a wall is replaced by the nearest free cell. Targets outside of free
+    space, and those in the cell of the robot, are left out. ``nearest``: the largest number of paths; those to the
+    nearest targets are returned. ``beyond``, ``within`` [m]: only targets at distances between these values are used.
     """
     start = _nearest_cell(space, pose[:2])
     ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))
@@ -123,8 +123,8 @@ def waypoint_paths(
 def waypoints(space: FreeSpace, count: int) -> Array:
     """Return at most ``count`` places (K, 2) [m] that are spread over free space.
 
-    The first place is farthest from walls. Each further place is farthest from the previous ones (farthest-point sampling:
-    Gonzalez, Theoretical Computer Science 38, 1985).
+    The first place is farthest from walls. Each further place is farthest from the previous ones (farthest-point
+    sampling: Gonzalez, Theoretical Computer Science 38, 1985).
     """
     i, j = np.nonzero(space.index >= 0)
     distance = np.empty(len(space.centres))
@@ -138,11 +138,11 @@ def waypoints(space: FreeSpace, count: int) -> Array:
 
 
 def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: int = 1) -> NDArray[np.int64]:
-    """Return how far robots can follow paths without coming too close to walls: the index (C, M) of the last pose that is
-    reached, for each of C paths and M robots.
+    """Return how far robots can follow paths without coming too close to walls: the index (C, M) of the last pose that
+    is reached, for each of C paths and M robots.
 
-    ``poses`` (M, 3): the start poses of the robots in the world frame. A robot that starts too close to a wall may drive away
-    from it.
+    ``poses`` (M, 3): the start poses of the robots in the world frame. A robot that starts too close to a wall may
+    drive away from it.
     ``between``: the number of collision checks between two poses of a path.
     """
     first = np.cumsum([0, *(len(path.poses) for path in paths)])
@@ -165,8 +165,8 @@ def arc(turn: float, curvature: float, length: float) -> Path:
 
 
 def _driven(pose: Array, corners: Array) -> Array:
-    """Return the poses (S, 3) of a robot that drives through ``corners`` (N, 2) in straight lines. ``pose`` (3,): the start.
-    Corners and start are in the world frame, the result is in the frame of the start."""
+    """Return the poses (S, 3) of a robot that drives through ``corners`` (N, 2) in straight lines. ``pose`` (3,): the
+    start. Corners and start are in the world frame, the result is in the frame of the start."""
     parts = [np.zeros((1, 3))]
     start = pose[:2]
     if np.hypot(*(corners[0] - start)) < 1e-9:

@@ -1,11 +1,11 @@
 """Policies that choose the path of a robot with an uncertain pose.
 
-``information`` chooses the path with the largest expected reduction of the belief's entropy, minus the cost of its length.
-``paper_literal`` has the opposite sign, as printed in the paper, and prefers the least informative path. ``random``, ``patrol`` and
-``nearest_tags`` are for comparison.
+``information`` chooses the path with the largest expected reduction of the belief's entropy, minus the cost of its
+length. ``paper_literal`` has the opposite sign, as printed in the paper, and prefers the least informative path.
+``random``, ``patrol`` and ``nearest_tags`` are for comparison.
 
-All policies get the same candidates. These are paths whose first metre is free according to the proximity sensor, and a turn in
-place unless the robot has just turned. Only policies that compare candidates use paths to distant places.
+All policies get the same candidates. These are paths whose first metre is free according to the proximity sensor, and a
+turn in place unless the robot has just turned. Only policies that compare candidates use paths to distant places.
 """
 
 import math
@@ -79,11 +79,11 @@ Policy = Callable[[Situation], Choice]
 
 
 def information(s: Situation, sign: float = 1.0) -> Choice:
-    """Choose the path with the largest expected information. With ``sign`` -1, the least informative path is preferred, as the
-    paper prints it.
+    """Choose the path with the largest expected information. With ``sign`` -1, the least informative path is preferred,
+    as the paper prints it.
 
-    Near paths are evaluated first. If no near path is worth its cost and the belief has few modes, paths to distant places are
-    evaluated. If these are not informative either, or if the pose is unknown, the robot patrols.
+    Near paths are evaluated first. If no near path is worth its cost and the belief has few modes, paths to distant
+    places are evaluated. If these are not informative either, or if the pose is unknown, the robot patrols.
     """
     settings = s.settings.policy
     if not s.sensors.forecasts or not s.candidates:
@@ -122,8 +122,8 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """Return the expected information (C,) [nats] of long paths about which mode is true, or about the pose if there is one mode.
 
-    With several modes, the entropy of the particles' poses is not used. On a long path particles diverge and run into walls, which
-    the real robot avoids by planning again.
+    With several modes, the entropy of the particles' poses is not used. On a long path particles diverge and run into
+    walls, which the real robot avoids by planning again.
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
@@ -158,8 +158,8 @@ def random(s: Situation) -> Choice:
 
 
 def patrol(s: Situation) -> Choice:
-    """Drive straight ahead until a wall is near, then in the direction with the most free space. Turn back only if no other
-    direction is free."""
+    """Drive straight ahead until a wall is near, then in the direction with the most free space. Turn back only if no
+    other direction is free."""
     straight = [(i, p) for i, p in enumerate(s.candidates) if _is_straight(p)]
     if not straight:
         return NO_PATH
@@ -206,8 +206,8 @@ def policy(name: str) -> Policy:
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
     """Select the paths whose first metre is free. Returns them with their free lengths.
 
-    ``free`` (C,) [m]: the free length of each path. ``sight`` [m]: the range of the proximity sensor. A path that is not free up to
-    this range is shortened to its free length.
+    ``free`` (C,) [m]: the free length of each path. ``sight`` [m]: the range of the proximity sensor. A path that is
+    not free up to this range is shortened to its free length.
     """
     keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length, sight) - 1e-9]
     return tuple(paths[i].until(float(free[i])) if free[i] < sight else paths[i] for i in keep), free[keep]

@@ -1,8 +1,8 @@
 """A simulated robot that follows paths by its own odometry and reports measurements, and its proximity sensor.
 
-The proximity sensor measures the free length up to the next wall in several directions. The measured lengths of one reading are not
-independent, because the grid of free space and the shape of the walls cause common errors. The likelihood is therefore tempered
-(:data:`TEMPERING`).
+The proximity sensor measures the free length up to the next wall in several directions. The measured lengths of one
+reading are not independent, because the grid of free space and the shape of the walls cause common errors. The
+likelihood is therefore tempered (:data:`TEMPERING`).
 """
 
 import math
@@ -61,8 +61,8 @@ class ProximitySensor:
     def log_likelihood(self, poses: Array, lengths: Array) -> Array:
         """Return the log-likelihood (M,) of the measured ``lengths`` (D,) at ``poses`` (M, 3), up to a constant.
 
-        The likelihood of a length is a Gaussian plus a constant for outliers (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005,
-        section 6.3.1, but not normalised).
+        The likelihood of a length is a Gaussian plus a constant for outliers (Thrun, Burgard, Fox, "Probabilistic
+        Robotics", 2005, section 6.3.1, but not normalised).
         """
         errors = (self.expected(poses) - lengths) / SIGMA
         return np.asarray(TEMPERING * np.log((1.0 - UNEXPECTED) * np.exp(-0.5 * errors**2) + UNEXPECTED).sum(axis=1))
@@ -162,8 +162,8 @@ class SimulatedRobot:
             yield from self._passed(np.zeros(3))
 
     def _passed(self, reported: Array) -> Iterator[Measurement]:
-        """Advance the time by one control period, and yield its measurements. ``reported`` (3,): the motion that odometry
-        reports."""
+        """Advance the time by one control period, and yield its measurements. ``reported`` (3,): the motion that
+        odometry reports."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))
         yield IncrementOdometry(self.t, float(reported[0]), float(reported[1]), float(reported[2]))
@@ -178,8 +178,8 @@ class SimulatedRobot:
                 yield m if kind_of(channel) == channel else replace(m, source=channel)  # type: ignore[type-var]
 
     def _reported_motions(self, path: Array, metres: float) -> Array:
-        """Return the motions (N, 3) of N control periods along at most ``metres`` [m] of a path, as odometry reports them. Each is
-        in the frame of the robot before the motion."""
+        """Return the motions (N, 3) of N control periods along at most ``metres`` [m] of a path, as odometry reports
+        them. Each is in the frame of the robot before the motion."""
         twists = se2.log(se2.between(path[:-1], path[1:]))
         lengths = np.hypot(twists[:, 0], twists[:, 1])
         seconds = np.maximum(lengths / self._settings.speed, np.abs(twists[:, 2]) / self._settings.turn_rate)
@@ -193,7 +193,7 @@ class SimulatedRobot:
         return se2.between(at[:-1], at[1:])
 
     def _is_free(self, target: Array) -> bool:
-        """True if the robot may move to ``target`` (3,): the cell there is free. From a cell that is not free, the robot may move
-        to any cell that is not nearer to a wall."""
+        """True if the robot may move to ``target`` (3,): the cell there is free. From a cell that is not free, the
+        robot may move to any cell that is not nearer to a wall."""
         ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, target))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

@@ -27,8 +27,8 @@ class PolicySettings(FileModel):
 
 
 class ActiveSettings(FileModel):
-    """Settings of an active run. The robot is localized once the standard deviations and the errors of position and heading are
-    below the limits. The standard deviation of the position is measured in its least certain direction."""
+    """Settings of an active run. The robot is localized once the standard deviations and the errors of position and
+    heading are below the limits. The standard deviation of the position is measured in its least certain direction."""
 
     policy: PolicySettings = PolicySettings()
     particles: Annotated[int, Field(ge=100, le=100_000)] = 2000

@@ -1,10 +1,10 @@
 """The interface between sensors and estimators.
 
 A sensor turns a measurement into observations. It sees the current estimate through a view. The estimator applies each
-observation before it requests the next one. An observation depends on the pose at one time and on named blocks. A block is a
-part of the state other than the pose, such as constants of a sensor or the position of a landmark. An observation is used as a
-factor of a graph, as a correction of a Gaussian, or as a likelihood over poses. Sensors do not depend on estimators, nor
-estimators on sensors."""
+observation before it requests the next one. An observation depends on the pose at one time and on named blocks. A block
+is a part of the state other than the pose, such as constants of a sensor or the position of a landmark. An observation
+is used as a factor of a graph, as a correction of a Gaussian, or as a likelihood over poses. Sensors do not depend on
+estimators, nor estimators on sensors."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Term:
 class Observation(Protocol):
     """The information of a measurement, or of a part of it, on the pose at one time and on named blocks. Immutable.
 
-    ``t``: time of the measurement [s]. ``found``: number of detections, possibly 0. ``is_judged``: True if :meth:`Sensor.judge`
-    must be called. ``iterations``: number of linearisations, or None if the estimator decides.
+    ``t``: time of the measurement [s]. ``found``: number of detections, possibly 0. ``is_judged``: True if
+    :meth:`Sensor.judge` must be called. ``iterations``: number of linearisations, or None if the estimator decides.
     """
 
     @property
@@ -78,8 +78,8 @@ class Observation(Protocol):
     ) -> Correction:
         """Return the correction of a Gaussian with mean ``pose`` (3,) and ``values`` of the blocks.
 
-        ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the pose.
-        ``columns``: the components of each block. All other components are corrected through their correlation.
+        ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the
+        pose. ``columns``: the components of each block. All other components are corrected through their correlation.
         ``iterations``: the number of linearisations.
         """
 
@@ -99,8 +99,8 @@ class Observation(Protocol):
 class NewVariable:
     """A new block of the state: the position of a landmark that is seen for the first time, or a variable with a prior.
 
-    ``name``: the name of the block. ``mean`` (d,): initial estimate. ``by_pose`` (d, 3) and ``by_block`` (d, P): Jacobians of the
-    mean by the pose and by other blocks.
+    ``name``: the name of the block. ``mean`` (d,): initial estimate. ``by_pose`` (d, 3) and ``by_block`` (d, P):
+    Jacobians of the mean by the pose and by other blocks.
     ``noise`` (d, d): the covariance that results from measurement noise alone. ``sightings``: the observations that the
     estimate consists of, each with the time [s] of its pose. Without sightings, ``mean`` and ``noise`` are a prior.
     """
@@ -113,9 +113,9 @@ class NewVariable:
     sightings: tuple[tuple[float, Observation], ...]
 
     def joint(self, covariance: Array, columns: Columns) -> tuple[Array, Array]:
-        """Return the cross-covariance (d, S) of the block with an error state of ``covariance`` (S, S), and the covariance
-        (d, d) of the block. ``columns``: the components of each block in the error state. Missing blocks are treated as
-        exact."""
+        """Return the cross-covariance (d, S) of the block with an error state of ``covariance`` (S, S), and the
+        covariance (d, d) of the block. ``columns``: the components of each block in the error state. Missing blocks are
+        treated as exact."""
         jacobian = np.zeros((len(self.mean), len(covariance)))
         jacobian[:, :3] = self.by_pose
         for name, block in self.by_block.items():
@@ -127,8 +127,8 @@ class NewVariable:
 
 @dataclass(frozen=True)
 class EarlierPose:
-    """A pose variable of an estimator at or before a requested time. ``t``: its time [s]. ``offset``: the motion from ``t`` to
-    the requested time, or None if the times are equal."""
+    """A pose variable of an estimator at or before a requested time. ``t``: its time [s]. ``offset``: the motion from
+    ``t`` to the requested time, or None if the times are equal."""
 
     t: float
     offset: Increment | None
@@ -136,8 +136,8 @@ class EarlierPose:
 
 @dataclass(frozen=True)
 class Link:
-    """A factor on two poses. Its first value is the pose that a measurement at ``t`` [s] refers to. Its second value is the
-    pose at ``earlier`` [s], which :meth:`View.earlier` returned. ``rows``: number of its residuals."""
+    """A factor on two poses. Its first value is the pose that a measurement at ``t`` [s] refers to. Its second value is
+    the pose at ``earlier`` [s], which :meth:`View.earlier` returned. ``rows``: number of its residuals."""
 
     t: float
     earlier: float
@@ -167,9 +167,9 @@ class Binding:
 class View(Protocol):
     """The current estimate as a sensor sees it, after all observations applied so far.
 
-    ``t``: time [s] of the pose that new observations depend on. ``offset``: the motion from ``t`` to the measurement, None if
-    the times are equal. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate at ``t``. ``newest``: True if the
-    estimator has no later pose. ``localized``: True if the robot is localized.
+    ``t``: time [s] of the pose that new observations depend on. ``offset``: the motion from ``t`` to the measurement,
+    None if the times are equal. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate at ``t``. ``newest``:
+    True if the estimator has no later pose. ``localized``: True if the robot is localized.
     """
 
     @property
@@ -197,8 +197,8 @@ class View(Protocol):
         """Return poses (R, 3) by odometry at ``times`` (R,) [s], in the frame of the pose at ``t``."""
 
     def earlier(self, t: float) -> EarlierPose | None:
-        """Return the pose at or before ``t`` [s] that a :class:`Link` may depend on. Returns None if there is none, as in
-        filters."""
+        """Return the pose at or before ``t`` [s] that a :class:`Link` may depend on. Returns None if there is none, as
+        in filters."""
 
 
 class Finder(Protocol):
@@ -236,8 +236,8 @@ class Finder(Protocol):
     def refuted_since(self, m: Any, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
         """Return the time [s] since which the track must have been wrong, or None. Call this after a measurement was applied.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the measurement. If the track is wrong, ``best`` is
-        the correct pose.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the measurement. If the track is wrong,
+        ``best`` is the correct pose.
         """
 
     def clear(self) -> None:
@@ -297,8 +297,8 @@ class Sensor:
         return False
 
     def accept(self) -> None:
-        """End the suspicion that the pose is wrong (``suspicious_since``), because a search found no better pose. The sensor's
-        model or the map is wrong instead."""
+        """End the suspicion that the pose is wrong (``suspicious_since``), because a search found no better pose. The
+        sensor's model or the map is wrong instead."""
 
     def gathered(self, observations: Sequence[Any]) -> list[Term]:
         """Merge the observations on one pose into few factors of a graph."""

@@ -88,16 +88,16 @@ class Calibrator:
 
         ``traced``: the logs. ``rig``: initial values.
         ``first``: the rig of the user. It differs from ``rig`` if logs without references are smoothed and calibrated
-        repeatedly. ``grids``: path with name prefix of files that may be written, None to write none.
-        ``like``: a result whose discrete choices are kept. It is given if ``traced`` is only a part of the logs of that result.
+        repeatedly. ``grids``: path with name prefix of files that may be written, None to write none. ``like``: a
+        result whose discrete choices are kept. It is given if ``traced`` is only a part of the logs of that result.
         Raises InputError if a log is too short.
         """
         raise NotImplementedError
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
         """Return ``rig`` with the uncertainties of constants from ``first``, for another repetition of smoothing and
-        calibration. Learnt uncertainties are smaller. With them the constants would stay near the values of the previous
-        repetition."""
+        calibration. Learnt uncertainties are smaller. With them the constants would stay near the values of the
+        previous repetition."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return rig
         uncertainty = first.section(self.section).uncertainty
@@ -154,8 +154,8 @@ class OneOfSeveral(Calibrator):
 class ConstantsCalibrator(Calibrator):
     """Base class of calibrations by least squares. Constants and noise are estimated alternately, ``rounds`` times.
 
-    The data of a log, which :meth:`part` returns, have timestamps ``t`` (K,) [s] and a method ``residuals(settings)``. It
-    returns residuals (K, D) in standard deviations.
+    The data of a log, which :meth:`part` returns, have timestamps ``t`` (K,) [s] and a method ``residuals(settings)``.
+    It returns residuals (K, D) in standard deviations.
     """
 
     rounds: ClassVar[int] = 2
@@ -169,8 +169,8 @@ class ConstantsCalibrator(Calibrator):
         raise NotImplementedError
 
     def with_noise(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any]:
-        """Return ``parts``, the data of each log, and ``settings``, both with the noise that the residuals show. The residuals are
-        those at the constants of ``settings``."""
+        """Return ``parts``, the data of each log, and ``settings``, both with the noise that the residuals show. The
+        residuals are those at the constants of ``settings``."""
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
@@ -227,8 +227,8 @@ class ConstantsCalibrator(Calibrator):
     def _constants(
         self, parts: Sequence[Any], settings: Any, initial: Any, posterior: Posterior
     ) -> list[FittedConstant]:
-        """Return the fitted constants of ``posterior``. With several logs, each log is also fitted alone, and the differences
-        between logs give the uncertainty of each constant. ``initial``: the settings before the fit."""
+        """Return the fitted constants of ``posterior``. With several logs, each log is also fitted alone, and the
+        differences between logs give the uncertainty of each constant. ``initial``: the settings before the fit."""
         values = posterior.as_dict()
         own = centred(posterior.parameters, values)
         alone = [
@@ -248,8 +248,8 @@ class ConstantsCalibrator(Calibrator):
         return out
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
-        """Return the result for logs whose trajectories are smoothed: the mean over the logs of each constant that the smoother
-        estimated. ``first``: the rig of the user."""
+        """Return the result for logs whose trajectories are smoothed: the mean over the logs of each constant that the
+        smoother estimated. ``first``: the rig of the user."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""

@@ -1,7 +1,7 @@
 """Argument and result types of the functions that a sensor registers.
 
-They cover checks before a run, the review after a run, summaries for ``fgloc info``, drawings, simulated drives, and the
-expected information along planned paths.
+They cover checks before a run, the review after a run, summaries for ``fgloc info``, drawings, simulated drives, and
+the expected information along planned paths.
 """
 
 from collections.abc import Callable, Collection, Container, Iterable, Mapping, Sequence
@@ -43,8 +43,8 @@ class Use:
     """A planned run of a log by an estimator.
 
     ``sensors``: names of the channels that the run may use.
-    ``estimator``: the name of the estimator. ``settings``: its settings. ``given``: names of the settings that the user has
-    set. ``modalities``: modalities of the measurements that the estimator uses.
+    ``estimator``: the name of the estimator. ``settings``: its settings. ``given``: names of the settings that the user
+    has set. ``modalities``: modalities of the measurements that the estimator uses.
     ``estimates_points``: True if the estimator can estimate image points that are not in the map.
     ``warnings``: warnings about the settings.
     """
@@ -63,8 +63,8 @@ class Use:
 class Ending:
     """The results of a finished run.
 
-    ``diagnostics``: diagnostics of the causal estimates. ``final_diagnostics``: diagnostics of the ``final`` trajectory, which uses
-    all measurements. ``learnt``: estimated constants and landmarks.
+    ``diagnostics``: diagnostics of the causal estimates. ``final_diagnostics``: diagnostics of the ``final``
+    trajectory, which uses all measurements. ``learnt``: estimated constants and landmarks.
     """
 
     diagnostics: Diagnostics
@@ -82,8 +82,8 @@ class Review:
 
 
 def lacking_section(rig: Rig, sensor: str) -> str:
-    """Return the name of the section of the rig that a sensor requires but the rig lacks. Returns "" if nothing is missing. A
-    section whose settings all have defaults is required only for one of several sensors, such as
+    """Return the name of the section of the rig that a sensor requires but the rig lacks. Returns "" if nothing is
+    missing. A section whose settings all have defaults is required only for one of several sensors, such as
     ``bearing_range.front``."""
     kind = kind_of(sensor)
     known = channels().get(kind)
@@ -109,9 +109,9 @@ class Paragraph:
 class Summary:
     """The summary of one sensor in a log, for ``fgloc info``.
 
-    ``found``: entries of the output of ``fgloc info --json``. ``in_map``: number of detectable elements of each map layer.
-    ``problems``: warnings. ``text``: printed paragraphs. ``undetected``: warnings about elements that the sensor never detects.
-    One of these warnings is omitted if another sensor of the same kind detects the element.
+    ``found``: entries of the output of ``fgloc info --json``. ``in_map``: number of detectable elements of each map
+    layer. ``problems``: warnings. ``text``: printed paragraphs. ``undetected``: warnings about elements that the sensor
+    never detects. One of these warnings is omitted if another sensor of the same kind detects the element.
     """
 
     found: Mapping[str, Any] = field(default_factory=dict)
@@ -124,8 +124,8 @@ class Summary:
 def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
     """Return the warning that the timestamps of ``name`` are ``shift`` [s] later than those of ``than``.
 
-    ``setting``: the section of the rig whose ``time_offset`` the warning proposes to set to ``offset`` [s]. If the shift is at
-    the limit of the search, the true one may be larger, and the warning proposes to correct the manifest.
+    ``setting``: the section of the rig whose ``time_offset`` the warning proposes to set to ``offset`` [s]. If the
+    shift is at the limit of the search, the true one may be larger, and the warning proposes to correct the manifest.
     """
     if abs(shift) > FARTHEST - STEP:
         sentence = (
@@ -151,9 +151,9 @@ def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
 class Marks:
     """What plots and viewers show of one ``layer`` of the map.
 
-    ``names`` (K) and ``positions`` (K, 3) [m]: the elements of the layer. ``t`` (N,) and ``seen`` (N): time [s of the log] and
-    element name of each detection. ``marker``, ``size``: matplotlib style. ``order``: layers with a higher order are drawn on
-    top. ``dense``: True if there are too many elements to label.
+    ``names`` (K) and ``positions`` (K, 3) [m]: the elements of the layer. ``t`` (N,) and ``seen`` (N): time [s of the
+    log] and element name of each detection. ``marker``, ``size``: matplotlib style. ``order``: layers with a higher
+    order are drawn on top. ``dense``: True if there are too many elements to label.
     """
 
     layer: str
@@ -182,8 +182,8 @@ def marks(log: Log) -> list[Marks]:
 class Ride:
     """A simulated drive through a world.
 
-    ``settings``: settings of the simulation, with the sections of the sensors. ``rig``: the rig that estimators will use.
-    ``world``: the true world. ``truth``: the true trajectory, from t = 0.
+    ``settings``: settings of the simulation, with the sections of the sensors. ``rig``: the rig that estimators will
+    use. ``world``: the true world. ``truth``: the true trajectory, from t = 0.
     ``rng``, ``rng_of_world``: return a random generator by name, from the seed of the log or of the world.
     """
 
@@ -203,8 +203,8 @@ class Ride:
 class Simulated:
     """The simulated measurements of a sensor.
 
-    ``streams``: by channel. ``layers``: map layers as surveyed, if they differ from the true world. ``metadata``: entries for
-    the metadata of the log.
+    ``streams``: by channel. ``layers``: map layers as surveyed, if they differ from the true world. ``metadata``:
+    entries for the metadata of the log.
     """
 
     streams: Mapping[str, Stream] = field(default_factory=dict)
@@ -243,15 +243,15 @@ class Forecast(Protocol):
     def information(self, poses: Array, ways: Array) -> Array:
         """Return the expected Fisher information (N, 3, 3) on the body-frame perturbation of ``poses`` (N, 3) along a path.
 
-        ``ways`` (N,): the length [m] of the part of the path at each pose. The duration of a turn counts as the distance that
-        the robot travels in that time.
+        ``ways`` (N,): the length [m] of the part of the path at each pose. The duration of a turn counts as the
+        distance that the robot travels in that time.
         """
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate measurements from each of the first J particles along a path. Add to ``out[j, m]`` the log-likelihood of
-        particle m, given the measurements from particle j.
+        """Simulate measurements from each of the first J particles along a path. Add to ``out[j, m]`` the
+        log-likelihood of particle m, given the measurements from particle j.
 
-        ``poses`` (S, M, 3): the poses of M particles at S stops on the path. ``metres``: length of the path, with turns as in
-        :meth:`information`. ``stops`` (M,): number of stops at which each particle measures. ``out`` (J, M).
+        ``poses`` (S, M, 3): the poses of M particles at S stops on the path. ``metres``: length of the path, with turns
+        as in :meth:`information`. ``stops`` (M,): number of stops at which each particle measures. ``out`` (J, M).
         Random draws are the same for all paths with the same ``seed``.
         """

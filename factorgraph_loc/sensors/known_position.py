@@ -1,7 +1,7 @@
 """A start with known position and unknown heading, used by the search for the pose.
 
-The prior is Gaussian in the position and uniform in the heading. The odometry propagates it to the current time. It is a
-constraint on the current pose, and generates candidates of that pose.
+The prior is Gaussian in the position and uniform in the heading. The odometry propagates it to the current time. It is
+a constraint on the current pose, and generates candidates of that pose.
 """
 
 import math
@@ -58,8 +58,8 @@ class KnownPosition:
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Return candidates (N, 3) of the pose at the odometry state ``now``, after starts at the mean position with evenly spaced
-        headings."""
+        """Return candidates (N, 3) of the pose at the odometry state ``now``, after starts at the mean position with
+        evenly spaced headings."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)

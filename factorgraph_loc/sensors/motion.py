@@ -41,9 +41,9 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
     """Return the odometry model of a rig.
 
     ``use_gyro``: bias and noise of the heading are those of the gyro.
-    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants. Their errors are added to the noise
-    as a random walk. Its variance equals that of the error after the distance :data:`WAY`, the rotation :data:`TURN` or the time
-    :data:`TIME`.
+    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants. Their errors are added to
+    the noise as a random walk. Its variance equals that of the error after the distance :data:`WAY`, the rotation
+    :data:`TURN` or the time :data:`TIME`.
     """
     s = rig.of(OdometrySettings)
     along, heading = s.noise.along.model(), s.noise.heading.model()
@@ -79,8 +79,8 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
 class Motion(OdometryChain):
     """Collects rows of wheel odometry and gyro, and computes the relative motion between any two recent times.
 
-    The gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``constants``: the P calibration constants that
-    are estimated. Without ``self_calibration`` there are none, and their errors are part of the noise.
+    The gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``constants``: the P calibration
+    constants that are estimated. Without ``self_calibration`` there are none, and their errors are part of the noise.
     """
 
     def __init__(
@@ -93,8 +93,8 @@ class Motion(OdometryChain):
         self._diagnostics = diagnostics
 
     def add(self, m: Measurement) -> None:
-        """Add one row, or several as :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are counted as
-        ignored. Rows that are too old are counted as late."""
+        """Add one row, or several as :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are
+        counted as ignored. Rows that are too old are counted as late."""
         kept: int
         match m:
             case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
@@ -112,8 +112,8 @@ class Motion(OdometryChain):
             self._diagnostics.drop_late("odometry", m.count - kept)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
-        """Return the logarithm (3,) of an increment's motion, corrected for ``constants`` (P,), and its Jacobian (3, P) by
-        them."""
+        """Return the logarithm (3,) of an increment's motion, corrected for ``constants`` (P,), and its Jacobian (3, P)
+        by them."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
 
@@ -138,8 +138,8 @@ class Motion(OdometryChain):
         return np.asarray(se2.exp(moved))
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
-        """Return the additional covariance (3, 3) of an increment if the wheels slip, and the negative log-probability of
-        slip."""
+        """Return the additional covariance (3, 3) of an increment if the wheels slip, and the negative log-probability
+        of slip."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
 
 

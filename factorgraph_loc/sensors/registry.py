@@ -1,9 +1,9 @@
 """The registry of sensors and their channels.
 
-A sensor is a package whose ``__init__`` defines a :class:`SensorType`. It names classes and functions of its modules by strings
-``package.module:name``. :func:`factorgraph_loc.plugins.load` imports them when they are needed. Built-in sensors are listed in
-:mod:`factorgraph_loc.builtin`. Another package registers the string of its :class:`SensorType` as an entry point of the group
-``factorgraph_loc.sensors``.
+A sensor is a package whose ``__init__`` defines a :class:`SensorType`. It names classes and functions of its modules by
+strings ``package.module:name``. :func:`factorgraph_loc.plugins.load` imports them when they are needed. Built-in
+sensors are listed in :mod:`factorgraph_loc.builtin`. Another package registers the string of its :class:`SensorType` as
+an entry point of the group ``factorgraph_loc.sensors``.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class Channel:
     """A kind of measurement of a sensor. Its ``name`` is used in the option ``--sensors`` and as the name of a log's stream.
 
     ``section``: the section of the rig with the channel's ``time_offset``.
-    ``tables``: descriptions (:class:`~factorgraph_loc.files.columns.Table`) of the channel's tables in a log. A channel without
-    tables is an optional column of the sensor's first channel, such as ``rssi`` of ``rfid``.
+    ``tables``: descriptions (:class:`~factorgraph_loc.files.columns.Table`) of the channel's tables in a log. A channel
+    without tables is an optional column of the sensor's first channel, such as ``rssi`` of ``rfid``.
     ``described``: descriptions of further tables, whose columns are the fields of measurements but not of files.
     ``assemble``: ``(rows by table, reading) -> stream``, if the fields of the stream are not columns of a table.
     ``disassemble``: ``(stream, writing) -> columns by table``, the inverse of ``assemble``.
@@ -104,8 +104,8 @@ class SensorType:
 
 
 def sensors() -> Mapping[str, SensorType]:
-    """Return all sensors by name, built-in ones first. Raises InputError if a sensor cannot be loaded, or if two have the same
-    name."""
+    """Return all sensors by name, built-in ones first. Raises InputError if a sensor cannot be loaded, or if two have
+    the same name."""
     return registered()
 
 
@@ -171,16 +171,16 @@ def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
 
 
 def channel(name: str) -> Channel:
-    """Return the channel with this name. It may be the name of one of several sensors, such as ``bearing_range.front``. Raises
-    InputError if it is unknown."""
+    """Return the channel with this name. It may be the name of one of several sensors, such as ``bearing_range.front``.
+    Raises InputError if it is unknown."""
     return next(own for own in sensor_of(name).channels if own.name == kind_of(name))
 
 
 def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
     """Yield the name and the function of each sensor that registers a function ``kind``, a field of :class:`SensorType`.
 
-    If the ``rig`` has several sensors of one type, each is yielded by its own name, such as ``bearing_range.front``. The
-    function then expects a rig or log in which the sensor is the only one of its type
+    If the ``rig`` has several sensors of one type, each is yielded by its own name, such as ``bearing_range.front``.
+    The function then expects a rig or log in which the sensor is the only one of its type
     (:meth:`~factorgraph_loc.model.rig.Rig.alone`).
     """
     for name, sensor in sensors().items():

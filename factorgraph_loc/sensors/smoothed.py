@@ -26,8 +26,8 @@ class Traced:
     """A log for calibration, whose reference is a measured or a smoothed trajectory.
 
     ``constants``: None for a measured reference. For a smoothed trajectory: the estimated constants by their names in
-    :class:`~factorgraph_loc.model.belief.Learnt`. Each value is a correction of the rig's value, and its standard deviation.
-    ``doubted``: names of elements that are probably not at their position in the map.
+    :class:`~factorgraph_loc.model.belief.Learnt`. Each value is a correction of the rig's value, and its standard
+    deviation. ``doubted``: names of elements that are probably not at their position in the map.
     """
 
     log: Log
@@ -36,8 +36,8 @@ class Traced:
 
 
 def recordings(logs: Sequence[Log]) -> list[int]:
-    """Return the number of the recording that each log belongs to, which is the index of its first log. Logs that differ only
-    in their odometry belong to the same recording, because they are not independent."""
+    """Return the number of the recording that each log belongs to, which is the index of its first log. Logs that
+    differ only in their odometry belong to the same recording, because they are not independent."""
     keys = [_exteroceptive(log) or i for i, log in enumerate(logs)]
     return [keys.index(key) for key in keys]
 
@@ -76,8 +76,8 @@ def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Correcti
 
 
 def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, float]]:
-    """Return the correction of a constant and its standard deviation in each log. Returns [] if it was not estimated in all
-    logs."""
+    """Return the correction of a constant and its standard deviation in each log. Returns [] if it was not estimated in
+    all logs."""
     corrections = [trace.constants[name] for trace in traced if trace.constants and name in trace.constants]
     return corrections if len(corrections) == len(traced) else []
 
@@ -87,9 +87,9 @@ def pooled_constants(
 ) -> tuple[Any, list[FittedConstant]]:
     """Update the constants of a section that were estimated in all logs. Returns the new settings and the fitted constants.
 
-    ``prefix``: the prefix of the constants' names in the logs. ``settings``: the settings that the logs were smoothed with.
-    ``first``: the settings before the first repetition of smoothing and calibration. Corrections of scales are relative, others
-    are absolute. With several logs, the uncertainties of the constants are updated as well.
+    ``prefix``: the prefix of the constants' names in the logs. ``settings``: the settings that the logs were smoothed
+    with. ``first``: the settings before the first repetition of smoothing and calibration. Corrections of scales are
+    relative, others are absolute. With several logs, the uncertainties of the constants are updated as well.
     """
     values: dict[str, float] = {}
     uncertainties: dict[str, float] = {}

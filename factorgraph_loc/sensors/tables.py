@@ -1,7 +1,7 @@
 """Converts tables of files into streams and back, and validates pushed measurements, by the descriptions of their columns.
 
-A channel whose stream has one field per column only needs a :class:`~factorgraph_loc.files.columns.Table`. Other channels
-define the functions ``assemble`` and ``disassemble``.
+A channel whose stream has one field per column only needs a :class:`~factorgraph_loc.files.columns.Table`. Other
+channels define the functions ``assemble`` and ``disassemble``.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """The context in which the rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list to append
-    to. ``shared``: what several sensors of the log have in common, such as the origin of latitudes, by name.
+    """The context in which the rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list
+    to append to. ``shared``: what several sensors of the log have in common, such as the origin of latitudes, by name.
     """
 
     rig: Rig
@@ -48,8 +48,8 @@ class Reading:
 
 @dataclass(frozen=True)
 class Writing:
-    """The context in which a stream is written. ``log``: the name of its log. ``t0_ns``: the absolute time of t = 0 [ns].
-    ``folder``: the folder of the tables."""
+    """The context in which a stream is written. ``log``: the name of its log. ``t0_ns``: the absolute time of t = 0
+    [ns]. ``folder``: the folder of the tables."""
 
     log: str
     t0_ns: int
@@ -73,8 +73,8 @@ def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
 
 
 def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
-    """Return the channel name and the alternative descriptions of the table ``name`` of the native format. Returns None if
-    there is no such table. The table of one of several sensors has a name such as ``bearing_range.front``."""
+    """Return the channel name and the alternative descriptions of the table ``name`` of the native format. Returns None
+    if there is no such table. The table of one of several sensors has a name such as ``bearing_range.front``."""
     kind, _, own = name.partition(".")
     if kind not in native_tables() or (kind != name and not (kind in several() and is_name(own))):
         return None
@@ -83,8 +83,8 @@ def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
 
 
 def all_tables(*chosen: SensorType) -> Iterator[Table]:
-    """Yield the descriptions of the tables of the ``chosen`` sensors, by default of all sensors. For each sensor, tables of
-    measurements come before tables of map layers."""
+    """Yield the descriptions of the tables of the ``chosen`` sensors, by default of all sensors. For each sensor,
+    tables of measurements come before tables of map layers."""
     for sensor in chosen or sensors().values():
         for channel in sensor.channels:
             yield from (load(place) for place in (*channel.tables, *channel.described))
@@ -92,8 +92,8 @@ def all_tables(*chosen: SensorType) -> Iterator[Table]:
 
 
 def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of a channel from the ``rows`` of its tables, by table name. Raises InputError for invalid rows, and
-    appends to ``reading.warnings`` for rows that are skipped."""
+    """Return the stream of a channel from the ``rows`` of its tables, by table name. Raises InputError for invalid
+    rows, and appends to ``reading.warnings`` for rows that are skipped."""
     if channel.assemble:
         made: Stream = load(channel.assemble)(rows, reading)
         return made
@@ -108,9 +108,9 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
 def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
     """Return the stream of a table's rows. Of repeated rows the last one is kept.
 
-    Rows are repeated if they have the same timestamp. If the rows of one timestamp form one measurement, repeated rows also
-    have the same name. Raises InputError with file, row and column for values out of bounds, decreasing timestamps, and rows
-    without values.
+    Rows are repeated if they have the same timestamp. If the rows of one timestamp form one measurement, repeated rows
+    also have the same name. Raises InputError with file, row and column for values out of bounds, decreasing
+    timestamps, and rows without values.
     """
     values: dict[str, Any] = dict(rows.names)
     measured = [column for column in table.columns if column.name in rows.numbers]
@@ -157,8 +157,8 @@ def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> A
 
 
 def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of a stream's tables, by table name. Files that the stream refers to are copied into the folder.
-    Raises InputError if the native format has no table for the stream."""
+    """Return the columns of a stream's tables, by table name. Files that the stream refers to are copied into the
+    folder. Raises InputError if the native format has no table for the stream."""
     if channel.disassemble:
         made: dict[str, Columns] = load(channel.disassemble)(stream, writing)
         return made
@@ -206,8 +206,8 @@ def channel_of(kind: type[Any]) -> Channel:
 
 
 def checked(m: M) -> M:
-    """Return a validated copy of a measurement, or the measurement itself if it only consists of valid floats, which are
-    immutable. Raises InputError with the first invalid field, its value and the expected values."""
+    """Return a validated copy of a measurement, or the measurement itself if it only consists of valid floats, which
+    are immutable. Raises InputError with the first invalid field, its value and the expected values."""
     if (floats := _floats_of(type(m))) is not None:
         for name, low, high in floats:
             value = getattr(m, name)
@@ -227,8 +227,8 @@ def checked(m: M) -> M:
 
 @cache
 def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] | None:
-    """Return name and inclusive bounds of each field of a class of measurements, such as those of odometry. Returns None if not
-    all fields are single numbers. Raises InputError if ``kind`` is no class of measurements."""
+    """Return name and inclusive bounds of each field of a class of measurements, such as those of odometry. Returns
+    None if not all fields are single numbers. Raises InputError if ``kind`` is no class of measurements."""
     channel = channel_of(kind)
     if channel.check:
         return None

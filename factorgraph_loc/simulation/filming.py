@@ -41,9 +41,9 @@ FEW = 40  # at most this many images are rendered by one process, because starti
 class Film:
     """The N images of a simulated drive. ``film[i]`` renders image i, (H, W, 3) BGR. The result does not depend on other images.
 
-    ``times`` (N,) [s]: the times of the middle of the exposures. ``stamps`` (N,) [s]: the same times by the camera's clock.
-    ``truth``: the true trajectory of the robot. ``renderer``: renders the images, and computes the 3-D point of a pixel.
-    ``seed``: the seed of the image noise.
+    ``times`` (N,) [s]: the times of the middle of the exposures. ``stamps`` (N,) [s]: the same times by the camera's
+    clock. ``truth``: the true trajectory of the robot. ``renderer``: renders the images, and computes the 3-D point of
+    a pixel. ``seed``: the seed of the image noise.
     """
 
     renderer: Renderer
@@ -86,8 +86,8 @@ class Film:
 
 
 def film(settings: SimulationSettings, seed: int) -> Film:
-    """Return the images of a simulated drive. :func:`~factorgraph_loc.simulation.simulate` simulates the same drive with the same
-    settings and seed.
+    """Return the images of a simulated drive. :func:`~factorgraph_loc.simulation.simulate` simulates the same drive
+    with the same settings and seed.
 
     Raises InputError if the rig has no camera, or if the camera is higher than the furniture.
     """
@@ -120,8 +120,8 @@ def with_images(
     """Render the images of a simulated log into files. Returns the log with these images.
 
     ``log``: the log that was simulated with the same ``settings`` and ``seed``. ``folder``: receives the image files.
-    ``workers``: the number of processes. ``progress``: is called with the number of finished images and the number of all images.
-    Raises InputError as :func:`film` does.
+    ``workers``: the number of processes. ``progress``: is called with the number of finished images and the number of
+    all images. Raises InputError as :func:`film` does.
     """
     assert log.reference is not None, "a simulated log has a reference"
     times = times_of(settings.images.rate, log.reference)
@@ -143,8 +143,8 @@ def _write_in_parallel(
     workers: int,
     progress: Callable[[float, float], None],
 ) -> None:
-    """Render ``count`` images by ``workers`` processes, and write them into ``folder``. Each process creates the scene and renders
-    every n-th image, where n is the number of processes. ``progress``: as of :func:`with_images`."""
+    """Render ``count`` images by ``workers`` processes, and write them into ``folder``. Each process creates the scene
+    and renders every n-th image, where n is the number of processes. ``progress``: as of :func:`with_images`."""
     write = partial(_write, settings, seed, folder)
     parts = [range(i, count, workers) for i in range(workers)]
     for _, outcome in run_each(

@@ -144,8 +144,8 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
 
 @compiled(error_model="numpy")
 def cast_all(around: Surroundings, rays: Array) -> Array:
-    """Return the distances (K,) of the hit points of ``rays`` (K, 3), in units of the lengths of the rays; infinite without a
-    hit."""
+    """Return the distances (K,) of the hit points of ``rays`` (K, 3), in units of the lengths of the rays; infinite
+    without a hit."""
     distance = np.empty(len(rays))
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
@@ -169,8 +169,8 @@ def expose(
     """Render an image of the building. At edges of faces, a pixel is the mean of four rays.
 
     ``texels`` (T, 3), ``layout``: the textures, see :class:`~factorgraph_loc.simulation.renderer.TexturedScene`.
-    ``directions`` (H, W, 2): x and y of each pixel's ray at depth 1 in the camera frame. ``rotation`` (3, 3): from camera to world.
-    ``pixel_at_one``: the size of a pixel at a depth of 1 m, in texels. ``rows`` (H, W): work array.
+    ``directions`` (H, W, 2): x and y of each pixel's ray at depth 1 in the camera frame. ``rotation`` (3, 3): from
+    camera to world. ``pixel_at_one``: the size of a pixel at a depth of 1 m, in texels. ``rows`` (H, W): work array.
     ``out`` (H, W, 3): the colours are added here.
     """
     height, width = directions.shape[:2]
@@ -217,8 +217,8 @@ def _shade(
     rotation: Array,
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
-    """Return the index of the face that the ray along (x, y, 1) in the camera frame hits, as :func:`cast` does, and the colour
-    (blue, green, red) of the hit point."""
+    """Return the index of the face that the ray along (x, y, 1) in the camera frame hits, as :func:`cast` does, and the
+    colour (blue, green, red) of the hit point."""
     x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
@@ -290,8 +290,8 @@ def _sample(
 
 @compiled(error_model="numpy")
 def _direction(x: float, y: float) -> float:
-    """Return the horizontal direction of (x, y) as a number in [0, BINS) that grows counter-clockwise. It is not proportional to
-    the angle, because that would need a trigonometric function."""
+    """Return the horizontal direction of (x, y) as a number in [0, BINS) that grows counter-clockwise. It is not
+    proportional to the angle, because that would need a trigonometric function."""
     total = abs(x) + abs(y)
     if total == 0.0:
         return 0.0
@@ -310,9 +310,9 @@ def develop(
 ) -> NDArray[np.uint8]:
     """Return the 8-bit image (H, W, 3) of a camera sensor, with noise.
 
-    ``light`` (H, W, 3): the rendered colours. ``gain`` (H, W): the factor of each pixel. A pixel of value v after this gain has
-    noise of the variance read^2 + shot * v. ``noise`` (H, W, 3): random integers that select from ``quantiles`` (Q,), which are
-    quantiles of a distribution with unit variance. Q is a power of two.
+    ``light`` (H, W, 3): the rendered colours. ``gain`` (H, W): the factor of each pixel. A pixel of value v after this
+    gain has noise of the variance read^2 + shot * v. ``noise`` (H, W, 3): random integers that select from
+    ``quantiles`` (Q,), which are quantiles of a distribution with unit variance. Q is a power of two.
     """
     height, width = gain.shape
     out = np.empty((height, width, 3), dtype=np.uint8)

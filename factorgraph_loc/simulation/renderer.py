@@ -1,8 +1,8 @@
 """Camera images of a textured building, with lens distortion, exposure, noise and motion blur.
 
-The building has vertical faces, a floor and a ceiling. A face is a rectangle above a segment of the floor plan, visible from the
-left side of the segment only. Furniture is lower than the room but higher than cameras, so that its top is never visible. Textures
-have mip levels (Williams, "Pyramidal parametrics", SIGGRAPH 1983).
+The building has vertical faces, a floor and a ceiling. A face is a rectangle above a segment of the floor plan, visible
+from the left side of the segment only. Furniture is lower than the room but higher than cameras, so that its top is
+never visible. Textures have mip levels (Williams, "Pyramidal parametrics", SIGGRAPH 1983).
 """
 
 import math
@@ -43,13 +43,13 @@ NORMAL = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
 class TexturedScene:
     """A building with textures.
 
-    ``faces`` (F, 4) [m]: segments (x1, y1, x2, y2), visible from their left side. ``bottoms``, ``tops`` (F,) [m]: heights of the
-    faces.
+    ``faces`` (F, 4) [m]: segments (x1, y1, x2, y2), visible from their left side. ``bottoms``, ``tops`` (F,) [m]:
+    heights of the faces.
     ``width``, ``depth`` [m]: size of floor and ceiling. ``height`` [m]: height of the ceiling.
-    ``texels`` (T, 3): the BGR colours of all mip levels of all textures. Columns of a face's texture run from left to right for the
-    viewer, rows run downwards. On floor and ceiling, columns run along x and rows along y.
-    ``layout`` (F + 2, LEVELS, 3): index of the first texel, width and height of each level of each texture. The textures of floor
-    and ceiling come last. ``texel`` [m]: the size of a texel.
+    ``texels`` (T, 3): the BGR colours of all mip levels of all textures. Columns of a face's texture run from left to
+    right for the viewer, rows run downwards. On floor and ceiling, columns run along x and rows along y.
+    ``layout`` (F + 2, LEVELS, 3): index of the first texel, width and height of each level of each texture. The
+    textures of floor and ceiling come last. ``texel`` [m]: the size of a texel.
     """
 
     faces: Array
@@ -64,8 +64,8 @@ class TexturedScene:
 
 
 def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> TexturedScene:
-    """Create the building of a plan, with random textures and random heights of furniture. ``tags`` with a facing are drawn on the
-    surfaces as small labels."""
+    """Create the building of a plan, with random textures and random heights of furniture. ``tags`` with a facing are
+    drawn on the surfaces as small labels."""
     walls, boxes = plan.faces()
     doors = np.array([side for door in plan.doors for side in both_sides(door)]).reshape(-1, 4)
     faces = np.concatenate((walls, boxes, doors))
@@ -143,8 +143,8 @@ def _stored(
 class Renderer:
     """Renders images of a ``scene`` by a camera ``model``.
 
-    Arguments ``position`` (3,) and ``rotation`` (3, 3) are the camera pose in the world frame. For a robot on the floor it can be
-    computed by :func:`factors.camera.model.camera_pose`.
+    Arguments ``position`` (3,) and ``rotation`` (3, 3) are the camera pose in the world frame. For a robot on the floor
+    it can be computed by :func:`factors.camera.model.camera_pose`.
     """
 
     def __init__(self, scene: TexturedScene, model: CameraModel, settings: ImageSettings | None = None) -> None:
@@ -170,9 +170,9 @@ class Renderer:
     ) -> Image:
         """Render a BGR image (H, W, 3).
 
-        ``position``, ``rotation``: the camera pose in the middle of the exposure. ``velocity`` (3,) [m/s], ``turn`` (3,) [rad/s]:
-        the motion of the camera in the world frame, which blurs the image. ``gain``: factor of the brightness. ``rng``: for the
-        noise of the camera; None renders an image without noise.
+        ``position``, ``rotation``: the camera pose in the middle of the exposure. ``velocity`` (3,) [m/s], ``turn``
+        (3,) [rad/s]: the motion of the camera in the world frame, which blurs the image. ``gain``: factor of the
+        brightness. ``rng``: for the noise of the camera; None renders an image without noise.
         """
         shape = (self.model.height, self.model.width, 3)
         light = np.zeros(shape, dtype=np.float32)
@@ -187,8 +187,8 @@ class Renderer:
         return np.asarray(raycasting.develop(light, brightness, noise, NORMAL, read, shot))
 
     def hits(self, pixels: Array, position: Array, rotation: Array) -> Array:
-        """Return the points (K, 3) of the scene that are visible at ``pixels`` (K, 2), in the world frame. A row is NaN if a
-        pixel shows nothing."""
+        """Return the points (K, 3) of the scene that are visible at ``pixels`` (K, 2), in the world frame. A row is NaN
+        if a pixel shows nothing."""
         directions = reprojection.undistorted(self.model, np.asarray(pixels, dtype=float).reshape(-1, 2))
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
         distance: Array = raycasting.cast_all(self._surroundings(position), rays)

@@ -94,8 +94,8 @@ class ImageSettings(FileModel):
 class SimulationSettings(FileModel):
     """All settings of a simulation except the seed.
 
-    Sensors register further sections: ``sightings`` of landmarks, ``rssi`` and ``phase`` of RFID reads, ``faults`` of RFID reads,
-    and ``pixels`` of points.
+    Sensors register further sections: ``sightings`` of landmarks, ``rssi`` and ``phase`` of RFID reads, ``faults`` of
+    RFID reads, and ``pixels`` of points.
     """
 
     name: str = "office"
@@ -125,8 +125,8 @@ class SimulationSettings(FileModel):
         return self
 
     def observation_counts(self) -> dict[str, float]:
-        """Return the expected number of simulated observations of each kind of objects (tags, landmarks, points). Raises
-        ValueError if the settings are inconsistent.
+        """Return the expected number of simulated observations of each kind of objects (tags, landmarks, points).
+        Raises ValueError if the settings are inconsistent.
         """
         counts: dict[str, float] = {}
         for name, rates in functions("looks", self.rig):
@@ -195,8 +195,8 @@ EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # pairs of keys: a ch
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the nested table ``base`` with the values of ``changes``. If a table in ``changes`` has another value of the key
-    ``kind`` than the table in ``base``, it replaces the whole table."""
+    """Return the nested table ``base`` with the values of ``changes``. If a table in ``changes`` has another value of
+    the key ``kind`` than the table in ``base``, it replaces the whole table."""
     if "kind" in changes and changes["kind"] != base.get("kind"):
         return dict(changes)
     out = dict(base)
@@ -230,8 +230,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """Return the settings of the preset ``name``. ``changes``: nested tables of the values that differ from the preset. Raises
-    InputError for an unknown preset or key, or for a value out of bounds."""
+    """Return the settings of the preset ``name``. ``changes``: nested tables of the values that differ from the preset.
+    Raises InputError for an unknown preset or key, or for a value out of bounds."""
     content = merged(_preset(name, "the settings"), changes or {})
     return parse_model(SimulationSettings, content, "the settings")
 

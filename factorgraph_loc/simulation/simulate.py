@@ -52,8 +52,8 @@ START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations of t
 def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.random.Generator:
     """Return the random generator called ``name``. Generators with different names are independent.
 
-    ``seed``: a number, or the seed sequence of another generator. The generator is seeded by ``seed`` and by the index of
-    ``name`` in
+    ``seed``: a number, or the seed sequence of another generator. The generator is seeded by ``seed`` and by the index
+    of ``name`` in
     ``names``, or by the hash of ``name`` if it is not in ``names``.
     """
     digest = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])

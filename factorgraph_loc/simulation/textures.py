@@ -25,8 +25,8 @@ TILE = 0.6  # m: size of the tiles of floor and ceiling
 
 
 def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, windows: bool) -> Canvas:
-    """Return the texture of a painted wall with objects, most of them at eye level. ``height``, ``width``: the size in texels
-    (pixels of a texture). ``texel`` [m]: the size of a texel. ``windows``: True if some objects are windows."""
+    """Return the texture of a painted wall with objects, most of them at eye level. ``height``, ``width``: the size in
+    texels (pixels of a texture). ``texel`` [m]: the size of a texel. ``windows``: True if some objects are windows."""
     out = _painted(rng, height, width, texel)
     tall = height * texel
     x = rng.uniform(*GAP)

@@ -51,8 +51,8 @@ class Plan:
         return np.array([*self.walls, *(side for box in self.boxes for side in _sides(box))])
 
     def faces(self) -> tuple[Array, Array]:
-        """Return the faces of walls and the faces of boxes, each as segments (F, 4) with the free side on their left. An inner
-        wall has two faces."""
+        """Return the faces of walls and the faces of boxes, each as segments (F, 4) with the free side on their left.
+        An inner wall has two faces."""
         walls = np.array([face for wall in self.walls for face in both_sides(wall)]).reshape(-1, 4)
         middles = _places(walls, np.full(len(walls), 0.5))[:, :2]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
@@ -92,8 +92,8 @@ def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
 
 
 def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
-    """Return the plan of an office: rooms on both sides of a corridor along x. Each room has a door to the corridor and, if it is
-    large enough, furniture in its two outer corners."""
+    """Return the plan of an office: rooms on both sides of a corridor along x. Each room has a door to the corridor
+    and, if it is large enough, furniture in its two outer corners."""
     if width < 4.0 or depth < 6.0:
         raise InputError(f"world: {width:g} x {depth:g} m is too small for an office, expected at least 4 x 6 m")
     rooms = max(1, round(width / ROOM_WIDTH))
@@ -143,11 +143,11 @@ def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
 
 
 def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
-    """Return an H-shaped plan with a half-turn symmetry: a corridor along x and a corridor across each of its ends. The rest of the
-    building are closed rooms.
+    """Return an H-shaped plan with a half-turn symmetry: a corridor along x and a corridor across each of its ends. The
+    rest of the building are closed rooms.
 
-    One tag hangs in the middle of the H. Two more tags hang in opposite arms at its ends. As seen from the middle, both are on
-    the left or both are on the right. The side is random.
+    One tag hangs in the middle of the H. Two more tags hang in opposite arms at its ends. As seen from the middle, both
+    are on the left or both are on the right. The side is random.
     """
     if width < 4.0 * HALL_WIDTH or depth < 3.0 * HALL_WIDTH:
         raise InputError(
@@ -171,11 +171,11 @@ def _sides(box: Segment) -> list[Segment]:
 
 
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
-    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Its walls include the sides of
-    furniture and shelves.
+    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Its walls include the sides
+    of furniture and shelves.
 
-    A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no facing. Raises
-    InputError if the plan has too few places for the tags.
+    A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no facing.
+    Raises InputError if the plan has too few places for the tags.
     """
     plan = make_plan(settings, rng)
     tags: dict[str, Tag] = {}
@@ -215,8 +215,8 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
 def _distribute(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
     """Distribute ``count`` places over ``faces`` (F, 4). Returns (count, 3): x, y, and the direction away from the face.
 
-    For each place, :data:`CANDIDATES` places are drawn uniformly along the faces. The one farthest from the previous places is
-    chosen (best-candidate sampling: Mitchell, SIGGRAPH 1991). Places behind furniture are not chosen.
+    For each place, :data:`CANDIDATES` places are drawn uniformly along the faces. The one farthest from the previous
+    places is chosen (best-candidate sampling: Mitchell, SIGGRAPH 1991). Places behind furniture are not chosen.
     """
     out = np.empty((count, 3))
     length = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])

@@ -122,8 +122,8 @@ class LocalBundle:
     pixels: Array
 
     def linearize(self, state: State) -> tuple[Array, Array, Array]:
-        """Return the whitened, robustly weighted residuals (M, 2) of the pixels, their Jacobian, and the squared whitened residuals
-        (M,) without weights."""
+        """Return the whitened, robustly weighted residuals (M, 2) of the pixels, their Jacobian, and the squared
+        whitened residuals (M,) without weights."""
         poses, tilts, points = state
         at = poses[self.frames], tilts[self.frames], points[self.owners], self.pixels
         model = self.model
@@ -185,8 +185,8 @@ class LocalBundle:
 
 
 def _seen_often(first: int, waiting: Waiting) -> list[list[PointSighting]]:
-    """Return for each point its sightings from keyframe number ``first`` on. Points with fewer than :data:`FEWEST` such sightings
-    are left out. ``waiting``: the sightings of each point that is not yet triangulated."""
+    """Return for each point its sightings from keyframe number ``first`` on. Points with fewer than :data:`FEWEST` such
+    sightings are left out. ``waiting``: the sightings of each point that is not yet triangulated."""
     return [sightings for w in waiting.values() if len(sightings := [s for s in w if s.keyframe >= first]) >= FEWEST]
 
 
@@ -195,8 +195,8 @@ def _turned(
 ) -> list[Array]:
     """Correct the rotations between the ``poses`` (3,) of consecutive keyframes, and return the corrected poses.
 
-    If a rotation differs by more than :data:`SLIPPED` from the median rotation of the common points in the images, the latter
-    replaces it. ``first``: the number of the first keyframe. ``often``: the sightings of each point.
+    If a rotation differs by more than :data:`SLIPPED` from the median rotation of the common points in the images, the
+    latter replaces it. ``first``: the number of the first keyframe. ``often``: the sightings of each point.
     """
     sides: list[dict[int, float]] = [{} for _ in poses]
     for i, sightings in enumerate(often):
@@ -216,9 +216,9 @@ def _turned(
 class KeyframeCameras:
     """Computes the camera poses of keyframes of a graph, for the triangulation of points.
 
-    ``estimated``: the estimated constants of the camera. ``twists``: the velocity (3,) of the robot at each keyframe, by number of
-    the keyframe; empty if the time offset of the camera is not estimated. ``anchored``, by number of the keyframe: True if visible
-    points of the graph determine the keyframe's pose.
+    ``estimated``: the estimated constants of the camera. ``twists``: the velocity (3,) of the robot at each keyframe,
+    by number of the keyframe; empty if the time offset of the camera is not estimated. ``anchored``, by number of the
+    keyframe: True if visible points of the graph determine the keyframe's pose.
     """
 
     def __init__(self, model: CameraModel, estimated: Estimated) -> None:
@@ -249,8 +249,8 @@ class KeyframeCameras:
         return self._moved(keyframe, guess, graph, 1.0)
 
     def at_stamp(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return the pose at the stamp of the image, from the pose ``guess`` at the time when the image was taken. ``keyframe``:
-        the number of the image's keyframe."""
+        """Return the pose at the stamp of the image, from the pose ``guess`` at the time when the image was taken.
+        ``keyframe``: the number of the image's keyframe."""
         return self._moved(keyframe, guess, graph, -1.0)
 
     def pose(self, keyframe: int, graph: Graph) -> Array:
@@ -274,9 +274,9 @@ class KeyframeCameras:
     ) -> dict[int, KeyframeCamera]:
         """Return the camera poses, by number, of the keyframes that observe the points ``names``.
 
-        ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the sightings of each point.
-        The ``slack`` of each camera pose is its error relative to the newest camera pose, in pixels. The error is small if points
-        of the graph determine both keyframes. Otherwise it is computed from the covariance of the odometry.
+        ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the sightings of each point. The
+        ``slack`` of each camera pose is its error relative to the newest camera pose, in pixels. The error is small if
+        points of the graph determine both keyframes. Otherwise it is computed from the covariance of the odometry.
         """
         slacks = self._slacks(newest, graph)
         cameras = {newest.index: self._camera(pose, newest.index, slacks, graph)}
@@ -290,9 +290,9 @@ class KeyframeCameras:
     ) -> tuple[dict[int, KeyframeCamera], Array] | None:
         """Return the adjusted camera poses of the last keyframes, by number, and the adjusted pose (3,) of ``newest``.
 
-        ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the sightings of the points that are
-        adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch.
-        Returns None if points of the graph determine the newest keyframe already, or if the adjustment fails.
+        ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the sightings of the points
+        that are adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch. Returns None
+        if points of the graph determine the newest keyframe already, or if the adjustment fails.
         """
         if self.anchored[newest.index]:
             return None

@@ -1,11 +1,11 @@
 """Loop closure without a map: recognition of points of the graph that were last observed long ago.
 
-About once a second an image is compared with those of the old points that may be visible. Features are matched without a predicted
-pose (Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The resulting pose must be on the floor. The points are
-matched again with this pose as the prediction. Enough of the visible points must match, in all parts of the image. Places in a
-building resemble each other. Therefore the poses of consecutive images must agree with the odometry between them. Their distance
-from the estimated track must be a possible drift. Geometric verification and consistency over consecutive images: Cadena,
-Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics 28(4), 2012.
+About once a second an image is compared with those of the old points that may be visible. Features are matched without
+a predicted pose (Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The resulting pose must be on
+the floor. The points are matched again with this pose as the prediction. Enough of the visible points must match, in
+all parts of the image. Places in a building resemble each other. Therefore the poses of consecutive images must agree
+with the odometry between them. Their distance from the estimated track must be a possible drift. Geometric verification
+and consistency over consecutive images: Cadena, Galvez-Lopez, Tardos, Neira, IEEE Transactions on Robotics 28(4), 2012.
 """
 
 import math
@@ -56,8 +56,8 @@ class OldPoints:
 class Image:
     """The image of a new keyframe.
 
-    ``frame``: its features. ``guess``: the predicted pose of ``keyframe`` and its covariance. ``travelled``: the path length of the
-    robot since the start [m].
+    ``frame``: its features. ``guess``: the predicted pose of ``keyframe`` and its covariance. ``travelled``: the path
+    length of the robot since the start [m].
     """
 
     frame: CameraFrame
@@ -70,8 +70,8 @@ class Image:
 class Revisit:
     """A keyframe whose image shows old points.
 
-    ``pose`` (3,): the pose of ``keyframe`` by these points. ``points`` (M,): indices of the recognized old points. ``features``
-    (M,): indices of their features in the image.
+    ``pose`` (3,): the pose of ``keyframe`` by these points. ``points`` (M,): indices of the recognized old points.
+    ``features`` (M,): indices of their features in the image.
     """
 
     keyframe: Keyframe
@@ -128,8 +128,8 @@ def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable
 
 
 def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tuple[Array, Integers, Integers] | None:
-    """Return the pose (3,) of the robot, computed from the ``points`` in an image, and the matches: indices of points (M,) and of
-    features (M,). Returns None if the pose is not on the floor, or if too few of the visible points match.
+    """Return the pose (3,) of the robot, computed from the ``points`` in an image, and the matches: indices of points
+    (M,) and of features (M,). Returns None if the pose is not on the floor, or if too few of the visible points match.
     """
     associator = Associator(points, model)
     somewhere = associator.relocalized(frame)
@@ -158,8 +158,8 @@ def _on_floor(
 
 
 def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
-    """True if the drift over a path of length ``travelled`` [m] can explain the difference between ``pose`` (3,) and the estimated
-    pose ``guess``."""
+    """True if the drift over a path of length ``travelled`` [m] can explain the difference between ``pose`` (3,) and
+    the estimated pose ``guess``."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_PER_METRE * travelled
     return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)
@@ -168,8 +168,8 @@ def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
 def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truths:
     """Return a mask (N,) of the points that may be visible and similar to their stored view.
 
-    The pose of ``camera`` may be wrong by :data:`LARGEST_SHIFT` and :data:`LARGEST_TURN`. A point is similar if it is observed from
-    about the same direction and distance as in its stored view.
+    The pose of ``camera`` may be wrong by :data:`LARGEST_SHIFT` and :data:`LARGEST_TURN`. A point is similar if it is
+    observed from about the same direction and distance as in its stored view.
     """
     rays, old_rays = points.positions - camera.position, points.positions - points.seen_from
     away, old_distance = np.linalg.norm(rays, axis=1), np.linalg.norm(old_rays, axis=1)
@@ -187,8 +187,8 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
 
 
 def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> PointMap:
-    """Return the ``old`` points with the indices ``rows`` at their newest positions, which ``current(key)`` returns. The camera
-    positions of their views are shifted by the same amount."""
+    """Return the ``old`` points with the indices ``rows`` at their newest positions, which ``current(key)`` returns.
+    The camera positions of their views are shifted by the same amount."""
     points = old.points.chosen(rows)
     positions = np.array([current(old.keys[i]) for i in rows.tolist()])
     return replace(points, positions=positions, seen_from=points.seen_from + positions - points.positions)

@@ -1,14 +1,14 @@
 """The monoSLAM filter: an EKF of a robot with wheels and one camera, and of the points that the camera observes.
 
-The filter is described by Raoui, Bouyakhf and Devy (ICINCO 2011, section 5 and Algorithm 3), "the paper" below. It derives from
-monoSLAM (Davison et al., 2007). The state of the robot has 13 values: position r^W and orientation q^WR of the robot's frame R,
-its velocity v^W in the world frame, and its turn rate w^R. The error state of the robot has 12 values, because an orientation has
-three degrees of freedom. The points that are not in the map follow. The camera is mounted on R by the rig's extrinsics, so R
-replaces the paper's camera frame.
+The filter is described by Raoui, Bouyakhf and Devy (ICINCO 2011, section 5 and Algorithm 3), "the paper" below. It
+derives from monoSLAM (Davison et al., 2007). The state of the robot has 13 values: position r^W and orientation q^WR of
+the robot's frame R, its velocity v^W in the world frame, and its turn rate w^R. The error state of the robot has 12
+values, because an orientation has three degrees of freedom. The points that are not in the map follow. The camera is
+mounted on R by the rig's extrinsics, so R replaces the paper's camera frame.
 
-Odometry replaces the paper's constant-velocity prediction of x, y and heading. Height, roll and pitch stay near those of a robot
-on the floor. Map points are searched at their predicted pixels (:mod:`.monoslam_sighting`). Other points are added to the state
-with an inverse depth (:mod:`.monoslam_map`). RFID measurements are ignored.
+Odometry replaces the paper's constant-velocity prediction of x, y and heading. Height, roll and pitch stay near those
+of a robot on the floor. Map points are searched at their predicted pixels (:mod:`.monoslam_sighting`). Other points are
+added to the state with an inverse depth (:mod:`.monoslam_map`). RFID measurements are ignored.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which the pose is unkn
 class UpdateRecord:
     """The state of the robot after an update of the filter. The final trajectory is made from these records.
 
-    ``t`` [s]: the time of the update. ``step``: the prediction from the previous record to this one.
-    ``robot``, ``constants`` (P,): the state of the robot and the corrections of the odometry's constants after the update.
+    ``t`` [s]: the time of the update. ``step``: the prediction from the previous record to this one. ``robot``,
+    ``constants`` (P,): the state of the robot and the corrections of the odometry's constants after the update.
     ``covariance`` (12 + P, 12 + P): the covariance of the errors of ``robot`` and ``constants``.
     ``relocalized``: True if the pose comes from the image alone and is independent of the previous record.
     """
@@ -119,8 +119,8 @@ def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateReco
 class MonoslamSettings(FilterSettings):
     """Settings of the monoSLAM filter.
 
-    If the filter estimates points, its update is never iterated, because iterations would make the filter inconsistent. Its final
-    trajectory is then the causal one, without smoothing.
+    If the filter estimates points, its update is never iterated, because iterations would make the filter inconsistent.
+    Its final trajectory is then the causal one, without smoothing.
     """
 
     height_sigma: Annotated[float, Field(ge=1e-5, le=1.0), InUnit("m")] = 0.005
@@ -128,8 +128,8 @@ class MonoslamSettings(FilterSettings):
     tilt_sigma: Annotated[float, Field(ge=1e-5, le=0.5), InUnit("rad")] = 0.005
     """standard deviation of roll and pitch of a robot on a floor"""
     landmarks: MapUse = "known"
-    """known: use only points of the map; extended: estimate other points too; unknown: estimate all points, the default without a
-    map"""
+    """known: use only points of the map; extended: estimate other points too; unknown: estimate all points, the default
+    without a map"""
     self_calibration: bool = True
     """whether constants of the odometry with an uncertainty in the rig are estimated"""
     max_points: Annotated[int, Field(ge=1, le=1000)] = 100
@@ -170,8 +170,8 @@ class Monoslam(Filter):
             self._wait(prior.t)
 
     def learnt(self) -> Learnt:
-        """Return the estimated constants of the odometry, and x and y of the points in the state. Points of unknown depth are left
-        out."""
+        """Return the estimated constants of the odometry, and x and y of the points in the state. Points of unknown
+        depth are left out."""
         state: SlamState | None = self._state
         if state is None:
             return Learnt()
@@ -248,8 +248,8 @@ class Monoslam(Filter):
         self._state = replace(state, image_odometry=self._odometry)
 
     def _match(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
-        """Match the image ``m`` with the points. Returns the predicted state and the matches. If points are estimated and the image
-        shows that the wheels slipped, the returned state has a larger covariance."""
+        """Match the image ``m`` with the points. Returns the predicted state and the matches. If points are estimated
+        and the image shows that the wheels slipped, the returned state has a larger covariance."""
         if self._settings.landmarks == "known" or state.image_odometry is None:
             return state, self._matcher.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.image_odometry, self._odometry))
@@ -297,8 +297,8 @@ class Monoslam(Filter):
     def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
         """Relocalize in the whole map if several images had no matches, or if the pose is very uncertain.
 
-        Returns the state, and True if relocalization succeeded. The new state then has no points, because the points belong to the
-        old pose.
+        Returns the state, and True if relocalization succeeded. The new state then has no points, because the points
+        belong to the old pose.
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
         camera = self._matcher.relocated(m, eye) if lost >= LOST_AFTER or self._is_vague(state) else None
@@ -313,8 +313,8 @@ class Monoslam(Filter):
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
-        """Return the state of a robot with the relocalized ``camera``, with the constants of ``lost_state``. Returns None if this
-        robot would not stand on the floor."""
+        """Return the state of a robot with the relocalized ``camera``, with the constants of ``lost_state``. Returns
+        None if this robot would not stand on the floor."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
@@ -328,8 +328,8 @@ class Monoslam(Filter):
         return SlamState(robot, lost_state.constants, covariance, floor=lost_state.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Update the points of the state after an image: count matches, add new points, delete bad points, and convert points of
-        known depth to x, y, z. Returns the new state."""
+        """Update the points of the state after an image: count matches, add new points, delete bad points, and convert
+        points of known depth to x, y, z. Returns the new state."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)
@@ -352,8 +352,8 @@ class Monoslam(Filter):
         return PoseEstimate(self._t, pose, covariance, "localized")
 
     def _pose_covariance(self, robot: RobotState, covariance: Array) -> Array:
-        """Return the covariance (6, 6) of the pose in ``robot``. It includes the uncertainty of the camera's mounting or, if the
-        map is unknown, of the start pose. ``covariance``: of the error state."""
+        """Return the covariance (6, 6) of the pose in ``robot``. It includes the uncertainty of the camera's mounting
+        or, if the map is unknown, of the start pose. ``covariance``: of the error state."""
         return covariance[:6, :6] + (self._mounting if self._origin is None else self._origin.of_pose(robot))
 
     def _record(self) -> UpdateRecord:

@@ -17,8 +17,8 @@ from factors.se2 import Array
 
 
 def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
-    """Return the covariance (12 + P + D, 12 + P + D) of ``posterior`` as if the update had used the invariant error state of this
-    module.
+    """Return the covariance (12 + P + D, 12 + P + D) of ``posterior`` as if the update had used the invariant error
+    state of this module.
 
     ``prior``: the state before the update. ``posterior``: the state after an ordinary update, with its covariance.
     ``scale``: the index of the odometry's constant that scales distances, or None if this constant is not estimated.
@@ -41,8 +41,8 @@ def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
 
 
 def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
-    """Return the Jacobian (12 + P + D, 3) of the error state with respect to a rotation of the world, at ``posterior`` minus at
-    ``prior``. The rows of the robot's rotation are zero."""
+    """Return the Jacobian (12 + P + D, 3) of the error state with respect to a rotation of the world, at ``posterior``
+    minus at ``prior``. The rows of the robot's rotation are zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros((len(posterior.covariance), 3))
     change[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)
@@ -58,8 +58,8 @@ def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
 
 
 def _by_scale(prior: SlamState, posterior: SlamState) -> Array:
-    """Return the derivative (12 + P + D,) of the error state with respect to the scale of the world, at ``posterior`` minus at
-    ``prior``. The row of the scale itself is zero."""
+    """Return the derivative (12 + P + D,) of the error state with respect to the scale of the world, at ``posterior``
+    minus at ``prior``. The row of the scale itself is zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros(len(posterior.covariance))
     change[SHIFT] = ours.rotation.T @ (ours.position - own.position)

@@ -38,8 +38,8 @@ def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> Sla
 
 
 def settled(state: SlamState, eye: Eye) -> SlamState:
-    """Convert points from inverse depth to x, y, z if their depth is certain enough, judged by the linearity index of Civera,
-    Davison and Montiel (2008). Returns the new state."""
+    """Convert points from inverse depth to x, y, z if their depth is certain enough, judged by the linearity index of
+    Civera, Davison and Montiel (2008). Returns the new state."""
     position, _ = eye.pose(state.robot)
     rays = [i for i, p in enumerate(state.points) if p.ray]
     if not rays:
@@ -81,8 +81,8 @@ def counted(state: SlamState, expected: Sequence[int], matched: Collection[int],
 def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
     """Delete points that are often not matched, and points with a negative inverse depth.
 
-    Returns the new state and the number of these points. If more than ``most`` points remain, the points with the oldest matches
-    are deleted too, but not counted.
+    Returns the new state and the number of these points. If more than ``most`` points remain, the points with the
+    oldest matches are deleted too, but not counted.
     """
     failed = {
         i

@@ -1,9 +1,9 @@
 """The motion model of the monoSLAM filter. Odometry predicts x, y and heading; the floor bounds height, roll and pitch.
 
-The state is that of Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on Pattern Analysis
-and Machine Intelligence 29(6), 2007. The error state has 12 values. The first six are rotation (3,) and translation (3,) of the
-pose in the robot's frame, as in ``gtsam.Pose3``. The velocity (3,) in the world frame and the turn rate (3,) in the robot's frame
-follow.
+The state is that of Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on
+Pattern Analysis and Machine Intelligence 29(6), 2007. The error state has 12 values. The first six are rotation (3,)
+and translation (3,) of the pose in the robot's frame, as in ``gtsam.Pose3``. The velocity (3,) in the world frame and
+the turn rate (3,) in the robot's frame follow.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class RobotState:
 class Step:
     """A prediction of the filter from one time to a later one.
 
-    ``robot``: the predicted state. ``transition`` (12, 12 + P): the Jacobian of its error with respect to the error of the earlier
-    state and of the P constants of the odometry. ``noise`` (12, 12): the covariance that the motion adds.
+    ``robot``: the predicted state. ``transition`` (12, 12 + P): the Jacobian of its error with respect to the error of
+    the earlier state and of the P constants of the odometry. ``noise`` (12, 12): the covariance that the motion adds.
     """
 
     robot: RobotState
@@ -69,8 +69,8 @@ class Step:
     noise: Array
 
     def carried(self, covariance: Array) -> Array:
-        """Return the covariance after the step. ``covariance`` (12 + P + D, 12 + P + D): the covariance before the step, of the
-        robot, P constants of the odometry, and D values of points."""
+        """Return the covariance after the step. ``covariance`` (12 + P + D, 12 + P + D): the covariance before the
+        step, of the robot, P constants of the odometry, and D values of points."""
         known = self.transition.shape[1]
         carried = self.transition @ covariance[:known]
         result = covariance.copy()
@@ -83,8 +83,8 @@ class Step:
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
         """Return this step followed by another step, as one step.
 
-        ``transition``, ``noise`` (12, 12): of the other step, which must not depend on the constants of the odometry. ``robot``:
-        the state after the other step.
+        ``transition``, ``noise`` (12, 12): of the other step, which must not depend on the constants of the odometry.
+        ``robot``: the state after the other step.
         """
         return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
 
@@ -109,8 +109,8 @@ class Origin:
         return np.asarray(adjoint @ self.covariance @ adjoint.T)
 
     def of_point(self, point: Array) -> Array:
-        """Return the part of the covariance (3, 3) of a ``point`` (3,) in the world frame that comes from the uncertain start
-        pose."""
+        """Return the part of the covariance (3, 3) of a ``point`` (3,) in the world frame that comes from the uncertain
+        start pose."""
         rotation = self.robot.rotation
         jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
         return np.asarray(jacobian @ self.covariance @ jacobian.T)
@@ -124,9 +124,9 @@ def standstill(robot: RobotState) -> Step:
 def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: Array, dt: float) -> Step:
     """Return the step of a robot that moves as measured by odometry. The odometry also sets its velocity and turn rate.
 
-    ``robot``: the state at the start. ``delta`` (3,): pose of the end in the frame of the start, as x [m], y [m], heading [rad].
-    ``covariance`` (3, 3): of a perturbation of the end in its own frame. ``by_constants`` (3, P): the derivative of this
-    perturbation by the P constants of the odometry. ``dt`` [s]: the duration.
+    ``robot``: the state at the start. ``delta`` (3,): pose of the end in the frame of the start, as x [m], y [m],
+    heading [rad]. ``covariance`` (3, 3): of a perturbation of the end in its own frame. ``by_constants`` (3, P): the
+    derivative of this perturbation by the P constants of the odometry. ``dt`` [s]: the duration.
     """
     dt = max(dt, SHORTEST)
     turn, ahead = about_z(float(delta[2])), np.array((delta[0], delta[1], 0.0))

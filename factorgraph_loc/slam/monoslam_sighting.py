@@ -1,11 +1,11 @@
 """Data association of the monoSLAM filter: matching of pixels of an image with points of the map or of the state.
 
 Active search: a point of the state is searched in the 99 % ellipse of its innovation (Davison et al., 2007, see
-:mod:`~factorgraph_loc.slam.monoslam_motion`, section III.E). Outliers are rejected by consensus: each single match corrects the
-prediction, and the correction that most other matches agree with defines the inliers (Civera, Grasa, Davison, Montiel, "1-Point
-RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010). The corrected pixels are computed from the innovation
-covariance. This is fast enough to try all matches, not a random sample. Finally each inlier is predicted from all other inliers.
-It is rejected if it is outside the gate of this prediction.
+:mod:`~factorgraph_loc.slam.monoslam_motion`, section III.E). Outliers are rejected by consensus: each single match
+corrects the prediction, and the correction that most other matches agree with defines the inliers (Civera, Grasa,
+Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5), 2010). The corrected pixels are
+computed from the innovation covariance. This is fast enough to try all matches, not a random sample. Finally each
+inlier is predicted from all other inliers. It is rejected if it is outside the gate of this prediction.
 """
 
 from collections.abc import Sequence
@@ -120,8 +120,8 @@ class Match:
 class FeatureMatcher:
     """Matches the pixels of an image with points of the map and of the filter's state.
 
-    ``use``: the points to match. ``known`` matches points of the map only, ``unknown`` points of the state only, ``extended``
-    both.
+    ``use``: the points to match. ``known`` matches points of the map only, ``unknown`` points of the state only,
+    ``extended`` both.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics, use: MapUse) -> None:
@@ -150,8 +150,8 @@ class FeatureMatcher:
     ) -> tuple[SlamState, Match]:
         """Return the state and the result of :meth:`match`. If the pixels show that the wheels slipped, the state is less certain.
 
-        ``added`` (3, 3): the covariance of x, y and heading that slip adds. ``rarity``: minus the logarithm of the probability of
-        slip. The wheels slipped if the log-likelihood ratio of the pixels exceeds ``rarity``.
+        ``added`` (3, 3): the covariance of x, y and heading that slip adds. ``rarity``: minus the logarithm of the
+        probability of slip. The wheels slipped if the log-likelihood ratio of the pixels exceeds ``rarity``.
         """
         slipped, diagnostics = state.widened(added), self._diagnostics
         added_before, noted = diagnostics.added, diagnostics.record()
@@ -167,9 +167,9 @@ class FeatureMatcher:
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
         """Return the rows of an image that may become new points of the state.
 
-        A feature may become a point if it is not matched, belongs to one of ``tracks`` (the feature tracks of the previous image),
-        and is far enough from matched and predicted pixels. A named pixel may become a point if its name is neither in the map nor
-        in the state.
+        A feature may become a point if it is not matched, belongs to one of ``tracks`` (the feature tracks of the
+        previous image), and is far enough from matched and predicted pixels. A named pixel may become a point if its
+        name is neither in the map nor in the state.
         """
         if m.frame is None:
             known_names = {p.name for p in state.points}

@@ -1,8 +1,8 @@
 """The state of the monoSLAM filter (robot and points), predicted pixels, and the Kalman update.
 
-The error state has 12 values of the robot, P constants of the odometry, and D values of points. The update is in covariance form.
-Only the robot's pose and the observed points have columns in the Jacobian of the innovation. The noise of outliers is increased,
-as in :mod:`~factors.update`. K is the number of pixels.
+The error state has 12 values of the robot, P constants of the odometry, and D values of points. The update is in
+covariance form. Only the robot's pose and the observed points have columns in the Jacobian of the innovation. The noise
+of outliers is increased, as in :mod:`~factors.update`. K is the number of pixels.
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ class SlamState:
 
     ``robot``: the state of the robot. ``constants`` (P,): corrections of the odometry's constants.
     ``covariance`` (12 + P + D, 12 + P + D): the covariance of the error state.
-    ``points``, ``values`` (D,): the points of the state, and their values one point after the other.
-    ``tracks``: the numbers of the feature tracks of the newest image. ``met``: the number of points added since the start.
-    ``lost``: the number of consecutive images without a match. ``image_odometry``: the odometry at the newest image.
-    ``floor``: the estimated standard deviation of the robot's tilt, or None if it is not estimated.
+    ``points``, ``values`` (D,): the points of the state, and their values one point after the other. ``tracks``: the
+    numbers of the feature tracks of the newest image. ``met``: the number of points added since the start. ``lost``:
+    the number of consecutive images without a match. ``image_odometry``: the odometry at the newest image. ``floor``:
+    the estimated standard deviation of the robot's tilt, or None if it is not estimated.
     """
 
     robot: RobotState
@@ -103,8 +103,8 @@ class SlamState:
         )
 
     def sway(self, usual: float) -> tuple[float, float]:
-        """Return the standard deviation of the tilt [rad] and its time constant [s]. ``usual``: the standard deviation if none is
-        estimated."""
+        """Return the standard deviation of the tilt [rad] and its time constant [s]. ``usual``: the standard deviation
+        if none is estimated."""
         return (usual, SETTLING) if self.floor is None else (self.floor.sigma, UNEVEN)
 
     def widened(self, planar: Array) -> SlamState:
@@ -137,8 +137,8 @@ def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
 
 
 def of_mounting(camera: CameraSettings) -> Array:
-    """Return the covariance (6, 6) of the robot's pose that the uncertainty of the camera's mounting causes, in the robot's
-    frame."""
+    """Return the covariance (6, 6) of the robot's pose that the uncertainty of the camera's mounting causes, in the
+    robot's frame."""
     u, lever = camera.uncertainty, np.eye(6)
     lever[SHIFT, TURN] = cross(camera.model().position)
     return (lever * np.square((u.roll, u.pitch, u.yaw, u.x, u.y, u.z))) @ lever.T
@@ -148,8 +148,8 @@ def of_mounting(camera: CameraSettings) -> Array:
 class Sights:
     """The predicted pixels of K points, with Jacobians.
 
-    ``pixels`` (K, 2) [px]. ``depths`` (K,): in front of the camera if positive; scaled by the inverse depth where the point has
-    one.
+    ``pixels`` (K, 2) [px]. ``depths`` (K,): in front of the camera if positive; scaled by the inverse depth where the
+    point has one.
     ``by_pose`` (K, 2, 6): Jacobian with respect to the robot's pose. ``by_point`` (K, 2, 6): with respect to the point's values.
     ``starts`` (K,): index of the point's first value in the error state. ``sizes`` (K,): number of the point's values; 0 for a
     point of the map, which is not in the state. ``noise`` (K, 2, 2) [px^2]: covariance of pixel noise and map errors.
@@ -170,8 +170,8 @@ class Sights:
         return Sights(*(getattr(self, name)[rows] for name in Sights.__dataclass_fields__))
 
     def columns(self) -> tuple[Integers, Array]:
-        """Return the indices (C,) of the values of the error state that the pixels depend on, and the Jacobian (2K, C) of the
-        pixels with respect to these values."""
+        """Return the indices (C,) of the values of the error state that the pixels depend on, and the Jacobian (2K, C)
+        of the pixels with respect to these values."""
         own = np.unique(self.starts[self.sizes > 0], return_index=True, return_inverse=True)
         where, first, which = own
         sizes = self.sizes[self.sizes > 0][first]
@@ -188,8 +188,8 @@ class Sights:
 class Eye:
     """The camera on the robot. It predicts the pixels of points from a state.
 
-    ``model``: its calibration. ``lift`` (6, 6): Jacobian of a perturbation of the camera's pose with respect to a perturbation of
-    the robot's pose, each in its own frame.
+    ``model``: its calibration. ``lift`` (6, 6): Jacobian of a perturbation of the camera's pose with respect to a
+    perturbation of the robot's pose, each in its own frame.
     """
 
     model: CameraModel
@@ -208,8 +208,8 @@ class Eye:
         return CameraPose(*self.pose(state.robot), self.lift @ state.covariance[:POSE, :POSE] @ self.lift.T)
 
     def known(self, robot: RobotState, points: Array, covariances: Array | None) -> Sights:
-        """Return the predicted pixels of map points at the state ``robot``. ``points`` (K, 3), ``covariances`` (K, 3, 3): their
-        positions and the covariances of these; None means exact positions."""
+        """Return the predicted pixels of map points at the state ``robot``. ``points`` (K, 3), ``covariances`` (K, 3,
+        3): their positions and the covariances of these; None means exact positions."""
         position, rotation = self.pose(robot)
         pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]
@@ -257,8 +257,8 @@ class Innovation:
     """The covariance of K predicted pixels, for a Kalman update.
 
     ``carried`` (12 + P + D, 2K): the covariance between the error state and the predicted pixels.
-    ``jacobian`` (2K, C), ``columns`` (C,): the Jacobian of the pixels, and the indices of its columns in the error state.
-    ``covariance`` (2K, 2K) [px^2]: the covariance of the predicted pixels, without pixel noise.
+    ``jacobian`` (2K, C), ``columns`` (C,): the Jacobian of the pixels, and the indices of its columns in the error
+    state. ``covariance`` (2K, 2K) [px^2]: the covariance of the predicted pixels, without pixel noise.
     """
 
     carried: Array
@@ -291,8 +291,8 @@ class Innovation:
         return positive.root(self.total(noise))
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
-        """Return L, the Cholesky factor (2K, 2K) of the innovation covariance with ``noise`` (K, 2, 2), and M, which is L^-1 times
-        the transpose of ``carried``. The gain of the update is the transpose of M times L^-1."""
+        """Return L, the Cholesky factor (2K, 2K) of the innovation covariance with ``noise`` (K, 2, 2), and M, which is
+        L^-1 times the transpose of ``carried``. The gain of the update is the transpose of M times L^-1."""
         root = self.root(noise)
         return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
 

@@ -1,13 +1,13 @@
 """Detection of feature tracks on moving objects, such as people, by comparison with the wheel odometry.
 
-The odometry predicts the pixel of a static point, up to the unknown distance of the point. Tracks that do not fit this prediction
-may be on a moving object. Images up to :data:`MAX_TIME` apart are compared, because a moving object may agree with the odometry
-for a short time.
+The odometry predicts the pixel of a static point, up to the unknown distance of the point. Tracks that do not fit this
+prediction may be on a moving object. Images up to :data:`MAX_TIME` apart are compared, because a moving object may
+agree with the odometry for a short time.
 
-A slip of the wheels also makes tracks disagree with the odometry. In this case all static points move in the image as if the robot
-had turned by another angle. The tracks that happen to agree with the odometry then agree with this other turn, too. But if some
-tracks agree with the odometry and not with the other turn, the disagreeing tracks belong to a moving object. This holds even if
-they are the majority.
+A slip of the wheels also makes tracks disagree with the odometry. In this case all static points move in the image as
+if the robot had turned by another angle. The tracks that happen to agree with the odometry then agree with this other
+turn, too. But if some tracks agree with the odometry and not with the other turn, the disagreeing tracks belong to a
+moving object. This holds even if they are the majority.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -46,15 +46,15 @@ class MovingThings:
         self._doubts = False  # True while the newest image has tracks on moving objects
 
     def is_static(self, name: Hashable) -> bool:
-        """True if the feature track ``name`` is on a static object. While the image shows moving objects, only tracks that agreed
-        with the odometry count as static."""
+        """True if the feature track ``name`` is on a static object. While the image shows moving objects, only tracks
+        that agreed with the odometry count as static."""
         return name not in self.moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
         """Update the classification with a new image.
 
-        ``keyframe``: the keyframe of the image. ``names``: its K tracks. ``pixels`` (K, 2): their pixels. ``graph``: supplies the
-        odometry between keyframes.
+        ``keyframe``: the keyframe of the image. ``names``: its K tracks. ``pixels`` (K, 2): their pixels. ``graph``:
+        supplies the odometry between keyframes.
         """
         new_pixels = dict(zip(names, pixels, strict=True))
         self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]
@@ -68,8 +68,8 @@ class MovingThings:
         self._doubts = not self.moving.isdisjoint(names)
 
     def _compare(self, old: Mapping[Hashable, Array], new: Mapping[Hashable, Array], step: Increment) -> None:
-        """Update the classification with two images. ``old``, ``new``: the pixel of each track by name. ``step``: the motion of the
-        odometry between the images."""
+        """Update the classification with two images. ``old``, ``new``: the pixel of each track by name. ``step``: the
+        motion of the odometry between the images."""
         common = [name for name in new if name in old]
         if not common:
             return
@@ -85,13 +85,12 @@ class MovingThings:
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
-    """Search another rotation of the robot that explains the feature tracks that disagree with the odometry. Returns a mask (K,) of
-    the tracks that fit this rotation.
+    """Search another rotation of the robot that explains the feature tracks that disagree with the odometry. Returns a
+    mask (K,) of the tracks that fit this rotation.
 
-    ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion of the odometry between the images.
-    ``right`` (K,): mask of the tracks that agree with ``step``.
-    The result is False everywhere if most tracks agree with ``step``, or if no rotation explains the fraction :data:`EXPLAINED` of
-    the disagreeing tracks.
+    ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion of the odometry between the
+    images. ``right`` (K,): mask of the tracks that agree with ``step``. The result is False everywhere if most tracks
+    agree with ``step``, or if no rotation explains the fraction :data:`EXPLAINED` of the disagreeing tracks.
     """
     best, unexplained = right, ~right
     if 2 * np.count_nonzero(unexplained) >= len(right):
@@ -110,9 +109,9 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
 def fitting(model: CameraModel, first: Array, second: Array, step: Increment) -> Truths:
     """Return a mask (K,) of the tracks that fit a motion ``step`` of the robot, if the distance of the point is chosen freely.
 
-    ``first``, ``second`` (K, 2): the pixels of K tracks before and after the motion. Two distances are tried. The first is where
-    the rays are nearest to each other. The second is a Gauss-Newton step from there, which considers the covariance of the
-    motion.
+    ``first``, ``second`` (K, 2): the pixels of K tracks before and after the motion. Two distances are tried. The first
+    is where the rays are nearest to each other. The second is a Gauss-Newton step from there, which considers the
+    covariance of the motion.
     """
     first_rays, second_rays = (rays(model, pixels) @ model.rotation.T for pixels in (first, second))
     camera = lifted(model, step.delta, step.covariance)

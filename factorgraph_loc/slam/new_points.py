@@ -1,8 +1,8 @@
 """Delayed initialization of points that the map lacks: sightings are collected until they determine the position of the point.
 
-A sighting is one observation of a point from a keyframe. At least :data:`FEWEST` sightings are needed. Their parallax must be large
-compared with the errors of pixels and poses. Their rays must intersect in front of the camera, with small residuals. A sighting
-that contradicts the other sightings is dropped.
+A sighting is one observation of a point from a keyframe. At least :data:`FEWEST` sightings are needed. Their parallax
+must be large compared with the errors of pixels and poses. Their rays must intersect in front of the camera, with small
+residuals. A sighting that contradicts the other sightings is dropped.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ UPRIGHT = np.zeros(2)
 
 @dataclass(frozen=True, slots=True)
 class PointSighting:
-    """An observation of a point from a keyframe. ``keyframe``: its number. ``pixel`` (2,): the observed pixel. ``ray`` (3,): the
-    unit vector from the camera to the point, in the camera frame."""
+    """An observation of a point from a keyframe. ``keyframe``: its number. ``pixel`` (2,): the observed pixel. ``ray``
+    (3,): the unit vector from the camera to the point, in the camera frame."""
 
     keyframe: int
     pixel: Array
@@ -47,8 +47,8 @@ def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Point
 
 @dataclass(frozen=True)
 class ChosenSightings:
-    """N sightings from a keyframe. ``rows``: their rows in the measurement. ``names``: the name of each point, or the number of its
-    track. ``pixels`` (N, 2): the observed pixels."""
+    """N sightings from a keyframe. ``rows``: their rows in the measurement. ``names``: the name of each point, or the
+    number of its track. ``pixels`` (N, 2): the observed pixels."""
 
     rows: list[int]
     names: list[Hashable]
@@ -60,8 +60,8 @@ class ChosenSightings:
 class KeyframeCamera:
     """The camera pose of a keyframe.
 
-    ``centre`` (3,), ``rotation`` (3, 3): position and orientation of the camera in the world frame. ``slack`` [px]: the pixel error
-    that the uncertainty of the pose causes.
+    ``centre`` (3,), ``rotation`` (3, 3): position and orientation of the camera in the world frame. ``slack`` [px]: the
+    pixel error that the uncertainty of the pose causes.
     """
 
     centre: Array
@@ -70,8 +70,8 @@ class KeyframeCamera:
 
     @classmethod
     def of(cls, model: CameraModel, pose: Array, slack: float, tilt: Array = UPRIGHT) -> KeyframeCamera:
-        """Return the camera pose of a robot at the planar ``pose`` (3,) with ``tilt`` (2,), its roll and pitch [rad]. ``slack``
-        [px]: the pixel error that the uncertainty of the pose causes."""
+        """Return the camera pose of a robot at the planar ``pose`` (3,) with ``tilt`` (2,), its roll and pitch [rad].
+        ``slack`` [px]: the pixel error that the uncertainty of the pose causes."""
         return cls(*reprojection.camera_pose(model, pose, tilt), slack)
 
 
@@ -79,8 +79,8 @@ class KeyframeCamera:
 class TriangulatedPoint:
     """A triangulated point.
 
-    ``position`` (3,): in the world frame. ``covariance`` (3, 3): of the position, if the camera poses are exact. ``squared`` (M,):
-    squared whitened residuals of the sightings.
+    ``position`` (3,): in the world frame. ``covariance`` (3, 3): of the position, if the camera poses are exact.
+    ``squared`` (M,): squared whitened residuals of the sightings.
     """
 
     position: Array
@@ -113,8 +113,8 @@ class NewPoints:
         return {name: sightings for name, sightings in self.waiting.items() if trusted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
-        """Drop the points ``wrong``, and all points without a sighting in the last :data:`PATIENCE` keyframes before number
-        ``keyframe``."""
+        """Drop the points ``wrong``, and all points without a sighting in the last :data:`PATIENCE` keyframes before
+        number ``keyframe``."""
         since = keyframe - PATIENCE
         self.waiting = {k: v for k, v in self.waiting.items() if v[-1].keyframe >= since and k not in wrong}
 
@@ -123,9 +123,9 @@ class NewPoints:
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
         """Triangulate the points ``names``. The sightings of a triangulated point are returned and no longer collected.
 
-        ``places``: a function that returns the camera pose of a keyframe by number, or None for a keyframe that accepts no factors.
-        ``most``: the largest number of results.
-        Returns for each triangulated point its name, the point, and the consistent sightings.
+        ``places``: a function that returns the camera pose of a keyframe by number, or None for a keyframe that accepts
+        no factors. ``most``: the largest number of results. Returns for each triangulated point its name, the point,
+        and the consistent sightings.
         """
         determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}
@@ -164,8 +164,8 @@ def agreed(
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
     """Triangulate a point without outliers. Returns the point and its consistent sightings.
 
-    ``places``: the camera pose of each of the ``sightings``. While the residuals are too large, the sighting is removed whose
-    removal leaves the smallest residuals. Returns None if the remaining sightings do not determine the point.
+    ``places``: the camera pose of each of the ``sightings``. While the residuals are too large, the sighting is removed
+    whose removal leaves the smallest residuals. Returns None if the remaining sightings do not determine the point.
     """
     sightings, places = list(sightings), list(places)
     point = triangulate(model, sightings, places)

@@ -1,9 +1,9 @@
 """Views of the points of a graph. A view is the descriptor of a point in one image, with the position of the camera.
 
-The last view of a point is needed to find the point again after its track was lost. Earlier views are stored for the map. A lost
-point is searched in the ellipse predicted from pose and point. The feature with the nearest descriptor is accepted if it is clearly
-nearer than the second (:func:`factorgraph_loc.vision.matching.match`). Wrong matches are rejected later, by consensus with other
-points.
+The last view of a point is needed to find the point again after its track was lost. Earlier views are stored for the
+map. A lost point is searched in the ellipse predicted from pose and point. The feature with the nearest descriptor is
+accepted if it is clearly nearer than the second (:func:`factorgraph_loc.vision.matching.match`). Wrong matches are
+rejected later, by consensus with other points.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -82,8 +82,8 @@ class PointViews:
     ) -> list[tuple[int, int]]:
         """Search lost points in an image. Returns pairs of an index in ``points`` and a row of ``frame``.
 
-        ``camera``: the predicted camera pose. ``points``: keys of N points. ``positions`` (N, 3): their estimates. ``rows``: the
-        features of ``frame`` that may be matched.
+        ``camera``: the predicted camera pose. ``points``: keys of N points. ``positions`` (N, 3): their estimates.
+        ``rows``: the features of ``frame`` that may be matched.
         """
         if not len(points) or not rows:
             return []
@@ -120,8 +120,8 @@ class PointViews:
         """Return the map ``points`` with all stored views, at the final poses of their keyframes.
 
         ``keys``: the keys of the points. ``values``: final estimates by key, which include the poses of keyframes.
-        ``pose_covariances``: body-frame covariances of these poses by key. The error of a pose is common to all points that were
-        observed from it.
+        ``pose_covariances``: body-frame covariances of these poses by key. The error of a pose is common to all points
+        that were observed from it.
         """
         rows = [
             (i, view)

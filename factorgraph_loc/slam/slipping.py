@@ -1,9 +1,9 @@
 """Detection of wheel slip between two keyframes, from recently observed points of the graph.
 
-If the wheels slipped, the odometry between the keyframes gets a larger noise. The noise is chosen once, before the keyframe is
-added to the graph. The alternative is a factor that chooses the likelier of two noises in each iteration (Olson, Agarwal,
-International Journal of Robotics Research 32(7), 2013). Such a factor has many optima, and a graph of points converges to wrong
-ones.
+If the wheels slipped, the odometry between the keyframes gets a larger noise. The noise is chosen once, before the
+keyframe is added to the graph. The alternative is a factor that chooses the likelier of two noises in each iteration
+(Olson, Agarwal, International Journal of Robotics Research 32(7), 2013). Such a factor has many optima, and a graph of
+points converges to wrong ones.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,9 +35,9 @@ def unless_slipped(
     """Return the predicted pose of a new keyframe. If the image shows that the wheels slipped, its covariance is increased.
 
     The motion ``keyframe.from_previous`` since the previous keyframe then also gets a larger covariance, in place.
-    ``guess``: the predicted pose and its covariance. ``slip``: a function of a motion. It returns the covariance (3, 3) that slip
-    adds, and minus the logarithm of the probability of slip. ``observed``: the positions (K, 3) of observed points, their pixels
-    (K, 2), the covariances (K, 3, 3) of the positions, and those (K, 2, 2) of the pixels [px^2].
+    ``guess``: the predicted pose and its covariance. ``slip``: a function of a motion. It returns the covariance (3, 3)
+    that slip adds, and minus the logarithm of the probability of slip. ``observed``: the positions (K, 3) of observed
+    points, their pixels (K, 2), the covariances (K, 3, 3) of the positions, and those (K, 2, 2) of the pixels [px^2].
     """
     step = keyframe.from_previous
     if step is None or keyframe.factor is not None or len(observed[0]) < ENOUGH:
@@ -52,8 +52,8 @@ def unless_slipped(
 def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
     """Return the covariance (3, 3) of the odometry from an earlier keyframe to the ``newest`` one, including detected slip.
 
-    The earlier keyframe is the last one at or before the time ``t`` [s], but at most ``most`` keyframes before ``newest``.
-    Returns None if there is no odometry from the keyframe before ``newest``.
+    The earlier keyframe is the last one at or before the time ``t`` [s], but at most ``most`` keyframes before
+    ``newest``. Returns None if there is no odometry from the keyframe before ``newest``.
     """
     steps: list[Increment] = []
     while newest.t > t and newest.from_previous is not None and len(steps) < most:
@@ -84,7 +84,7 @@ def _evidence(
 
 
 def more_probable(off: Array, covariances: tuple[Array, Array]) -> float:
-    """Return the log-likelihood ratio of an error ``off`` (D,) for the second of two ``covariances`` (D, D), relative to the
-    first."""
+    """Return the log-likelihood ratio of an error ``off`` (D,) for the second of two ``covariances`` (D, D), relative
+    to the first."""
     fits = [positive.squared(off, covariance) + np.linalg.slogdet(covariance)[1] for covariance in covariances]
     return 0.5 * float(fits[0] - fits[1])

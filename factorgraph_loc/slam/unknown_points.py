@@ -1,9 +1,9 @@
 """Points that the map lacks, as variables of a factor graph.
 
-Their pixels are added to the graph at keyframes only. The sightings of a point are collected first (:mod:`.new_points`). Once they
-determine the point, it becomes a variable, and each of its sightings becomes a factor. From then on the inlier pixels of the point
-correct the newest keyframe and become factors too. If a track is an outlier :data:`STRIKES` times in a row, it is no longer used
-for the point.
+Their pixels are added to the graph at keyframes only. The sightings of a point are collected first
+(:mod:`.new_points`). Once they determine the point, it becomes a variable, and each of its sightings becomes a factor.
+From then on the inlier pixels of the point correct the newest keyframe and become factors too. If a track is an outlier
+:data:`STRIKES` times in a row, it is no longer used for the point.
 """
 
 import math
@@ -63,8 +63,8 @@ class _Point:
 
 @dataclass(frozen=True)
 class _NewImage:
-    """The image ``m`` of a new keyframe. ``addition``: receives new factors and variables of ``graph``. ``model``: the camera, with
-    the current estimates of its constants."""
+    """The image ``m`` of a new keyframe. ``addition``: receives new factors and variables of ``graph``. ``model``: the
+    camera, with the current estimates of its constants."""
 
     m: Pixels
     keyframe: Keyframe
@@ -136,8 +136,8 @@ class UnknownPoints(Mapper):
     def _observe_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
-        """Add the observations of points of the graph among the sightings ``chosen``. Returns the pose ``guess``, corrected by
-        these points, and their number.
+        """Add the observations of points of the graph among the sightings ``chosen``. Returns the pose ``guess``,
+        corrected by these points, and their number.
 
         ``certain``: the rows whose points were recognized by a loop closure.
         """
@@ -192,8 +192,8 @@ class UnknownPoints(Mapper):
         return pose
 
     def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
-        """Return the name of the point in each row of the image. A point of a feature has the number of the feature track in which
-        it was first observed. Lost points are searched, and keep their name in another track."""
+        """Return the name of the point in each row of the image. A point of a feature has the number of the feature
+        track in which it was first observed. Lost points are searched, and keep their name in another track."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
@@ -282,8 +282,8 @@ class UnknownPoints(Mapper):
         self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def forget(self, first: Keyframe) -> list[int]:
-        """Delete the data of keyframes before ``first``, and of removed points that were not observed from ``first`` or later.
-        Returns the keys of these points."""
+        """Delete the data of keyframes before ``first``, and of removed points that were not observed from ``first`` or
+        later. Returns the keys of these points."""
         forgotten = [point.key for point in self._gone if point.last < first.t]
         self._gone = [point for point in self._gone if point.last >= first.t]
         self._views.forget(forgotten)
@@ -304,8 +304,8 @@ class UnknownPoints(Mapper):
         return self._views.settled(points, tuple(keys.values()), values, covariances)
 
     def _add_tilt(self, image: _NewImage, tilt: Array, sigma: float) -> None:
-        """Add the robot's ``tilt`` (2,) at the keyframe of ``image`` as a variable, with a prior of mean zero and standard
-        deviation ``sigma`` [rad]."""
+        """Add the robot's ``tilt`` (2,) at the keyframe of ``image`` as a variable, with a prior of mean zero and
+        standard deviation ``sigma`` [rad]."""
         keyframe, graph = image.keyframe, image.graph
         key = tilt_key(keyframe.index)
         if key in graph.values:
@@ -318,12 +318,12 @@ class UnknownPoints(Mapper):
     def _corrected(
         self, image: _NewImage, points: list[_Point], pixels: Array, guess: Guess, known: Truths
     ) -> tuple[Guess, Array, float, Truths]:
-        """Correct the pose ``guess`` by ``points`` of the graph that are observed at ``pixels``. Returns pose, tilt (2,) of the
-        robot, prior standard deviation of the tilt, and a mask of the inliers.
+        """Correct the pose ``guess`` by ``points`` of the graph that are observed at ``pixels``. Returns pose, tilt
+        (2,) of the robot, prior standard deviation of the tilt, and a mask of the inliers.
 
-        Recent points and old points are tested separately, because the track has drifted since the old ones. A few points cannot
-        confirm each other. They are used only if they have names, because a wrong feature may agree with an uncertain pose.
-        ``known``: mask of the points recognized by a loop closure.
+        Recent points and old points are tested separately, because the track has drifted since the old ones. A few
+        points cannot confirm each other. They are used only if they have names, because a wrong feature may agree with
+        an uncertain pose. ``known``: mask of the points recognized by a loop closure.
         """
         model, keyframe, graph, named = image.model, image.keyframe, image.graph, image.m.names is not None
         sigma = self._floor.sigma

@@ -1,9 +1,9 @@
 """Matching of an image's features to the points of a map, with or without a predicted camera pose.
 
-With a prediction, a point is searched at its predicted pixel. Points that were never observed from a similar viewpoint are left
-out, because they may be occluded. The most similar feature in the gate of a point is accepted if it passes the ratio test (Lowe,
-IJCV 60, 2004, section 7.1). The ratio test compares different points only, because all views of one point are similar. All matches
-must agree on one pose (:mod:`~factorgraph_loc.vision.consensus`).
+With a prediction, a point is searched at its predicted pixel. Points that were never observed from a similar viewpoint
+are left out, because they may be occluded. The most similar feature in the gate of a point is accepted if it passes the
+ratio test (Lowe, IJCV 60, 2004, section 7.1). The ratio test compares different points only, because all views of one
+point are similar. All matches must agree on one pose (:mod:`~factorgraph_loc.vision.consensus`).
 
 Without a prediction, the image is compared with a whole small map, or with the most similar keyframes of a large one
 (:mod:`~factorgraph_loc.vision.relocalization`).
@@ -52,8 +52,8 @@ FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # relocalization: least number and least fr
 class Associations:
     """M matches between points of a map and features of an image.
 
-    ``points`` (M,): indices of the map's points. ``features`` (M,): indices of the image's features. ``expected``: the number of
-    points that should be visible. ``rejected``: the number of matches that were rejected as outliers.
+    ``points`` (M,): indices of the map's points. ``features`` (M,): indices of the image's features. ``expected``: the
+    number of points that should be visible. ``rejected``: the number of matches that were rejected as outliers.
     """
 
     points: Integers
@@ -94,8 +94,8 @@ class Associator:
     ) -> Associations:
         """Match an image to the map with a predicted pose of the camera.
 
-        ``model``: the current estimate of the camera's calibration, if it differs from the rig's. ``focal``: the standard deviation
-        of the logarithm of the focal length.
+        ``model``: the current estimate of the camera's calibration, if it differs from the rig's. ``focal``: the
+        standard deviation of the logarithm of the focal length.
         """
         model = self._model if model is None else model
         position, rotation = camera.position, camera.rotation
@@ -196,8 +196,8 @@ class Associator:
         return np.asarray(distances(pairs, begins, views, self._numbers, _numbers(frame_descriptors)))
 
     def _cost_limit(self) -> float:
-        """Return the largest distance of descriptors that a match may have. Only the fraction :data:`CHANCE` of pairs of different
-        points is more similar."""
+        """Return the largest distance of descriptors that a match may have. Only the fraction :data:`CHANCE` of pairs
+        of different points is more similar."""
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf
         rows = np.linspace(0, len(self._owners) - 1, min(SAMPLED, len(self._owners))).astype(np.int64)
@@ -231,9 +231,9 @@ def _gates(covariances: Array) -> tuple[Array, Array]:
 def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
     """Return the pairs (N, 2) of a point and a feature, as indices, where the feature is inside the gate of the point.
 
-    ``predicted`` (C, 2) [px]: the predicted pixels of the points. ``inverses`` (C, 2, 2): the matrices A of the elliptic gates
-    x'Ax = 1. ``reaches`` (C,) [px]: the largest radii of the gates. ``features`` (K, 2) [px]: the pixels of the features.
-    ``cell`` [px]: the size of the grid cells by which the features are sorted for speed.
+    ``predicted`` (C, 2) [px]: the predicted pixels of the points. ``inverses`` (C, 2, 2): the matrices A of the
+    elliptic gates x'Ax = 1. ``reaches`` (C,) [px]: the largest radii of the gates. ``features`` (K, 2) [px]: the pixels
+    of the features. ``cell`` [px]: the size of the grid cells by which the features are sorted for speed.
     """
     low_x, low_y = high_x, high_y = features[0, 0], features[0, 1]
     for i in range(1, len(features)):
@@ -280,8 +280,8 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
 @compiled(fastmath=True)
 def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any) -> Array:
-    """Return for each pair of point and feature the squared distance (N,) between the feature's descriptor and the most similar
-    view of the point. For descriptors of bits this is the Hamming distance.
+    """Return for each pair of point and feature the squared distance (N,) between the feature's descriptor and the most
+    similar view of the point. For descriptors of bits this is the Hamming distance.
 
     ``pairs`` (N, 2): indices of point and feature. ``views[begins[i]:begins[i + 1]]``: indices of the views of point i.
     ``known`` (V, D): the descriptors of the map's views. ``frame_descriptors`` (K, D): the descriptors of the features.
@@ -306,10 +306,10 @@ def clear_pairs(
 ) -> Integers:
     """Return the indices of the pairs that are mutually best and pass the ratio test.
 
-    ``pairs`` (N, 2): indices of point and feature. ``costs`` (N,): distances of their descriptors. ``predicted`` (C, 2),
-    ``features`` (K, 2) [px]: the pixels of points and features.
-    A pair passes the ratio test if its cost is below ``ratio`` times the costs of the other pairs with the same point or feature.
-    Other pairs less than ``apart`` [px] away are not compared, because they may show the same point.
+    ``pairs`` (N, 2): indices of point and feature. ``costs`` (N,): distances of their descriptors. ``predicted`` (C,
+    2), ``features`` (K, 2) [px]: the pixels of points and features. A pair passes the ratio test if its cost is below
+    ``ratio`` times the costs of the other pairs with the same point or feature. Other pairs less than ``apart`` [px]
+    away are not compared, because they may show the same point.
     """
     every = np.arange(len(pairs))
     kept = np.ones(len(pairs), dtype=bool)

@@ -1,8 +1,8 @@
 """Extractor of the colour features of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011).
 
-Images are converted to the Gaussian colour model: intensity and two opponent colours, each a linear combination of red, green and
-blue. For RGB cameras this approximates the response of a Gaussian receptive field to a spectrum and its first two derivatives
-(Geusebroek, van den Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5).
+Images are converted to the Gaussian colour model: intensity and two opponent colours, each a linear combination of red,
+green and blue. For RGB cameras this approximates the response of a Gaussian receptive field to a spectrum and its first
+two derivatives (Geusebroek, van den Boomgaard, Smeulders, Geerts, "Color invariance", IEEE TPAMI 23(12), 2001, eq. 5).
 """
 
 from dataclasses import dataclass
@@ -27,9 +27,9 @@ _FROM_BGR = GAUSSIAN_COLOUR[:, ::-1].astype(np.float32).copy()
 class Weights:
     """A linear map from the 35 values of a colour feature to its descriptor, learnt from points observed in two images.
 
-    ``map`` (35, 35) multiplies the values minus their ``mean`` (35,). After the map, the difference between two views of a point
-    has unit covariance. The Euclidean distance of two results is then the Mahalanobis distance of the values (within-class
-    whitening, Fukunaga, "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
+    ``map`` (35, 35) multiplies the values minus their ``mean`` (35,). After the map, the difference between two views
+    of a point has unit covariance. The Euclidean distance of two results is then the Mahalanobis distance of the values
+    (within-class whitening, Fukunaga, "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
     """
 
     mean: Float
@@ -44,8 +44,8 @@ class Weights:
 
 @cache
 def shipped_weights() -> Weights:
-    """Return the weights that are part of the package. ``scripts/learn_feature_weights`` learnt them from the image sequences bark
-    and graf of Mikolajczyk et al., IJCV 65, 2005."""
+    """Return the weights that are part of the package. ``scripts/learn_feature_weights`` learnt them from the image
+    sequences bark and graf of Mikolajczyk et al., IJCV 65, 2005."""
     with (
         resources.files("factorgraph_loc.vision").joinpath("weights.npz").open("rb") as file,
         np.load(file, allow_pickle=False) as stored,
@@ -100,8 +100,8 @@ class ColourExtractor:
 
 
 def colour_channels(image: Image) -> list[Float]:
-    """Return the channels E (intensity), E_lambda and E_lambda_lambda (opponent colours), each (H, W), of a BGR image. A grey image
-    (H, W) has the channel E only."""
+    """Return the channels E (intensity), E_lambda and E_lambda_lambda (opponent colours), each (H, W), of a BGR image.
+    A grey image (H, W) has the channel E only."""
     if image.ndim == 2:
         return [image.astype(np.float32)]
     channels = cv2.split(cv2.transform(image.astype(np.float32), _FROM_BGR))

@@ -1,10 +1,10 @@
 """Outlier rejection among the points observed in an image: they must agree on one camera pose near the predicted one.
 
-All points are accepted if they are jointly compatible with the prediction (Neira, Tardos, IEEE Transactions on Robotics and
-Automation 17(6), 2001). Otherwise random samples of three points correct the prediction by a Kalman update each. The correction
-with most inliers is used. (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal of Field Robotics 27(5),
-2010, use samples of one point.) The predicted camera of a robot on a floor has a covariance of rank 5. The correction changes only
-these five directions.
+All points are accepted if they are jointly compatible with the prediction (Neira, Tardos, IEEE Transactions on Robotics
+and Automation 17(6), 2001). Otherwise random samples of three points correct the prediction by a Kalman update each.
+The correction with most inliers is used. (Civera, Grasa, Davison, Montiel, "1-Point RANSAC for EKF filtering", Journal
+of Field Robotics 27(5), 2010, use samples of one point.) The predicted camera of a robot on a floor has a covariance of
+rank 5. The correction changes only these five directions.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ JOINT = 0.99  # probability of the joint compatibility test
 
 @dataclass(frozen=True)
 class CameraPose:
-    """The pose of a camera. ``position`` (3,), ``rotation`` (3, 3): in the world frame. ``covariance`` (6, 6): of a perturbation in
-    the camera frame, rotation first."""
+    """The pose of a camera. ``position`` (3,), ``rotation`` (3, 3): in the world frame. ``covariance`` (6, 6): of a
+    perturbation in the camera frame, rotation first."""
 
     position: Array
     rotation: Array
@@ -61,9 +61,9 @@ def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
     """Return a mask (K,) of the observed points that agree on one pose near the predicted ``camera``.
 
-    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): observations. ``covariances`` (K, 2, 2) [px^2]: their noise.
-    All points are inliers if they are jointly compatible with the prediction (:func:`are_compatible`). Otherwise at least
-    :data:`FEWEST` points must agree, or none is an inlier.
+    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): observations. ``covariances`` (K, 2, 2) [px^2]:
+    their noise. All points are inliers if they are jointly compatible with the prediction (:func:`are_compatible`).
+    Otherwise at least :data:`FEWEST` points must agree, or none is an inlier.
     """
     count = len(points)
     if are_compatible(model, camera, points, pixels, covariances):
@@ -87,8 +87,8 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
 def _best_of_samples(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, whiteners: Array, root: Array
 ) -> tuple[Array, Array, Array]:
-    """Correct the predicted pose by random samples of points, and return the correction with most inliers: position (1, 3),
-    rotation (1, 3, 3), and the squared whitened residuals (K,) of all points at this pose.
+    """Correct the predicted pose by random samples of points, and return the correction with most inliers: position (1,
+    3), rotation (1, 3, 3), and the squared whitened residuals (K,) of all points at this pose.
 
     ``whiteners`` (K, 2, 2): whiten the pixel errors. ``root`` (6, 6): a square root of the covariance of the allowed corrections.
     """
@@ -129,8 +129,8 @@ def _best_of_samples(
 def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, covariances: Array
 ) -> float:
-    """Return the normalised squared innovation of K ``points`` (K, 3), observed at ``pixels`` (K, 2) with noise ``covariances``
-    (K, 2, 2), for a camera whose perturbation has the ``covariance`` (6, 6)."""
+    """Return the normalised squared innovation of K ``points`` (K, 3), observed at ``pixels`` (K, 2) with noise
+    ``covariances`` (K, 2, 2), for a camera whose perturbation has the ``covariance`` (6, 6)."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
     for i in range(len(points)):
@@ -171,8 +171,8 @@ def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]
 def _whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """Return the whitened residuals (H, 2S), predicted minus measured, of H cameras with S points each, and their Jacobians
-    (H, 2S, 6) by the perturbation of the camera.
+    """Return the whitened residuals (H, 2S), predicted minus measured, of H cameras with S points each, and their
+    Jacobians (H, 2S, 6) by the perturbation of the camera.
 
     ``points`` (H, S, 3), ``pixels`` (H, S, 2), ``whiteners`` (H, S, 2, 2): the points of each camera.
     """

@@ -45,9 +45,9 @@ _FLAT = 1e-6  # grey levels: norm of a patch's responses below which they are se
 def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = False) -> NDArray[np.void]:
     """Compute the values of N ``keypoints`` of an image, as records (N,) of the type :data:`RECORD`.
 
-    ``space``: the scale space of the image. ``keypoints`` must have directions. By default four places around a point are described
-    too. ``paper_literal``: describe the four nearest keypoints instead, as Raoui et al. 2011. The nearest keypoints often differ
-    between images, which makes the values less repeatable.
+    ``space``: the scale space of the image. ``keypoints`` must have directions. By default four places around a point
+    are described too. ``paper_literal``: describe the four nearest keypoints instead, as Raoui et al. 2011. The nearest
+    keypoints often differ between images, which makes the values less repeatable.
     """
     sigmas = keypoints.sizes / 2.0
     answers = space.patches(keypoints.points, sigmas, keypoints.angles, LATTICE) @ FILTERS
@@ -70,8 +70,8 @@ def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = Fa
 def values(record: NDArray[np.void]) -> Float:
     """Convert records (N,) to the 35 dimensionless values (N, 35) that are compared.
 
-    Responses and textures are divided by their norm, for invariance to contrast. Scale is in octaves. Orientations are replaced by
-    their sine, which is continuous where an angle wraps around.
+    Responses and textures are divided by their norm, for invariance to contrast. Scale is in octaves. Orientations are
+    replaced by their sine, which is continuous where an angle wraps around.
     """
     responses = record["scale_responses"].reshape(-1, 20)
     texture = record["texture"].reshape(-1, 9)
@@ -81,8 +81,8 @@ def values(record: NDArray[np.void]) -> Float:
 
 
 def _nearest(points: Array) -> Integers:
-    """Return the indices (N, 4) of the four nearest other points of each of ``points`` (N, 2), nearest first. If there are too few
-    points, the index of the point itself is used."""
+    """Return the indices (N, 4) of the four nearest other points of each of ``points`` (N, 2), nearest first. If there
+    are too few points, the index of the point itself is used."""
     indices = cKDTree(points).query(points, k=np.arange(2, 6))[1] if len(points) else np.empty((0, 4), dtype=np.int64)
     return np.where(indices < len(points), indices, np.arange(len(points))[:, None]).astype(np.int64)
 

@@ -46,8 +46,8 @@ _WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTAT
 def detect(space: ScaleSpace, colours: list[Float], count: int, *, everywhere: bool = False) -> Keypoints:
     """Detect at most ``count`` points in an image. Returns them by descending response.
 
-    ``space``: the scale space of the intensity E. ``colours``: the other channels (H, W) of the image. ``everywhere``: choose
-    points in all parts of the image, not only the strongest.
+    ``space``: the scale space of the intensity E. ``colours``: the other channels (H, W) of the image. ``everywhere``:
+    choose points in all parts of the image, not only the strongest.
     """
     corners = np.vstack(_corners(space, colours))
     corners = corners[np.argsort(-corners[:, 3], kind="stable")]
@@ -84,8 +84,8 @@ def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
 
 
 def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
-    """Detect the corners of each characteristic scale. Returns an array (N, 4) for each scale: x and y [px], scale [px],
-    response."""
+    """Detect the corners of each characteristic scale. Returns an array (N, 4) for each scale: x and y [px], scale
+    [px], response."""
     by_scale = []
     for o, octave in enumerate(space.octaves):
         if o > 0:
@@ -102,8 +102,8 @@ def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
 
 
 def fill_strength(octave: Octave, i: int) -> None:
-    """Write the Harris measure at scale number ``i`` of an octave to ``octave.strength``. ``octave.colours`` must have the blur of
-    scale ``i - 1``."""
+    """Write the Harris measure at scale number ``i`` of an octave to ``octave.strength``. ``octave.colours`` must have
+    the blur of scale ``i - 1``."""
     structure_tensor(octave.planes[i - 1], octave.colours, octave.products)
     for product in octave.products:
         blur(product, product, INTEGRATION * SIGMAS[i])

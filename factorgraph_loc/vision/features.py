@@ -48,8 +48,8 @@ class OpenCvExtractor:
         return keypoints[order], np.asarray(descriptors)[order]
 
     def _chosen(self, keypoints: Keypoints) -> Integers:
-        """Return the indices of the selected keypoints, by descending response. OpenCV returns more than ``nfeatures`` if responses
-        are equal."""
+        """Return the indices of the selected keypoints, by descending response. OpenCV returns more than ``nfeatures``
+        if responses are equal."""
         order = np.argsort(-keypoints.responses, kind="stable").astype(np.int64)
         if self._everywhere:
             return order[spread_out(keypoints.points[order], self._count, cells=PARTS)]
@@ -66,8 +66,8 @@ EXTRACTORS: dict[str, Callable[..., Extractor]] = {
 def extractor(name: str, count: int = 1000, *, everywhere: bool = False) -> Extractor:
     """Create an extractor of features. ``name``: a key of :data:`EXTRACTORS`.
 
-    ``count``: the largest number of features per image. ``everywhere``: choose features in all parts of an image, not only the
-    strongest. Raises InputError for an unknown name or a ``count`` below 1.
+    ``count``: the largest number of features per image. ``everywhere``: choose features in all parts of an image, not
+    only the strongest. Raises InputError for an unknown name or a ``count`` below 1.
     """
     if name not in EXTRACTORS:
         raise InputError(f"feature {quoted(name)} is not known{nearest(name, sorted(EXTRACTORS))}")

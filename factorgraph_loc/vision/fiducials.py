@@ -1,11 +1,11 @@
 """Detection of fiducial markers in images, with corners of subpixel accuracy.
 
-OpenCV detects the markers (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under
-occlusion", Pattern Recognition 2014). For AprilTags it uses their dictionaries (Olson, ICRA 2011). A corner is then refined as the
-intersection of lines fitted to the edges of the marker. Refinement at the corner itself (OpenCV's ``cornerSubPix``) is biased: blur
-moves a corner into the square, so that the marker appears smaller and farther away. Blur across an edge is symmetric, so that the
-mean grey level determines the position of the edge. (Tabatabai, Mitchell, "Edge location to subpixel values in digital imagery",
-PAMI 1984, use moments.)
+OpenCV detects the markers (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial
+markers under occlusion", Pattern Recognition 2014). For AprilTags it uses their dictionaries (Olson, ICRA 2011). A
+corner is then refined as the intersection of lines fitted to the edges of the marker. Refinement at the corner itself
+(OpenCV's ``cornerSubPix``) is biased: blur moves a corner into the square, so that the marker appears smaller and
+farther away. Blur across an edge is symmetric, so that the mean grey level determines the position of the edge.
+(Tabatabai, Mitchell, "Edge location to subpixel values in digital imagery", PAMI 1984, use moments.)
 """
 
 from collections import Counter
@@ -37,8 +37,8 @@ def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
 
 
 def _intersections(grey: Image, corners: Array, bits: int) -> Array:
-    """Fit a line to the edge near each side of the square ``corners`` (4, 2), and return the intersections of neighbouring
-    lines."""
+    """Fit a line to the edge near each side of the square ``corners`` (4, 2), and return the intersections of
+    neighbouring lines."""
     middle = corners.mean(axis=0)
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     reach = min(REACH, 0.8 * float(sides.min()) / bits)  # not across the black border
@@ -63,8 +63,8 @@ def _intersections(grey: Image, corners: Array, bits: int) -> Array:
 def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) -> tuple[Array, float] | None:
     """Fit a line to an edge of a marker between ``start`` and ``end``. Returns None if the edge is not visible.
 
-    ``middle`` (2,): the centre of the marker. ``reach`` [px]: the largest distance of samples from the line between ``start`` and
-    ``end``. The result is the normal n (2,) and the offset c [px] of the line n.p = c.
+    ``middle`` (2,): the centre of the marker. ``reach`` [px]: the largest distance of samples from the line between
+    ``start`` and ``end``. The result is the normal n (2,) and the offset c [px] of the line n.p = c.
     """
     along = end - start
     length = float(np.linalg.norm(along))
@@ -103,8 +103,8 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
     """Detect the markers in an image. Returns the number of each marker and its corners (4, 2) [px].
 
-    The order of the corners is upper left, upper right, lower right, lower left of the printed marker. A number that occurs twice
-    in the image is omitted, because it is not known which of both is meant.
+    The order of the corners is upper left, upper right, lower right, lower left of the printed marker. A number that
+    occurs twice in the image is omitted, because it is not known which of both is meant.
     """
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     detector = _detector(family)

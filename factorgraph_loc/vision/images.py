@@ -63,11 +63,11 @@ def read_image(path: Path) -> Image:
 
 
 def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
-    """Decode the bytes of an image file with OpenCV. ``flags``: those of ``cv2.imdecode``. ``source``: the origin of the bytes, for
-    error messages.
+    """Decode the bytes of an image file with OpenCV. ``flags``: those of ``cv2.imdecode``. ``source``: the origin of
+    the bytes, for error messages.
 
-    Raises InputError if the bytes are no image, or if it has more than :data:`~factorgraph_loc.files.bounded.PIXELS` pixels. This
-    is checked before memory is allocated. OpenCV itself would allow 2^30 pixels.
+    Raises InputError if the bytes are no image, or if it has more than :data:`~factorgraph_loc.files.bounded.PIXELS`
+    pixels. This is checked before memory is allocated. OpenCV itself would allow 2^30 pixels.
     """
     image_size(content, source)
     with foreign(source, NO_IMAGE), quiet():

@@ -1,7 +1,7 @@
 """Compiled loops of the colour features. Unlike numpy expressions they need no temporary images.
 
-Images are ``float32``, to halve memory traffic. Several threads can run the loops in parallel, because the loops do not use Python
-objects.
+Images are ``float32``, to halve memory traffic. Several threads can run the loops in parallel, because the loops do not
+use Python objects.
 """
 
 import math
@@ -51,8 +51,8 @@ def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
 
 @compiled(nogil=True, fastmath=FAST)
 def corner_strength(products: Float, scale: np.float32, strength: Float) -> None:
-    """Compute the strength of corners: determinant over trace of the second moment matrix, times ``scale``. Without ``scale``
-    this is half the harmonic mean of the eigenvalues.
+    """Compute the strength of corners: determinant over trace of the second moment matrix, times ``scale``. Without
+    ``scale`` this is half the harmonic mean of the eigenvalues.
 
     ``products`` (3, H, W): the elements xx, xy, yy of the matrix at each pixel. ``strength`` (H, W): receives the result.
     """
@@ -81,10 +81,9 @@ def refined_peaks(
 ) -> int:
     """Select the local maxima of the corner strength that are also maxima over scale, and refine them. Returns their number.
 
-    ``strength`` (H, W): the corner strength. ``pixels`` (N, 2): x and y of its local maxima. ``planes`` (3, H, W): the intensity at
-    three consecutive scales with ``variances`` (3,) [px^2].
-    A pixel is selected if its strength is above ``threshold`` and if the normalised Laplacian near it is largest in the middle
-    plane.
+    ``strength`` (H, W): the corner strength. ``pixels`` (N, 2): x and y of its local maxima. ``planes`` (3, H, W): the
+    intensity at three consecutive scales with ``variances`` (3,) [px^2]. A pixel is selected if its strength is above
+    ``threshold`` and if the normalised Laplacian near it is largest in the middle plane.
     ``peaks`` (N, 5): receives a row for each selected pixel. Its values are x and y, refined by a paraboloid through 3x3 strengths;
     the scale, refined by a parabola, in steps from the middle plane; the strength; the absolute Laplacian.
     """
@@ -147,10 +146,10 @@ def locally_strongest(points: Float, scales: Float, reach: float, alike: float, 
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
     """Sample rotated and scaled patches around N points by bilinear interpolation. Each point has its own plane of a pyramid.
 
-    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's plane.
-    ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4): x and y of the point in its plane [px], and the vector
-    (a, b) [px] of the x axis of its frame. ``offsets`` (M, 2): the sampled places in the frame. ``patches`` (N, M): receives the
-    samples. Outside the plane the nearest pixel is used.
+    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's
+    plane. ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4): x and y of the point in its plane [px],
+    and the vector (a, b) [px] of the x axis of its frame. ``offsets`` (M, 2): the sampled places in the frame.
+    ``patches`` (N, M): receives the samples. Outside the plane the nearest pixel is used.
     """
     for n in range(len(frames)):
         start, height, width = starts[n], shapes[n, 0], shapes[n, 1]

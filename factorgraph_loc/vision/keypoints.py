@@ -23,8 +23,8 @@ class Keypoints:
     """N points of an image, as arrays.
 
     ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel.
-    ``sizes`` (N,) [px]: proportional to the size of the described region. For SIFT and the colour features this is twice the
-    standard deviation of the point's Gaussian scale, for ORB the side of its patch.
+    ``sizes`` (N,) [px]: proportional to the size of the described region. For SIFT and the colour features this is
+    twice the standard deviation of the point's Gaussian scale, for ORB the side of its patch.
     ``angles`` (N,) [rad]: the direction ``atan2(dy, dx)`` with y down, NaN if a point has none.
     ``responses`` (N,): the strength, comparable within one image and one extractor.
     """
@@ -63,17 +63,17 @@ class Keypoints:
 class Extractor(Protocol):
     """The interface of feature extractors: detector and descriptor of one kind of feature.
 
-    Images are checked by :func:`~factorgraph_loc.vision.images.as_image`, which raises InputError. An image that is blank or has a
-    side below 16 px has no features. At most ``count`` points are returned, the strongest first. ``count`` is an argument of the
-    extractor's constructor.
+    Images are checked by :func:`~factorgraph_loc.vision.images.as_image`, which raises InputError. An image that is
+    blank or has a side below 16 px has no features. At most ``count`` points are returned, the strongest first.
+    ``count`` is an argument of the extractor's constructor.
     """
 
     def detect(self, image: object) -> Keypoints:
         """Return the features of ``image``."""
 
     def detectAndCompute(self, image: object) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
-        """Return the N features of ``image`` and their descriptors. These are bits, (N, bytes) ``uint8``, or numbers, (N, D)
-        ``float32``."""
+        """Return the N features of ``image`` and their descriptors. These are bits, (N, bytes) ``uint8``, or numbers,
+        (N, D) ``float32``."""
 
 
 PARTS = 12  # grid cells for features in all parts of an image: with more cells, very weak features would be chosen
@@ -82,9 +82,9 @@ PARTS = 12  # grid cells for features in all parts of an image: with more cells,
 def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None, cells: int | None = None) -> Integers:
     """Select at most ``count`` pixels that are spread over the image. Returns their indices in ascending order.
 
-    ``pixels`` (K, 2). One pixel after the other is taken from each cell of a grid in turn. ``cells``: the approximate number of
-    cells, ``count`` if None. ``priority`` (K,): in each cell the pixels with the highest priority are taken first. If it is None,
-    the first pixels are taken first.
+    ``pixels`` (K, 2). One pixel after the other is taken from each cell of a grid in turn. ``cells``: the approximate
+    number of cells, ``count`` if None. ``priority`` (K,): in each cell the pixels with the highest priority are taken
+    first. If it is None, the first pixels are taken first.
     """
     if len(pixels) <= count:
         return np.arange(len(pixels))

@@ -3,8 +3,8 @@
 Ratio test: Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 60, 2004, section 7.1. Descriptors of type
 ``uint8`` are bits and are compared by their Hamming distance. Other descriptors are compared by their Euclidean distance.
 
-Descriptors are rounded to single precision. Two distances are equal if they differ by less than :data:`ROUNDING`, and a nearest
-neighbour with the same distance as the second nearest is no match.
+Descriptors are rounded to single precision. Two distances are equal if they differ by less than :data:`ROUNDING`, and a
+nearest neighbour with the same distance as the second nearest is no match.
 """
 
 import math
@@ -29,8 +29,8 @@ Truths = NDArray[np.bool_]
 class Matches:
     """M matches between the descriptors of two images.
 
-    ``indices`` (M, 2): indices of the descriptors in the first and in the second image, ascending in the first. ``distances`` (M,):
-    distances of the descriptors.
+    ``indices`` (M, 2): indices of the descriptors in the first and in the second image, ascending in the first.
+    ``distances`` (M,): distances of the descriptors.
     """
 
     indices: Integers
@@ -49,10 +49,10 @@ def match(
 ) -> Matches:
     """Match the descriptors ``first`` (N, D) with the descriptors ``second`` (M, D).
 
-    Two descriptors match if each is the nearest neighbour of the other. In addition their distance must be below ``ratio`` times
-    the distance to the second nearest one in ``second``, if there is one. Ties are no matches.
-    ``allowed`` (N, M): mask of the pairs that may match; None allows all. Raises InputError for incompatible or non-finite
-    descriptors, and for a ratio that is not positive.
+    Two descriptors match if each is the nearest neighbour of the other. In addition their distance must be below
+    ``ratio`` times the distance to the second nearest one in ``second``, if there is one. Ties are no matches.
+    ``allowed`` (N, M): mask of the pairs that may match; None allows all. Raises InputError for incompatible or
+    non-finite descriptors, and for a ratio that is not positive.
     """
     if not ratio > 0.0:
         raise InputError(f"matching: ratio is {ratio}, expected more than 0")
@@ -72,8 +72,8 @@ def match(
 
 
 def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
-    """Return a mask (N, M) of the pairs of prediction and pixel where the pixel is in the gate of the prediction. It can be
-    passed to :func:`match` as ``allowed``.
+    """Return a mask (N, M) of the pairs of prediction and pixel where the pixel is in the gate of the prediction. It
+    can be passed to :func:`match` as ``allowed``.
 
     ``predicted`` (N, 2) [px]: predicted pixels. ``covariances`` (N, 2, 2) [px^2]: of prediction and measurement together.
     ``points`` (M, 2) [px]: measured pixels. A gate is the ellipse that contains the pixel with the probability :data:`GATE`. The
@@ -91,8 +91,8 @@ def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
 
 
 def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
-    """Return for each row of ``distances`` (N, M), M > 0, the index of the smallest distance (N,), the smallest distance (N,),
-    and the second smallest distance (N,). The latter is infinite if M is 1."""
+    """Return for each row of ``distances`` (N, M), M > 0, the index of the smallest distance (N,), the smallest
+    distance (N,), and the second smallest distance (N,). The latter is infinite if M is 1."""
     rows = np.arange(len(distances))
     index = distances.argmin(axis=1)
     best = distances[rows, index]
@@ -110,8 +110,8 @@ def _is_clear(best: Array, second: Array) -> Truths:
 def distance_matrix(first: Descriptors, second: Descriptors) -> Array:
     """Return the distances (N, M) between the descriptors ``first`` (N, D) and ``second`` (M, D).
 
-    These are Hamming distances of bits if the descriptors have the type ``uint8``, otherwise Euclidean distances. Raises InputError
-    for incompatible or non-finite descriptors.
+    These are Hamming distances of bits if the descriptors have the type ``uint8``, otherwise Euclidean distances.
+    Raises InputError for incompatible or non-finite descriptors.
     """
     for which, descriptors in (("first", first), ("second", second)):
         if descriptors.ndim != 2:

@@ -1,12 +1,12 @@
 """Camera pose from matched map points, without a prediction.
 
-Each random sample of three points yields up to four poses. The pose with most inliers is refined with all its inliers (Universal
-RANSAC: Raguram, Chum, Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as in OpenCV). For a robot on the floor only x, y and heading are
-refined. A camera pose is rejected if the robot would be tilted or not on the floor.
+Each random sample of three points yields up to four poses. The pose with most inliers is refined with all its inliers
+(Universal RANSAC: Raguram, Chum, Pollefeys, Matas, Frahm, PAMI 35(8), 2013, as in OpenCV). For a robot on the floor
+only x, y and heading are refined. A camera pose is rejected if the robot would be tilted or not on the floor.
 
-In a large map an image is compared only with the few most similar keyframes. A keyframe is described by the differences between its
-descriptors and the words of a small vocabulary (VLAD: Jegou, Douze, Schmid, Perez, CVPR 2010). Each word is normalised separately
-(Arandjelovic, Zisserman, CVPR 2013).
+In a large map an image is compared only with the few most similar keyframes. A keyframe is described by the differences
+between its descriptors and the words of a small vocabulary (VLAD: Jegou, Douze, Schmid, Perez, CVPR 2010). Each word is
+normalised separately (Arandjelovic, Zisserman, CVPR 2013).
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class FoundOnFloor:
 def located(model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None) -> Resection | None:
     """Compute the camera pose from K points with outliers. Returns None if the points do not determine it.
 
-    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): their observed pixels. ``covariances`` (K, 3, 3) [m^2]: of
-    the positions, None if these are exact.
+    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): their observed pixels. ``covariances`` (K, 3, 3)
+    [m^2]: of the positions, None if these are exact.
     """
     if len(points) < FEWEST:
         return None
@@ -93,8 +93,8 @@ def on_floor(
 ) -> FoundOnFloor | None:
     """Compute the planar pose of a robot on the floor, starting at the pose ``camera`` of its camera.
 
-    ``points`` (K, 3), ``pixels`` (K, 2), ``covariances`` (K, 3, 3): see :func:`located`. Returns None if the robot with this camera
-    pose is tilted or not on the floor, or if the points do not determine the planar pose.
+    ``points`` (K, 3), ``pixels`` (K, 2), ``covariances`` (K, 3, 3): see :func:`located`. Returns None if the robot with
+    this camera pose is tilted or not on the floor, or if the points do not determine the planar pose.
     """
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
@@ -174,8 +174,8 @@ def found_on_floor(
 class KeyframeIndex:
     """An index of the keyframes of a map, to find those that are most similar to an image.
 
-    ``descriptors`` (M, D): the descriptors of the map's M views. ``seen_from`` (M, 3): the camera position of each view. All views
-    with the same camera position form a keyframe.
+    ``descriptors`` (M, D): the descriptors of the map's M views. ``seen_from`` (M, 3): the camera position of each
+    view. All views with the same camera position form a keyframe.
     """
 
     def __init__(self, descriptors: Descriptors, seen_from: Array) -> None:
@@ -192,16 +192,16 @@ class KeyframeIndex:
         return len(self._descriptions)
 
     def views(self, descriptors: Descriptors) -> Integers:
-        """Return the indices of the views of the :data:`NEAREST` keyframes that are most similar to an image with ``descriptors``
-        (N, D)."""
+        """Return the indices of the views of the :data:`NEAREST` keyframes that are most similar to an image with
+        ``descriptors`` (N, D)."""
         (description,) = self._described(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)
         alike[np.argsort(-(self._descriptions @ description), kind="stable")[:NEAREST]] = True
         return np.flatnonzero(alike[self._of])
 
     def _described(self, values: Array, of: Integers) -> Array:
-        """Return the VLAD vectors (K, WORDS * D) of K images, by which images are compared. ``values`` (M, D): the descriptors of
-        all images. ``of`` (M,): the index of each descriptor's image."""
+        """Return the VLAD vectors (K, WORDS * D) of K images, by which images are compared. ``values`` (M, D): the
+        descriptors of all images. ``of`` (M,): the index of each descriptor's image."""
         (nearest, _), count = vq(values, self._words), len(self._words)
         descriptions = np.zeros((int(of.max()) + 1, count, values.shape[1]))
         np.add.at(descriptions, (of, nearest), values - self._words[nearest])

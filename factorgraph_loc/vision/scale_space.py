@@ -27,8 +27,8 @@ SIGMAS: Array = FINEST * STEP ** np.arange(-1.0, SCALES + 1.0)
 class Octave:
     """The arrays of one octave.
 
-    ``planes`` (6, H, W): the intensity E at each scale of :data:`SIGMAS`. ``colours`` (C, H, W): the other channels at one scale.
-    ``products`` (3, H, W), ``strength`` (H, W), ``largest`` (H, W): work arrays of the detector.
+    ``planes`` (6, H, W): the intensity E at each scale of :data:`SIGMAS`. ``colours`` (C, H, W): the other channels at
+    one scale. ``products`` (3, H, W), ``strength`` (H, W), ``largest`` (H, W): work arrays of the detector.
     ``step`` [px]: the size of a pixel of the octave, in pixels of the image.
     """
 
@@ -79,8 +79,8 @@ class ScaleSpace:
                 blur(octave.planes[i - 1], octave.planes[i], more_blur(SIGMAS[i - 1], SIGMAS[i]))
 
     def levels(self, sigmas: Array) -> Integers:
-        """Return for each scale of ``sigmas`` (N,) [px] the index (N,) of the nearest characteristic scale, counted over all
-        octaves."""
+        """Return for each scale of ``sigmas`` (N,) [px] the index (N,) of the nearest characteristic scale, counted
+        over all octaves."""
         nearest = np.rint(SCALES * np.log2(sigmas / FINEST))
         return np.asarray(np.clip(nearest, 0, len(self._steps) - 1), dtype=np.int64)
 
@@ -100,8 +100,8 @@ class ScaleSpace:
 
 
 def blur(source: Float, target: Float, sigma: float) -> None:
-    """Blur ``source`` (H, W) by a Gaussian with standard deviation ``sigma`` [px] and mirrored borders. The result is written to
-    ``target``, which may be ``source``."""
+    """Blur ``source`` (H, W) by a Gaussian with standard deviation ``sigma`` [px] and mirrored borders. The result is
+    written to ``target``, which may be ``source``."""
     side = 2 * int(np.ceil(3.0 * sigma)) + 1
     cv2.GaussianBlur(source, (side, side), sigma, dst=target, borderType=cv2.BORDER_REFLECT_101)
 

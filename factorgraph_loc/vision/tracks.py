@@ -1,9 +1,9 @@
 """Feature tracks over consecutive images.
 
-Matches between two images are mutual nearest neighbours that pass the ratio test and have a bounded displacement. They must fit
-one essential matrix, estimated by USAC (Raguram et al., PAMI 35, 2013) as in OpenCV with a fixed seed. A fundamental matrix is not
-used, because it often fits a moving object too. Features without a match in the last image are also compared with the image before
-it.
+Matches between two images are mutual nearest neighbours that pass the ratio test and have a bounded displacement. They
+must fit one essential matrix, estimated by USAC (Raguram et al., PAMI 35, 2013) as in OpenCV with a fixed seed. A
+fundamental matrix is not used, because it often fits a moving object too. Features without a match in the last image
+are also compared with the image before it.
 """
 
 import math
@@ -25,8 +25,8 @@ OTHER_BODY = 0.5  # if more of the rejected pairs fit a second essential matrix,
 
 
 class _TrackedImage(NamedTuple):
-    """The K features of one image. ``directions`` (K, 2): x and y at depth 1. ``descriptors`` (K, D). ``numbers`` (K,): their track
-    numbers."""
+    """The K features of one image. ``directions`` (K, 2): x and y at depth 1. ``descriptors`` (K, D). ``numbers`` (K,):
+    their track numbers."""
 
     directions: Array
     descriptors: Descriptors
@@ -64,8 +64,8 @@ class FeatureTracker:
         return numbers
 
     def _continued(self, earlier: _TrackedImage, image: _TrackedImage) -> _TrackedImage:
-        """Match the features of ``image`` that have no number yet with an earlier image, and write their track numbers. Returns the
-        features of the earlier image that were not matched."""
+        """Match the features of ``image`` that have no number yet with an earlier image, and write their track numbers.
+        Returns the features of the earlier image that were not matched."""
         rows = np.flatnonzero(image.numbers < 0)
         current = image.directions[rows], image.descriptors[rows]
         matched = pairs(earlier[:2], current, self._camera)

@@ -1,5 +1,5 @@
-"""The reprojection factor of known points in an image. It depends on a robot pose, and optionally on camera constants and on
-displacements of points."""
+"""The reprojection factor of known points in an image. It depends on a robot pose, and optionally on camera constants
+and on displacements of points."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ class ReprojectionFactor:
     """A factor on the robot's pose from K known points in one image. The pose may be the pose at a slightly earlier time.
 
     ``points`` (K, 3): world positions. ``pixels`` (K, 2): their measured pixels.
-    ``offset`` (3,): the robot's pose at the image's time, in the frame of the pose variable. Odometry measures it. None if both
-    poses are the same.
+    ``offset`` (3,): the robot's pose at the image's time, in the frame of the pose variable. Odometry measures it. None
+    if both poses are the same.
     ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
     ``point_covariances`` (K, 3, 3): covariances of the points of an inexact map. They are added to the noise.
     ``estimated``: indices in :data:`PARAMETERS` of the P camera constants that are estimated.
-    ``moved_by`` (K,): for each point, the number of the displacement variable that is added to the point, or -1. Empty if there are
-    no such variables.
+    ``moved_by`` (K,): for each point, the number of the displacement variable that is added to the point, or -1. Empty
+    if there are no such variables.
     ``twist`` (3,): the robot's body-frame velocity at the image's time. The Jacobian by the time offset needs it.
 
-    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P > 0, and
-    the displacements (3,) of points in the world. The robot's tilt (roll and pitch) is an unknown error that all points have in
-    common.
+    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P
+    > 0, and the displacements (3,) of points in the world. The robot's tilt (roll and pitch) is an unknown error that
+    all points have in common.
     """
 
     model: CameraModel
@@ -102,8 +102,8 @@ class ReprojectionFactor:
         return self.model.tempering * float(loss)
 
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Fit the robot's tilt to the image. Returns the whitened residual (K, 2) with this tilt, and the tilt (2,): roll and pitch
-        in standard deviations."""
+        """Fit the robot's tilt to the image. Returns the whitened residual (K, 2) with this tilt, and the tilt (2,):
+        roll and pitch in standard deviations."""
         error, (*_, by_tilt) = self.whitened(values)
         roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
         tilt = np.array((roll, pitch))
@@ -169,13 +169,13 @@ def image_update(
     """Correct a Gaussian by known points in an image, with a Kalman update. See :func:`~factors.update.update_state`.
 
     ``pose`` (3,): the predicted pose.
-    ``covariance`` (S, S): covariance of the error state. Its first three components are the pose's body-frame perturbation.
-    ``iterations``, ``converged``: limits of the iterations.
-    ``values``: the values of the factor besides the pose, at the prediction. ``columns``: the components of each in the error
-    state.
+    ``covariance`` (S, S): covariance of the error state. Its first three components are the pose's body-frame
+    perturbation. ``iterations``, ``converged``: limits of the iterations.
+    ``values``: the values of the factor besides the pose, at the prediction. ``columns``: the components of each in the
+    error state.
 
-    With ``values``, the resulting covariance is converted to perturbations of the updated pose instead of the predicted pose. The
-    difference matters because pixels are much more accurate than a surveyed map.
+    With ``values``, the resulting covariance is converted to perturbations of the updated pose instead of the predicted
+    pose. The difference matters because pixels are much more accurate than a surveyed map.
     """
     size = len(covariance)
     packed = factor.packed() if factor.of_pose_alone else None

@@ -1,14 +1,14 @@
 """Inverse-depth parametrization of points.
 
-Source: Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Transactions on Robotics 24(5), 2008,
-sections III (parametrization and measurement), IV (initialization) and VI (conversion to x, y, z).
+Source: Civera, Davison, Montiel, "Inverse depth parametrization for monocular SLAM", IEEE Transactions on Robotics
+24(5), 2008, sections III (parametrization and measurement), IV (initialization) and VI (conversion to x, y, z).
 
-A ray (6,) represents a point by six values: the camera's position (x, y, z) [m] at the first sighting, azimuth and elevation [rad]
-of the direction in the world, and the inverse depth [1/m]. The world's z axis is up, so azimuth and elevation are singular only for
-points straight above or below.
+A ray (6,) represents a point by six values: the camera's position (x, y, z) [m] at the first sighting, azimuth and
+elevation [rad] of the direction in the world, and the inverse depth [1/m]. The world's z axis is up, so azimuth and
+elevation are singular only for points straight above or below.
 
-A Gaussian of the inverse depth represents all depths from a minimum to infinity. A point is therefore a useful landmark from its
-first sighting on: it informs the camera's rotation at once, and the translation as soon as there is parallax.
+A Gaussian of the inverse depth represents all depths from a minimum to infinity. A point is therefore a useful landmark
+from its first sighting on: it informs the camera's rotation at once, and the translation as soon as there is parallax.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ LINEAR = 0.1  # below this linearity index, x, y, z of a point are nearly Gaussi
 
 
 def directions(rays: Array) -> tuple[Array, Array]:
-    """The directions of ``rays`` (K, 6) as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and elevation.
-    A ray is x, y, z of its start, azimuth, elevation, and the inverse depth of the point on it."""
+    """The directions of ``rays`` (K, 6) as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth
+    and elevation. A ray is x, y, z of its start, azimuth, elevation, and the inverse depth of the point on it."""
     azimuth, elevation = rays[:, 3], rays[:, 4]
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     by_angles = np.zeros((len(rays), 3, 2))
@@ -33,8 +33,8 @@ def directions(rays: Array) -> tuple[Array, Array]:
 
 
 def turned(angles: Array) -> Array:
-    """The derivative (2, 3) of azimuth and elevation by a small rotation vector about the world's axes. ``angles`` (2,): azimuth
-    and elevation [rad]."""
+    """The derivative (2, 3) of azimuth and elevation by a small rotation vector about the world's axes. ``angles``
+    (2,): azimuth and elevation [rad]."""
     azimuth, elevation = angles.tolist()
     c, s = np.cos(azimuth), np.sin(azimuth)
     slope = np.tan(elevation)
@@ -42,8 +42,8 @@ def turned(angles: Array) -> Array:
 
 
 def positions(rays: Array) -> tuple[Array, Array]:
-    """The positions (K, 3) in the world of points given as ``rays`` (K, 6), and their Jacobian (K, 3, 6) by the rays. A ray is
-    x, y, z of its start, azimuth, elevation, and inverse depth, which must be positive."""
+    """The positions (K, 3) in the world of points given as ``rays`` (K, 6), and their Jacobian (K, 3, 6) by the rays. A
+    ray is x, y, z of its start, azimuth, elevation, and inverse depth, which must be positive."""
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5]
     jacobian = np.zeros((len(rays), 3, SIZE))
@@ -54,12 +54,12 @@ def positions(rays: Array) -> tuple[Array, Array]:
 
 
 def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array) -> tuple[Array, Array, Array]:
-    """Predict the pixels of points in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world. The points are given as
-    ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, inverse depth.
+    """Predict the pixels of points in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world. The points
+    are given as ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, inverse depth.
 
     Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6), as in
-    :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6). A pixel depends only on the direction from the
-    camera to the point, so the inverse depth may be zero (section III).
+    :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6). A pixel depends only on the direction
+    from the camera to the point, so the inverse depth may be zero (section III).
     """
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5, None]
@@ -108,9 +108,9 @@ def begin(
 def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
     """The linearity index (K,) of ``rays`` (K, 6) for a camera at ``position`` (3,) (section VI).
 
-    A ray is x, y, z of its start, azimuth, elevation, and inverse depth. ``sigmas`` (K,): standard deviations of the inverse
-    depths. If the index is below :data:`LINEAR`, the point's x, y, z are nearly Gaussian and can replace the ray. The index is
-    infinite if the inverse depth is not positive.
+    A ray is x, y, z of its start, azimuth, elevation, and inverse depth. ``sigmas`` (K,): standard deviations of the
+    inverse depths. If the index is below :data:`LINEAR`, the point's x, y, z are nearly Gaussian and can replace the
+    ray. The index is infinite if the inverse depth is not positive.
     """
     inverse = rays[:, 5]
     index = np.full(len(rays), np.inf)

@@ -49,16 +49,16 @@ def _radial(k: Lens, rr: float) -> tuple[float, float]:
 
 @compiled
 def radial_slope(k: Lens, rr: float) -> float:
-    """The derivative of the distorted distance from the axis by the undistorted distance, of a rational or fisheye lens. ``rr``:
-    the squared undistorted distance."""
+    """The derivative of the distorted distance from the axis by the undistorted distance, of a rational or fisheye
+    lens. ``rr``: the squared undistorted distance."""
     radial, slope = _radial(k, rr)
     return float(radial + rr * slope)
 
 
 @compiled(inline="always")
 def _bent(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """Distort a direction (x, y) within the valid radius. Returns the distorted direction (2 numbers), and its derivatives: x by x,
-    x by y (which equals y by x), and y by y."""
+    """Distort a direction (x, y) within the valid radius. Returns the distorted direction (2 numbers), and its
+    derivatives: x by x, x by y (which equals y by x), and y by y."""
     k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
     rr = x * x + y * y
     radial = 1.0 + k1 * rr + k2 * rr * rr
@@ -77,8 +77,8 @@ def _bent(k: Lens, x: float, y: float) -> tuple[float, float, float, float, floa
 def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float, float]:
     """Distort any direction (x, y). Returns the distorted direction (2 numbers) and its Jacobian row by row (4 numbers).
 
-    Let B be the distortion and R its valid radius. Beyond R the distortion of a direction d is extrapolated radially, as
-    ``t B(d / t)`` with ``t = |d| / R``. Directions far outside of the image then do not appear in the image.
+    Let B be the distortion and R its valid radius. Beyond R the distortion of a direction d is extrapolated radially,
+    as ``t B(d / t)`` with ``t = |d| / R``. Directions far outside of the image then do not appear in the image.
     """
     t = math.sqrt(max(1.0, k[8] * (x * x + y * y)))
     inverse = 1.0 / t
@@ -117,8 +117,8 @@ def in_camera(
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Transform a world point to the camera frame.
 
-    ``place``: the camera's pose in the robot frame, from :func:`mounting`. ``c``, ``s``: cosine and sine of the robot's heading.
-    ``dx``, ``dy``, ``z``: the vector from the robot to the point along the world's axes.
+    ``place``: the camera's pose in the robot frame, from :func:`mounting`. ``c``, ``s``: cosine and sine of the robot's
+    heading. ``dx``, ``dy``, ``z``: the vector from the robot to the point along the world's axes.
 
     Returns the vector from the camera to the point along the robot's axes, and the point in the camera frame.
     """
@@ -134,9 +134,9 @@ def in_camera(
 def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
     """Invert the distortion by Newton's method.
 
-    ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and the remaining errors (K,) of their
-    distortion. Only directions at which the lens's Jacobian has a positive determinant are found. The result is NaN, with an
-    infinite error, for a direction that is NaN.
+    ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and the remaining errors (K,)
+    of their distortion. Only directions at which the lens's Jacobian has a positive determinant are found. The result
+    is NaN, with an infinite error, for a direction that is NaN.
     """
     n = len(distorted)
     directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)
@@ -201,8 +201,8 @@ def project_planar(
     """Project a world ``point`` (3,) from a robot on a plane.
 
     ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame.
-    ``pose`` (3,), ``tilt`` (2,) [rad]: the robot's planar pose, and its roll and pitch. ``turn`` (3, 3): :func:`turned` of the
-    tilt.
+    ``pose`` (3,), ``tilt`` (2,) [rad]: the robot's planar pose, and its roll and pitch. ``turn`` (3, 3): :func:`turned`
+    of the tilt.
     ``jacobian`` (2, WIDTH): output, the derivatives of the pixel.
 
     Returns the pixel coordinates u and v, and the depth [m].
@@ -248,8 +248,8 @@ def project_planar(
 
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
-    """The pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobian (K, 2, WIDTH).
-    ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame."""
+    """The pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobian (K, 2,
+    WIDTH). ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
     for i in range(len(points)):
@@ -284,12 +284,12 @@ def whiten(
     """Linearise N pixel measurements.
 
     ``k``, ``position``, ``rotation``: the lens, and the camera's pose in the robot frame.
-    ``poses`` (N, 3), ``tilts`` (N, 2), ``points`` (N, 3): the robot's pose and tilt, and the world point of each measurement.
-    ``measured`` (N, 2): the measured pixels. ``sigma`` [px]: the standard deviation of each coordinate.
+    ``poses`` (N, 3), ``tilts`` (N, 2), ``points`` (N, 3): the robot's pose and tilt, and the world point of each
+    measurement. ``measured`` (N, 2): the measured pixels. ``sigma`` [px]: the standard deviation of each coordinate.
     ``robust``: the scale of Huber's loss in standard deviations.
 
-    Returns whitened residuals (N, 2) with robust weights, their Jacobian (N, 2, WIDTH), and the squared norms (N,) of the residuals
-    without robust weights.
+    Returns whitened residuals (N, 2) with robust weights, their Jacobian (N, 2, WIDTH), and the squared norms (N,) of
+    the residuals without robust weights.
     """
     n = len(measured)
     residual, jacobian, squared = np.empty((n, 2)), np.empty((n, 2, WIDTH)), np.zeros(n)
@@ -308,8 +308,8 @@ def see(
     residual: Array,
     jacobian: Array,
 ) -> float:
-    """Linearise one measurement of :func:`whiten`. ``at``: pose, tilt, point and measured pixel. Writes ``residual`` (2,) and
-    ``jacobian`` (2, WIDTH). Returns the squared norm of the residual without robust weight."""
+    """Linearise one measurement of :func:`whiten`. ``at``: pose, tilt, point and measured pixel. Writes ``residual``
+    (2,) and ``jacobian`` (2, WIDTH). Returns the squared norm of the residual without robust weight."""
     pose, tilt, point, measured = at
     u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
     residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma
@@ -341,9 +341,9 @@ def log_likelihood(
 ) -> Array:
     """The compiled part of :func:`factors.camera.model.log_likelihood`.
 
-    ``whiteners`` (K, 2, 2): the matrices that whiten the pixel errors. ``tilts`` (K, 2, 2): the Jacobian of the whitened errors by
-    roll and pitch in standard deviations. ``scale``: the scale of Huber's loss. The tilt of each pose is fitted by least squares,
-    without robust weights.
+    ``whiteners`` (K, 2, 2): the matrices that whiten the pixel errors. ``tilts`` (K, 2, 2): the Jacobian of the
+    whitened errors by roll and pitch in standard deviations. ``scale``: the scale of Huber's loss. The tilt of each
+    pose is fitted by least squares, without robust weights.
     """
     place, count = mounting(position, rotation), len(points)
     px, py, c, s = poses[:, 0].copy(), poses[:, 1].copy(), np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -1,10 +1,10 @@
 """A pinhole camera with lens distortion on a robot: projection and its derivatives.
 
-The axes of the camera frame are z forward, x right, y down. The direction of a point is (x, y) at depth 1. The lens distorts this
-direction, and the pixel is (fx x + cx, fy y + cy) of the distorted direction. The distortion has radial and tangential terms (k1,
-k2, p1, p2) after Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, as in OpenCV and
-``gtsam.Cal3DS2``. Rational polynomials and fisheye lenses (Kannala and Brandt, 2006) are also as in OpenCV. Pixel noise is Gaussian
-with Huber's loss (1964) against outliers.
+The axes of the camera frame are z forward, x right, y down. The direction of a point is (x, y) at depth 1. The lens
+distorts this direction, and the pixel is (fx x + cx, fy y + cy) of the distorted direction. The distortion has radial
+and tangential terms (k1, k2, p1, p2) after Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8),
+1971, as in OpenCV and ``gtsam.Cal3DS2``. Rational polynomials and fisheye lenses (Kannala and Brandt, 2006) are also as
+in OpenCV. Pixel noise is Gaussian with Huber's loss (1964) against outliers.
 
 The distortion polynomial is used up to the radius where it stops growing, because it would fold the image beyond. Directions beyond
 this radius are extrapolated radially, so that they do not appear in the image. Points that are behind the camera, or nearer than
@@ -48,13 +48,13 @@ class CameraModel:
 
     ``fx``, ``fy``, ``cx``, ``cy`` [px]: focal lengths and principal point.
     ``width``, ``height`` [px]: size of the images.
-    ``distortion``: (k1, k2, p1, p2), or (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) of a fisheye lens, as in OpenCV.
-    ``position`` (3,) [m], ``rotation`` (3, 3): pose of the camera in the robot frame.
+    ``distortion``: (k1, k2, p1, p2), or (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) of a fisheye lens, as in
+    OpenCV. ``position`` (3,) [m], ``rotation`` (3, 3): pose of the camera in the robot frame.
     ``sigma`` [px]: standard deviation of each pixel coordinate.
     ``robust``: scale of Huber's loss in standard deviations.
     ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images.
-    ``tilt`` [rad]: standard deviation of the robot's roll and pitch, because floors are not exactly level. All points of an image
-    have this error in common.
+    ``tilt`` [rad]: standard deviation of the robot's roll and pitch, because floors are not exactly level. All points
+    of an image have this error in common.
     ``fisheye``: True for a fisheye lens.
     """
 
@@ -100,8 +100,8 @@ class CameraModel:
 def mounting(roll: float, pitch: float, yaw: float) -> Array:
     """The rotation (3, 3) of a camera in the robot frame from three angles [rad].
 
-    A forward-facing camera is rotated by ``roll`` about x, by ``pitch`` about y (positive is down), and by ``yaw`` about z
-    (positive is left), in this order, about the axes of the robot.
+    A forward-facing camera is rotated by ``roll`` about x, by ``pitch`` about y (positive is down), and by ``yaw``
+    about z (positive is left), in this order, about the axes of the robot.
     """
     return np.asarray(gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ FORWARD)
 
@@ -113,8 +113,8 @@ def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
 
 
 def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
-    """The model with corrected constants. ``changes`` (8,): corrections of :data:`PARAMETERS`. The time offset is ignored, because
-    it is not part of the model."""
+    """The model with corrected constants. ``changes`` (8,): corrections of :data:`PARAMETERS`. The time offset is
+    ignored, because it is not part of the model."""
     turn = np.asarray(gtsam.Rot3.Expmap(changes[3:6]).matrix())
     scale = math.exp(float(changes[FOCAL]))
     return replace(
@@ -145,8 +145,8 @@ def mounted(model: CameraModel, position: Array, rotation: Array) -> tuple[Array
 
 
 def lift(model: CameraModel) -> Array:
-    """The Jacobian (6, 6) of the camera's perturbation by the robot's perturbation. Each perturbation is in the body's own frame,
-    with rotation before translation."""
+    """The Jacobian (6, 6) of the camera's perturbation by the robot's perturbation. Each perturbation is in the body's
+    own frame, with rotation before translation."""
     x, y, z = model.position
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = jacobian[3:, 3:] = model.rotation.T
@@ -155,8 +155,8 @@ def lift(model: CameraModel) -> Array:
 
 
 def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """The robot's position (3,) and rotation (3, 3) in the world, from the camera's ``position`` (3,) and ``rotation`` (3, 3). The
-    inverse of :func:`mounted`."""
+    """The robot's position (3,) and rotation (3, 3) in the world, from the camera's ``position`` (3,) and ``rotation``
+    (3, 3). The inverse of :func:`mounted`."""
     turn = rotation @ model.rotation.T
     return position - turn @ model.position, turn
 
@@ -174,15 +174,15 @@ def camera_pose(model: CameraModel, pose: Array, tilt: Array | None = None) -> t
 
 
 def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array]:
-    """Predict the pixels (K, 2) of world ``points`` (K, 3) from the robot's ``pose`` (3,). Also returns the depths (K,) [m], which
-    are negative behind the camera."""
+    """Predict the pixels (K, 2) of world ``points`` (K, 3) from the robot's ``pose`` (3,). Also returns the depths (K,)
+    [m], which are negative behind the camera."""
     local = in_camera(model, pose, points)
     return project(model, local), local[:, 2]
 
 
 def undistorted(model: CameraModel, pixels: Array) -> Array:
-    """The directions (K, 2) of ``pixels`` (K, 2), as (x, y) at depth 1 in the camera frame. The inverse of :func:`project`,
-    computed by Newton's method."""
+    """The directions (K, 2) of ``pixels`` (K, 2), as (x, y) at depth 1 in the camera frame. The inverse of
+    :func:`project`, computed by Newton's method."""
     distorted = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
     return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(distorted))[0])
 
@@ -195,8 +195,8 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 def folded(model: CameraModel) -> Array | None:
     """Find a pixel (2,) at which the lens model is not invertible, on a grid over the image. Returns None if there is none.
 
-    A lens is invertible at a pixel if a direction within the valid radius of the polynomial projects to the pixel, and the
-    determinant of the lens's Jacobian is positive there.
+    A lens is invertible at a pixel if a direction within the valid radius of the polynomial projects to the pixel, and
+    the determinant of the lens's Jacobian is positive there.
     """
     if not any(model.distortion) and not model.fisheye:
         return None
@@ -214,9 +214,9 @@ def folded(model: CameraModel) -> Array | None:
 def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array, Array, Array]:
     """Predict the pixels of world ``points`` (K, 3) from the robot's planar ``pose`` (3,), with derivatives.
 
-    Returns the pixels (K, 2) and their Jacobians by the pose's body-frame perturbation (K, 2, 3), by the points (K, 2, 3), and by
-    corrections of :data:`PARAMETERS` (K, 2, 8). The derivative by the time offset is zero here, because it needs the robot's
-    velocity.
+    Returns the pixels (K, 2) and their Jacobians by the pose's body-frame perturbation (K, 2, 3), by the points (K, 2,
+    3), and by corrections of :data:`PARAMETERS` (K, 2, 8). The derivative by the time offset is zero here, because it
+    needs the robot's velocity.
     """
     camera = lens_of(model), model.position, model.rotation
     pixels, jacobian = reprojection_kernels.linearize(camera, pose, np.ascontiguousarray(points, dtype=float))
@@ -226,8 +226,8 @@ def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Ar
 def by_tilt(model: CameraModel, by_parameters: Array) -> Array:
     """The Jacobian (K, 2, 2) of pixels by the robot's roll and pitch, in units of their standard deviation ``model.tilt``.
 
-    ``by_parameters`` (K, 2, 8): the Jacobian by :data:`PARAMETERS`. A robot that tilts about its axes on the floor rotates the
-    camera and also moves it.
+    ``by_parameters`` (K, 2, 8): the Jacobian by :data:`PARAMETERS`. A robot that tilts about its axes on the floor
+    rotates the camera and also moves it.
     """
     x, y, z = model.position
     arm = np.array(((0.0, z), (-z, 0.0), (y, -x)))
@@ -239,8 +239,8 @@ def linearize_in_space(
 ) -> tuple[Array, Array, Array]:
     """Predict the pixels of world ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world.
 
-    Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the points (K, 2, 3). The
-    perturbation is in the camera frame with rotation before translation, as in ``gtsam.Pose3``.
+    Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the points (K, 2, 3).
+    The perturbation is in the camera frame with rotation before translation, as in ``gtsam.Pose3``.
     """
     linear: tuple[Array, Array, Array] = reprojection_kernels.linearize_in_space(
         lens_of(model), *(np.ascontiguousarray(part, dtype=float) for part in (position, rotation, points))
@@ -256,8 +256,8 @@ def log_likelihood(
     tilts: Array,
     covariances: Array | None = None,
 ) -> Array:
-    """The robust, tempered log-likelihood (N,), up to a constant, of one image at N poses. Each pose has the roll and pitch that
-    fit best.
+    """The robust, tempered log-likelihood (N,), up to a constant, of one image at N poses. Each pose has the roll and
+    pitch that fit best.
 
     ``poses`` (N, 3): robot poses. ``points`` (K, 3): world points. ``pixels`` (K, 2): their measured pixels.
     ``tilts`` (K, 2, 2): the Jacobian of the pixels by roll and pitch, from :func:`by_tilt`.
@@ -276,8 +276,8 @@ def log_likelihood(
 def lens_of(model: CameraModel) -> Lens:
     """The camera's intrinsic constants as a tuple for compiled code.
 
-    One element limits the radius up to which the distortion is valid. This is the radius where the radial part stops growing, and
-    at most the radius of :data:`WIDEST` or :data:`WIDEST_FISHEYE`.
+    One element limits the radius up to which the distortion is valid. This is the radius where the radial part stops
+    growing, and at most the radius of :data:`WIDEST` or :data:`WIDEST_FISHEYE`.
     """
     focal = model.fx, model.fy, model.cx, model.cy
     if not any(model.distortion) and not model.fisheye:
@@ -326,8 +326,8 @@ class TiltScale:
     def learnt(self, tilt: Array, covariance: Array, prior: float) -> tuple[TiltScale, float]:
         """Update the filter by the tilt estimated in one image.
 
-        ``tilt`` (2,) [rad], ``covariance`` (2, 2): the estimate of roll and pitch, and its covariance.
-        ``prior`` [rad]: the standard deviation of the zero-mean prior of roll and pitch that the estimate was computed with.
+        ``tilt`` (2,) [rad], ``covariance`` (2, 2): the estimate of roll and pitch, and its covariance. ``prior`` [rad]:
+        the standard deviation of the zero-mean prior of roll and pitch that the estimate was computed with.
 
         Returns the updated filter, and the expected standard deviation [rad] of the tilt in this image.
         """
@@ -338,8 +338,8 @@ class TiltScale:
 
 @compiled(error_model="numpy")
 def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_evidence: Array) -> tuple[float, float]:
-    """Compute :meth:`TiltScale.learnt`. Updates ``log_evidence`` in place. Returns the expected standard deviations of later images
-    and of this image."""
+    """Compute :meth:`TiltScale.learnt`. Updates ``log_evidence`` in place. Returns the expected standard deviations of
+    later images and of this image."""
     determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
     a, b, d = covariance[1, 1] / determinant, -covariance[0, 1] / determinant, covariance[0, 0] / determinant
     x, y = a * tilt[0] + b * tilt[1], b * tilt[0] + d * tilt[1]

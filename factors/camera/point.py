@@ -26,8 +26,8 @@ class PointFactor:
     ``estimated``: indices in :data:`~factors.camera.model.PARAMETERS` of the P camera constants that are estimated.
     ``twist`` (3,): the robot's body-frame velocity. Needed if the time offset is estimated.
 
-    The methods take a list of values in this order: the robot's pose (3,), the corrections (P,) of the estimated constants if P >
-    0, the robot's roll and pitch (2,) [rad], and the point (3,) in the world.
+    The methods take a list of values in this order: the robot's pose (3,), the corrections (P,) of the estimated
+    constants if P > 0, the robot's roll and pitch (2,) [rad], and the point (3,) in the world.
     """
 
     model: CameraModel
@@ -42,15 +42,15 @@ class PointFactor:
         return id(self.model)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (2,) with robust weights, and its Jacobian (2, d) by each value. The residual of a point behind the
-        camera is constant, because no gradient leads to the true position."""
+        """The whitened residual (2,) with robust weights, and its Jacobian (2, d) by each value. The residual of a
+        point behind the camera is constant, because no gradient leads to the true position."""
         residuals, blocks = self.linearize_all([self], [values])
         return residuals[0], [block[0] for block in blocks]
 
     @staticmethod
     def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
-        """Linearise N factors of one camera, each at its own values. The constants must be equal in all. Returns residuals (N, 2)
-        and the Jacobian (N, 2, d) by each value."""
+        """Linearise N factors of one camera, each at its own values. The constants must be equal in all. Returns
+        residuals (N, 2) and the Jacobian (N, 2, d) by each value."""
         estimated, constants = factors[0].estimated, values[0][1]
         residual, jacobian, _ = _linearize_all(factors, values)
         if TIME_OFFSET in estimated:
@@ -69,14 +69,14 @@ class PointFactor:
         return float(huber_loss(_linearize_all([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:
-        """True if the pixel is certainly a false match: the point is behind the camera, or its predicted pixel is at least
-        :data:`BEHIND` standard deviations from the measured one."""
+        """True if the pixel is certainly a false match: the point is behind the camera, or its predicted pixel is at
+        least :data:`BEHIND` standard deviations from the measured one."""
         return bool(_linearize_all([self], [values])[2][0] >= BEHIND**2)
 
 
 def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
-    """Linearise N factors. Returns the robustly weighted residuals (N, 2), their Jacobian (N, 2, WIDTH), and the squared norms (N,)
-    of the unweighted residuals."""
+    """Linearise N factors. Returns the robustly weighted residuals (N, 2), their Jacobian (N, 2, WIDTH), and the
+    squared norms (N,) of the unweighted residuals."""
     first = factors[0]
     model, lens, (_, *constants, _, _) = first.model, first.lens, values[0]
     if constants:
@@ -106,8 +106,8 @@ def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) ->
 class PointPrior:
     """A weak prior of a point's position in the robot frame, as a factor on the robot's pose and the point.
 
-    ``mean`` (3,) [m]: the expected position in the robot frame. ``sigma`` [m]: the standard deviation of each coordinate. The
-    methods take a list of two values: the robot's pose (3,) and the point (3,) in the world.
+    ``mean`` (3,) [m]: the expected position in the robot frame. ``sigma`` [m]: the standard deviation of each
+    coordinate. The methods take a list of two values: the robot's pose (3,) and the point (3,) in the world.
 
     A prior in the world frame would constrain the robot: a thousand such priors with 30 m would fix its position to a metre.
     """

@@ -32,16 +32,16 @@ def triangulated(
     ``centres`` (M, 3), ``turns`` (M, 3, 3): positions and rotations of the cameras in the world.
     ``rays`` (M, 3): unit vectors to the point in each camera frame.
     ``pixels`` (M, 2), ``sigmas`` (M,): the measured pixels, and the standard deviation of each coordinate.
-    ``largest_sigma``: the largest allowed standard deviation of the point, relative to its smallest depth.
-    ``parallax`` [rad]: the smallest allowed angle between the outermost rays. ``nearest`` [m]: the smallest allowed depth.
+    ``largest_sigma``: the largest allowed standard deviation of the point, relative to its smallest depth. ``parallax``
+    [rad]: the smallest allowed angle between the outermost rays. ``nearest`` [m]: the smallest allowed depth.
     ``robust``: the scale of Huber's loss in standard deviations, infinite for least squares.
 
-    Returns four values: False if the parallax is too small or the point too uncertain, otherwise True; the point (3,) in the world;
-    its covariance (3, 3); and the squared norms (M,) of its whitened residuals. These are infinite if the point is not at least
-    ``nearest`` in front of all cameras.
+    Returns four values: False if the parallax is too small or the point too uncertain, otherwise True; the point (3,)
+    in the world; its covariance (3, 3); and the squared norms (M,) of its whitened residuals. These are infinite if the
+    point is not at least ``nearest`` in front of all cameras.
 
-    The start is the point nearest to all rays. Gauss-Newton steps on the reprojection error follow (Hartley and Zisserman,
-    "Multiple View Geometry", 2004, chapter 12).
+    The start is the point nearest to all rays. Gauss-Newton steps on the reprojection error follow (Hartley and
+    Zisserman, "Multiple View Geometry", 2004, chapter 12).
     """
     directions = np.empty_like(rays)
     for m in range(len(rays)):
@@ -95,8 +95,8 @@ def inverse_depths(first: Array, second: Array, position: Array, motion: Array) 
 
 @compiled(error_model="numpy")
 def _nearest(centres: Array, directions: Array) -> Array:
-    """The point (3,) with the least squared distances from M rays. ``centres`` (M, 3): starts of the rays. ``directions`` (M, 3):
-    their unit vectors."""
+    """The point (3,) with the least squared distances from M rays. ``centres`` (M, 3): starts of the rays.
+    ``directions`` (M, 3): their unit vectors."""
     left, right = np.zeros((3, 3)), np.zeros((3, 1))
     for m in range(len(directions)):
         for i in range(3):
@@ -111,9 +111,9 @@ def _nearest(centres: Array, directions: Array) -> Array:
 def _inform(
     k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, robust: float, squared: Array
 ) -> tuple[Array, Array, float]:
-    """The Gauss-Newton system of a ``point`` (3,), for the images of :func:`triangulated`. Returns its information matrix (3, 3),
-    the negative gradient (3, 1) of the loss, and the smallest depth of the point. Writes the squared norms of the whitened
-    residuals into ``squared`` (M,)."""
+    """The Gauss-Newton system of a ``point`` (3,), for the images of :func:`triangulated`. Returns its information
+    matrix (3, 3), the negative gradient (3, 1) of the loss, and the smallest depth of the point. Writes the squared
+    norms of the whitened residuals into ``squared`` (M,)."""
     information, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
     for m in range(len(centres)):
         local = product((point - centres[m]).reshape(1, 3), turns[m])
@@ -137,8 +137,8 @@ def _inform(
 
 @compiled(error_model="numpy")
 def _is_below(covariance: Array, most: float) -> bool:
-    """True if the largest eigenvalue of a covariance (3, 3) is less than ``most``. This is so if ``most`` times the identity minus
-    the covariance is positive definite."""
+    """True if the largest eigenvalue of a covariance (3, 3) is less than ``most``. This is so if ``most`` times the
+    identity minus the covariance is positive definite."""
     a, b, c = most - covariance[0, 0], most - covariance[1, 1], most - covariance[2, 2]
     d, e, f = covariance[0, 1], covariance[0, 2], covariance[1, 2]
     two = a * b - d * d

@@ -1,5 +1,5 @@
-"""Compiled functions for known points in an image: the linearisation of :class:`~factors.camera.factor.ReprojectionFactor`, and the
-estimation of the robot's roll and pitch."""
+"""Compiled functions for known points in an image: the linearisation of
+:class:`~factors.camera.factor.ReprojectionFactor`, and the estimation of the robot's roll and pitch."""
 
 import math
 from typing import NamedTuple
@@ -44,8 +44,8 @@ class PackedImage(NamedTuple):
 def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array, Array]:
     """The whitened residual (K, 2) of a level robot at ``pose`` (3,), predicted minus measured, and its Jacobian (K, 2, width).
 
-    The columns of a full Jacobian are the pose (3), the tilt (2) in standard deviations, the point (3), and the camera's constants
-    (8). ``width``: the number of columns to compute. The derivative by the time offset is zero.
+    The columns of a full Jacobian are the pose (3), the tilt (2) in standard deviations, the point (3), and the
+    camera's constants (8). ``width``: the number of columns to compute. The derivative by the time offset is zero.
     """
     count, row = len(image.points), np.empty((2, WIDTH))
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, width))
@@ -92,8 +92,8 @@ def _widened(
 ) -> tuple[float, float, float]:
     """Add the effect of three uncertain variables to the covariance (uu, uv, vv) of a pixel.
 
-    ``covariance`` (3, 3): covariance of the variables. ``row`` (2, WIDTH): the pixel's Jacobian. ``first``: its first column for
-    the variables. ``count``: a factor of the added covariance. Returns the new uu, uv and vv.
+    ``covariance`` (3, 3): covariance of the variables. ``row`` (2, WIDTH): the pixel's Jacobian. ``first``: its first
+    column for the variables. ``count``: a factor of the added covariance. Returns the new uu, uv and vv.
     """
     p = row[0, first], row[0, first + 1], row[0, first + 2]
     q = row[1, first], row[1, first + 1], row[1, first + 2]
@@ -103,8 +103,8 @@ def _widened(
 
 @compiled(error_model="numpy")
 def linearized(image: PackedImage, pose: Array) -> tuple[Array, Array]:
-    """The whitened residual (2K,) and its Jacobian (2K, 3) by the pose, with robust weights and tempering and with the tilt
-    marginalised, as in :meth:`~factors.camera.factor.ReprojectionFactor.linearize`."""
+    """The whitened residual (2K,) and its Jacobian (2K, 3) by the pose, with robust weights and tempering and with the
+    tilt marginalised, as in :meth:`~factors.camera.factor.ReprojectionFactor.linearize`."""
     residual, jacobian = whitened(image, pose)
     return marginal(residual, jacobian, image.robust, image.tempering)
 
@@ -113,8 +113,8 @@ def linearized(image: PackedImage, pose: Array) -> tuple[Array, Array]:
 def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float, Array]:
     """Fit roll and pitch to whitened residuals (K, 2), by iteratively reweighted least squares. The cost is convex.
 
-    ``by_tilt`` (K, 2, 2): the Jacobian by roll and pitch in standard deviations. ``robust``: the scale of Huber's loss. Returns
-    roll and pitch in standard deviations, and the robust weights (K,) at the solution.
+    ``by_tilt`` (K, 2, 2): the Jacobian by roll and pitch in standard deviations. ``robust``: the scale of Huber's loss.
+    Returns roll and pitch in standard deviations, and the robust weights (K,) at the solution.
     """
     n, roll, pitch = len(residual), 0.0, 0.0
     weights = np.ones(n)
@@ -141,13 +141,13 @@ def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float
 def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) -> tuple[Array, Array]:
     """Marginalise the tilt, an error that all K points have in common.
 
-    ``residual`` (K, 2): whitened. ``jacobian`` (K, 2, D + 2): by D variables and, in the last two columns T, by the tilt in
-    standard deviations. ``robust``: the scale of Huber's loss. ``tempering``: the exponent of the likelihood. Returns the residual
-    (2K,) and its Jacobian (2K, D), whitened for the noise with the tilt.
+    ``residual`` (K, 2): whitened. ``jacobian`` (K, 2, D + 2): by D variables and, in the last two columns T, by the
+    tilt in standard deviations. ``robust``: the scale of Huber's loss. ``tempering``: the exponent of the likelihood.
+    Returns the residual (2K,) and its Jacobian (2K, D), whitened for the noise with the tilt.
 
-    With the diagonal matrix W of robust weights, the covariance of the residuals is W^-1 + T T'. A square root of its inverse is
-    (1 - A C A') W^(1/2), with A = W^(1/2) T, H^2 = 1 + A'A, and C^-1 = H (H + 1). The result is multiplied by the square root of
-    the tempering.
+    With the diagonal matrix W of robust weights, the covariance of the residuals is W^-1 + T T'. A square root of its
+    inverse is (1 - A C A') W^(1/2), with A = W^(1/2) T, H^2 = 1 + A'A, and C^-1 = H (H + 1). The result is multiplied
+    by the square root of the tempering.
     """
     n, size = len(residual), jacobian.shape[2] - 2
     _, _, weights = tilted(residual, jacobian[:, :, size:], robust)
@@ -182,8 +182,8 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
 
 @compiled(error_model="numpy")
 def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, Array]:
-    """Estimate the robot's roll and pitch from one image, by least squares. ``pose`` (3,), ``covariance`` (3, 3): the prior of the
-    robot's pose. Returns roll and pitch (2,) [rad] and their covariance (2, 2)."""
+    """Estimate the robot's roll and pitch from one image, by least squares. ``pose`` (3,), ``covariance`` (3, 3): the
+    prior of the robot's pose. Returns roll and pitch (2,) [rad] and their covariance (2, 2)."""
     residual, jacobian = whitened(image, pose)
     prior = np.eye(POINT)
     put(inverse(covariance), prior)
@@ -200,8 +200,8 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
     ``tilt`` [rad]: the standard deviation of the robot's roll and pitch.
     ``pose`` (3,), ``covariance`` (3, 3): the robot's planar pose, and its body-frame covariance.
 
-    Returns the camera's position (3,) and rotation (3, 3) in the world, and the covariance (6, 6) of its perturbation in the camera
-    frame, with rotation before translation.
+    Returns the camera's position (3,) and rotation (3, 3) in the world, and the covariance (6, 6) of its perturbation
+    in the camera frame, with rotation before translation.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, POINT)), np.empty((6, 6))
@@ -223,8 +223,8 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
 
 @compiled(error_model="numpy")
 def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
-    """The covariances (K, 2, 2) of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian of the pixels by the
-    points.
+    """The covariances (K, 2, 2) of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian of the pixels
+    by the points.
     ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel noise."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):

@@ -1,5 +1,5 @@
-"""The factor of measured ranges and bearings of landmarks. It depends on a robot pose, and optionally on calibration constants of
-the sensor, on a range bias, and on the position of an unknown landmark."""
+"""The factor of measured ranges and bearings of landmarks. It depends on a robot pose, and optionally on calibration
+constants of the sensor, on a range bias, and on the position of an unknown landmark."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class BearingRangeFactor:
 
     ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their heights above the sensor.
     ``ranges``, ``bearings``: measurements (K,) [m, rad], NaN where a value is missing.
-    ``offset`` (3,): the robot's pose at the measurement's time, in the frame of the pose variable. Odometry measures it. None if
-    both poses are the same.
+    ``offset`` (3,): the robot's pose at the measurement's time, in the frame of the pose variable. Odometry measures
+    it. None if both poses are the same.
     ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
     ``point_covariances`` (K, 2, 2): covariances of the landmarks of an inexact map. They are added to the noise.
     ``estimated``: indices in :data:`PARAMETERS` of the P sensor constants that are estimated.
@@ -56,8 +56,8 @@ class BearingRangeFactor:
     ``in_look``: the number of landmarks measured at this time, including those in separate factors. None means K. The landmarks
     have the error of ``offset`` in common, so its covariance is multiplied by this number and does not average out.
 
-    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P > 0, the
-    range bias (1,) [m] if ``biased``, and the landmark's position (2,) if ``free``.
+    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P
+    > 0, the range bias (1,) [m] if ``biased``, and the landmark's position (2,) if ``free``.
     """
 
     model: BearingRangeModel
@@ -88,8 +88,8 @@ class BearingRangeFactor:
 
     @property
     def kind(self) -> Hashable:
-        """A key that is equal for factors that can be linearised together. None if the factor has a free landmark or a bias, since
-        such factors are linearised one by one."""
+        """A key that is equal for factors that can be linearised together. None if the factor has a free landmark or a
+        bias, since such factors are linearised one by one."""
         return None if self.free or self.biased else (self.estimated, self.model)
 
     def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
@@ -97,8 +97,8 @@ class BearingRangeFactor:
         return BearingRangeStack(factors, numbers, column)
 
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
-        """The number of landmarks whose normalised innovation squared exceeds ``limit``, at the predicted ``pose`` (3,) with
-        body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
+        """The number of landmarks whose normalised innovation squared exceeds ``limit``, at the predicted ``pose`` (3,)
+        with body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
         contiguous = np.ascontiguousarray(covariance)
         return int(kernels.beyond(self.model.packed, pose, self.packed, contiguous, limit))
 
@@ -144,8 +144,8 @@ class BearingRangeFactor:
         return self if late == self.model.late else replace(self, model=with_late(self.model, late))
 
     def predicted(self, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """The arguments of :meth:`~factors.landmarks.late.LateShares.after` at a predicted ``pose`` (3,) with body-frame
-        ``covariance`` (3, 3). The factor must depend on the pose only."""
+        """The arguments of :meth:`~factors.landmarks.late.LateShares.after` at a predicted ``pose`` (3,) with
+        body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
         contiguous = np.ascontiguousarray(covariance)
         return kernels.predicted(self.model.packed, self.packed, pose, contiguous)
 
@@ -177,8 +177,8 @@ class BearingRangeFactor:
         return self.ranges - values[1 + bool(self.estimated)][0] if self.biased else self.ranges
 
     def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
-        """The whitened residual (K, 2) with ``bias`` [m] added to the range bias, and its Jacobian (K, 2, WIDTH) by the pose, the
-        landmark and all sensor constants."""
+        """The whitened residual (K, 2) with ``bias`` [m] added to the range bias, and its Jacobian (K, 2, WIDTH) by the
+        pose, the landmark and all sensor constants."""
         packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
@@ -228,8 +228,8 @@ class BearingRangeFactor:
     def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
         """Compute the position of a single landmark from its range and bearing, to initialise a free landmark.
 
-        ``values``: the values of the factor without the landmark's position. Returns the position (2,) in the world, its Jacobian
-        (2, d) by each of ``values``, and its covariance (2, 2) caused by the measurement noise.
+        ``values``: the values of the factor without the landmark's position. Returns the position (2,) in the world,
+        its Jacobian (2, d) by each of ``values``, and its covariance (2, 2) caused by the measurement noise.
         """
         on_pose = self.fixed(values[1:], None)
         at = values[0] if on_pose.offset is None else se2.compose(values[0], on_pose.offset)
@@ -327,8 +327,8 @@ class BearingRangeStack:
         return np.repeat(np.repeat(self._pose_of, np.diff(self._ends, prepend=0)), 2)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Write the whitened residuals with robust weights into ``residual`` (2 K,), and their Jacobian into ``jacobian``
-        (2 K, 6 + P). The columns are those of :mod:`factors.chain`."""
+        """Write the whitened residuals with robust weights into ``residual`` (2 K,), and their Jacobian into
+        ``jacobian`` (2 K, 6 + P). The columns are those of :mod:`factors.chain`."""
         error, by_all, slopes = self._whitened(poses, parameters)
         losses.weigh(self._model, error, by_all, slopes)
         by_all = by_all.reshape(len(residual), WIDTH)
@@ -359,8 +359,8 @@ def _places(estimated: tuple[int, ...]) -> Integers:
 
 
 def _raised_inverse(by_point: Array) -> Array:
-    """The inverse of a whitened Jacobian (2, 2) by a landmark's position. Small singular values are raised to a minimum first,
-    because the Jacobian is singular for a landmark at the sensor."""
+    """The inverse of a whitened Jacobian (2, 2) by a landmark's position. Small singular values are raised to a minimum
+    first, because the Jacobian is singular for a landmark at the sensor."""
     rows, values, columns = np.linalg.svd(by_point)
     if values[1] > LEAST_TOLD * values[0]:
         return np.asarray(np.linalg.inv(by_point))

@@ -1,6 +1,6 @@
-"""Compiled functions for landmark measurements: linearisation for graphs, and a Kalman update in information form for filters. The
-update is equivalent to :func:`factors.update.update_state`. A filter computes a dozen small matrices per measurement, and NumPy is
-slow for these."""
+"""Compiled functions for landmark measurements: linearisation for graphs, and a Kalman update in information form for
+filters. The update is equivalent to :func:`factors.update.update_state`. A filter computes a dozen small matrices per
+measurement, and NumPy is slow for these."""
 
 import math
 
@@ -90,8 +90,8 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
 
 @compiled
 def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
-    """The whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH). Each measurement has its own
-    point (N, 2) or (N, 3) and its own pose (N, 3). ``model``: as of :func:`linearize`."""
+    """The whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH). Each measurement has
+    its own point (N, 2) or (N, 3) and its own pose (N, 3). ``model``: as of :func:`linearize`."""
     error, jacobian = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, WIDTH))
     mounted, depth = (model[0], model[1], model[TURN]), model[DEPTH] > 0.0
     noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]
@@ -119,8 +119,8 @@ def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> No
 
 @compiled
 def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
-    """Propagate a covariance (D, D) by the first D columns J of a Jacobian. Returns the elements (0, 0), (1, 0) and (1, 1) of the
-    product ``J covariance J^T``."""
+    """Propagate a covariance (D, D) by the first D columns J of a Jacobian. Returns the elements (0, 0), (1, 0) and (1,
+    1) of the product ``J covariance J^T``."""
     a = b = d = 0.0
     for i in range(len(covariance)):
         for j in range(len(covariance)):
@@ -169,8 +169,8 @@ def linearize_all(
     ``ends`` (L,): the index behind the last row of each measurement.
     ``measured``: points, ranges and bearings, with K rows each.
     ``flags`` (L, 4): True where a measurement has an offset, an offset covariance, a velocity, and point covariances.
-    ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): those of each measurement; ignored where a flag is False.
-    ``counts`` (L,): the number of landmarks that have the error of an offset in common.
+    ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): those of each measurement; ignored where a flag is
+    False. ``counts`` (L,): the number of landmarks that have the error of an offset in common.
     ``surveys`` (K, 2, 2): point covariances.
     ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): outputs, which must contain zeros before the call.
     """
@@ -254,8 +254,8 @@ def updated(
 def weighted(
     model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
 ) -> tuple[Array, Array, Array]:
-    """The whitened residual (2K,) with robust weights, and its Jacobians by the pose (2K, 3) and by the estimated constants
-    (2K, P). The arguments are those of :func:`updated`."""
+    """The whitened residual (2K,) with robust weights, and its Jacobians by the pose (2K, 3) and by the estimated
+    constants (2K, P). The arguments are those of :func:`updated`."""
     count, wide = len(packed[0]), len(indices)
     residual, jacobian, slope = np.empty((count, 2)), np.empty((count, 2, 3 + wide)), np.empty(count)
     _linearized(model, packed, pose, values, indices, residual, jacobian, slope)
@@ -266,8 +266,8 @@ def weighted(
 
 @compiled(error_model="numpy")
 def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """The whitened errors (K,) of ranges at a predicted pose with body-frame ``covariance`` (3, 3), their :func:`slopes` (K,), and
-    the variances (K,) of the predicted ranges in units of the noise."""
+    """The whitened errors (K,) of ranges at a predicted pose with body-frame ``covariance`` (3, 3), their
+    :func:`slopes` (K,), and the variances (K,) of the predicted ranges in units of the noise."""
     count = len(packed[0])
     error, jacobian, slope, variances = (
         np.zeros((count, 2)),
@@ -311,8 +311,8 @@ def _linearized(
     jacobian: Array,
     slope: Array,
 ) -> None:
-    """Write the whitened residuals (K, 2), their Jacobian (K, 2, 3 + P) by the pose and the estimated constants, and their
-    :func:`slopes` (K,). The arguments are those of :func:`updated`."""
+    """Write the whitened residuals (K, 2), their Jacobian (K, 2, 3 + P) by the pose and the estimated constants, and
+    their :func:`slopes` (K,). The arguments are those of :func:`updated`."""
     count = len(residual)
     changes = np.zeros(len(PARAMETERS))
     for j in range(len(values)):

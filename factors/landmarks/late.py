@@ -1,8 +1,8 @@
 """Late ranges: a radio wave that arrives by a reflection has travelled further than the line of sight.
 
-A range without a bearing is either direct or late. The noise of a direct range is Gaussian. A late range has an additional excess,
-which is Gaussian with a positive mean. Both parts have the robust loss of Geman and McClure, so that gross errors have little
-influence. The likelihood is the sum of both parts, weighted by the share of late ranges.
+A range without a bearing is either direct or late. The noise of a direct range is Gaussian. A late range has an
+additional excess, which is Gaussian with a positive mean. Both parts have the robust loss of Geman and McClure, so that
+gross errors have little influence. The likelihood is the sum of both parts, weighted by the share of late ranges.
 
 :class:`LateShares` learns the share and the excess of a sensor from innovations. Other hypotheses compete for the same
 innovations: a larger or smaller noise, a bias of all ranges, and gross errors. All hypotheses have prior probabilities.
@@ -39,8 +39,8 @@ LEAST_INFORMATION = (
 
 
 class LateRanges(NamedTuple):
-    """The late ranges of a sensor. ``share``: the probability that a range is late. ``mean``, ``spread``: the mean and the standard
-    deviation of the excess of a late range [m]."""
+    """The late ranges of a sensor. ``share``: the probability that a range is late. ``mean``, ``spread``: the mean and
+    the standard deviation of the excess of a late range [m]."""
 
     share: float = 0.0
     mean: float = 0.0
@@ -60,8 +60,8 @@ def mixture(
     ``slope``: the inverse of the standard deviation [1/m].
     ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``spread``: those of :class:`LateRanges`.
 
-    The information is that of a range known to be direct or late, averaged over both, minus the variance of the derivative (Louis,
-    Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
+    The information is that of a range known to be direct or late, averaged over both, minus the variance of the
+    derivative (Louis, Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
     """
     widening = 1.0 + (slope * spread) ** 2
     beyond = error + slope * mean
@@ -83,12 +83,12 @@ def mixture(
 def moments(
     error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, spread: float
 ) -> tuple[float, float, float]:
-    """Returns the error and the weight of a Gaussian measurement that has the effect of a range on a prediction, and the normalised
-    innovation squared, averaged over both parts.
+    """Returns the error and the weight of a Gaussian measurement that has the effect of a range on a prediction, and
+    the normalised innovation squared, averaged over both parts.
 
-    The prediction is corrected by a direct and by a late range. The mixture of both results is replaced by a Gaussian with the same
-    mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian inference", 2001, 3.1).
-    A variance above that of the prediction is reduced to it.
+    The prediction is corrected by a direct and by a late range. The mixture of both results is replaced by a Gaussian
+    with the same mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian
+    inference", 2001, 3.1). A variance above that of the prediction is reduced to it.
 
     ``variance``: that of the predicted range in units of the noise. ``gate``: the noise is increased if a normalised innovation
     squared exceeds this limit, as in :func:`factors.update.update_state`. The other arguments are those of :func:`mixture`.
@@ -137,8 +137,8 @@ class LateShares:
     """What is known about the late ranges of a sensor. Immutable.
 
     ``probability``: the prior probability that the sensor has late ranges.
-    ``log_weights`` (noises, 1 + H): the logarithms of the posterior probabilities of all hypotheses. None means the prior.
-    ``expected``: the late ranges, averaged over all hypotheses.
+    ``log_weights`` (noises, 1 + H): the logarithms of the posterior probabilities of all hypotheses. None means the
+    prior. ``expected``: the late ranges, averaged over all hypotheses.
     """
 
     probability: float
@@ -159,9 +159,9 @@ class LateShares:
     def after(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
         """The posterior after K ranges.
 
-        ``errors`` (K,): the predicted minus the measured ranges in standard deviations. ``slopes`` (K,): the inverse standard
-        deviations [1/m], 0 for measurements that cannot be late. ``variances`` (K,): those of the predicted ranges, in units of the
-        noise.
+        ``errors`` (K,): the predicted minus the measured ranges in standard deviations. ``slopes`` (K,): the inverse
+        standard deviations [1/m], 0 for measurements that cannot be late. ``variances`` (K,): those of the predicted
+        ranges, in units of the noise.
         """
         if self.probability == 0.0 or not slopes.any():
             return self
@@ -178,8 +178,8 @@ def _rounded(value: float) -> float:
 def _learnt(
     logs: Array, shares: Array, means: Array, spreads: Array, errors: Array, slopes: Array, variances: Array
 ) -> Array:
-    """The normalised logarithms of the probabilities of all hypotheses after K ranges. ``logs`` (noises, 1 + H): those before.
-    ``shares``, ``means``, ``spreads`` (H,): the hypotheses with an excess. The other arguments are those of
+    """The normalised logarithms of the probabilities of all hypotheses after K ranges. ``logs`` (noises, 1 + H): those
+    before. ``shares``, ``means``, ``spreads`` (H,): the hypotheses with an excess. The other arguments are those of
     :meth:`LateShares.after`."""
     out, late = logs.copy(), np.empty(_PARTS)
     for k in range(len(errors)):
@@ -204,8 +204,8 @@ def _learnt(
 
 @compiled(error_model="numpy")
 def _averaged(logs: Array, shares: Array, means: Array, spreads: Array) -> tuple[float, float, float]:
-    """The share of late ranges, and the mean and standard deviation of their excess, averaged over all hypotheses. The arguments
-    are those of :func:`_learnt`."""
+    """The share of late ranges, and the mean and standard deviation of their excess, averaged over all hypotheses. The
+    arguments are those of :func:`_learnt`."""
     share = first = second = 0.0
     for j in range(len(shares)):
         if shares[j] < 1.0:

@@ -13,8 +13,8 @@ from factors.se2 import Array, Integers
 
 @compiled
 def slopes(error: Array, jacobian: Array, ranges: Array, bearings: Array, out: Array) -> None:
-    """Compute the derivatives ``out`` (K,) of whitened range residuals by the predicted ranges [1/m]. A derivative is 0 if a
-    landmark is not measured by its range alone. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the outputs of
+    """Compute the derivatives ``out`` (K,) of whitened range residuals by the predicted ranges [1/m]. A derivative is 0
+    if a landmark is not measured by its range alone. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the outputs of
     :func:`factors.landmarks.kernels.linearize`."""
     for k in range(len(ranges)):
         alone = math.isnan(bearings[k]) and not math.isnan(ranges[k])
@@ -37,9 +37,9 @@ def loss(model: Array, error: Array, slopes: Array) -> float:
 
 @compiled
 def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
-    """Compute the ``weights`` (K,) of the squared residuals for iteratively reweighted least squares. The ``error`` of a range that
-    may be late changes in place, so that the product of weight and error is the derivative of the loss. The other arguments are
-    those of :func:`loss`."""
+    """Compute the ``weights`` (K,) of the squared residuals for iteratively reweighted least squares. The ``error`` of
+    a range that may be late changes in place, so that the product of weight and error is the derivative of the loss.
+    The other arguments are those of :func:`loss`."""
     for k in range(len(error)):
         if slopes[k] > 0.0 and model[LATE] > 0.0:
             late = model[ROBUST], model[LATE], model[LATE + 1], model[LATE + 2]
@@ -51,8 +51,8 @@ def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
 
 @compiled
 def weigh(model: Array, error: Array, jacobian: Array, slopes: Array) -> None:
-    """Multiply residuals (K, 2) and their Jacobian (K, 2, D), in place, by the square roots of their weights. Afterwards the
-    product of both is the derivative of the loss. The other arguments are those of :func:`loss`."""
+    """Multiply residuals (K, 2) and their Jacobian (K, 2, D), in place, by the square roots of their weights.
+    Afterwards the product of both is the derivative of the loss. The other arguments are those of :func:`loss`."""
     weights = np.empty(len(error))
     reweigh(model, error, slopes, weights)
     for k in range(len(error)):
@@ -75,11 +75,11 @@ def resolve(
     weights: Array,
     squared: Array,
 ) -> bool:
-    """Replace ranges that may be late by Gaussian measurements (:func:`factors.landmarks.late.moments`). Their ``error``,
-    ``weights`` and ``squared`` change in place. Returns True if there are such ranges.
+    """Replace ranges that may be late by Gaussian measurements (:func:`factors.landmarks.late.moments`). Their
+    ``error``, ``weights`` and ``squared`` change in place. Returns True if there are such ranges.
 
-    ``error`` (K, 2), ``jacobian`` (K, 2, D): whitened residuals at the prediction, and their Jacobian.
-    ``columns`` (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): that of the state.
+    ``error`` (K, 2), ``jacobian`` (K, 2, D): whitened residuals at the prediction, and their Jacobian. ``columns``
+    (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): that of the state.
     ``weights`` (K,): the weights of the squared residuals. ``squared`` (K,): the normalised innovations squared.
     ``gate``: see :func:`factors.landmarks.late.moments`. ``model`` and ``slopes`` are those of :func:`loss`.
     """

@@ -39,9 +39,9 @@ class BearingRangeModel:
 
     ``mounting``: (x, y, heading) of the sensor in the robot frame [m, m, rad].
     ``range_scale``: the reported range divided by the true range.
-    ``depth``: True if ranges are measured along one axis. ``depth_axis``: the direction of this axis in the sensor frame [rad].
-    ``range_sigma`` [m], ``range_sigma_relative``: the standard deviation of a range r is ``hypot(range_sigma,
-    range_sigma_relative * r)``.
+    ``depth``: True if ranges are measured along one axis. ``depth_axis``: the direction of this axis in the sensor
+    frame [rad]. ``range_sigma`` [m], ``range_sigma_relative``: the standard deviation of a range r is
+    ``hypot(range_sigma, range_sigma_relative * r)``.
     ``bearing_bias``, ``bearing_sigma``: offset and standard deviation of bearings [rad].
     ``robust``: the scale of the Geman-McClure loss in standard deviations.
     ``late``: the late ranges among those without a bearing.
@@ -84,8 +84,8 @@ def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Arra
 
 
 def on_floor(model: BearingRangeModel, points: Array, ranges: Array) -> Array:
-    """Convert slant ranges (K,) to ranges along the floor. ``points``: (K, 3) with the height above the sensor as third coordinate.
-    If the points (K, 2) have no heights, the ranges are returned unchanged."""
+    """Convert slant ranges (K,) to ranges along the floor. ``points``: (K, 3) with the height above the sensor as third
+    coordinate. If the points (K, 2) have no heights, the ranges are returned unchanged."""
     if points.shape[1] <= HEIGHT:
         return ranges
     squared = np.square(ranges / model.range_scale) - np.square(points[:, HEIGHT])
@@ -112,8 +112,8 @@ def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
 
 
 def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
-    """The whitened residuals (..., K, 2) of K points (K, 2), predicted minus measured. ``poses``: (..., 1, 3) or (3,). A residual
-    is zero where the range or bearing is missing (NaN)."""
+    """The whitened residuals (..., K, 2) of K points (K, 2), predicted minus measured. ``poses``: (..., 1, 3) or (3,).
+    A residual is zero where the range or bearing is missing (NaN)."""
     expected_range, expected_bearing = predict(model, poses, points)
     sigma = sigmas(model, ranges)
     error = np.empty((*np.shape(expected_range), 2))
@@ -182,8 +182,8 @@ def whitened_into(
     ``model``: range scale, range sigma, relative range sigma, bearing bias, bearing sigma.
     ``error`` (K, 2): output, the residuals. Must contain zeros before the call.
     ``jacobian`` (K, 2, WIDTH): output, the derivatives by the body-frame perturbation of the pose, by the point, and by
-    :data:`PARAMETERS`. The derivative by the range scale is by its relative change. The derivative by the time offset stays zero,
-    because it needs the robot's velocity. Must contain zeros before the call.
+    :data:`PARAMETERS`. The derivative by the range scale is by its relative change. The derivative by the time offset
+    stays zero, because it needs the robot's velocity. Must contain zeros before the call.
     """
     range_scale, _, _, _, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -231,8 +231,8 @@ def _whitened(
 ) -> tuple[float, float, float, float, float, float, float]:
     """The whitened errors of range and bearing of one point, and intermediate values for derivatives.
 
-    ``sx``, ``sy``, ``height``: the vector from the sensor to the point, along the robot's axes [m]. ``turn``: heading of the sensor
-    in the robot frame. ``ahead_x``, ``ahead_y``: unit vector of the depth axis in the robot frame.
+    ``sx``, ``sy``, ``height``: the vector from the sensor to the point, along the robot's axes [m]. ``turn``: heading
+    of the sensor in the robot frame. ``ahead_x``, ``ahead_y``: unit vector of the depth axis in the robot frame.
 
     Returns the errors of range and bearing (zero if missing), the point's distance along the floor, the derivatives of the
     unscaled range by ``sx`` and ``sy``, the unscaled range, and the inverse standard deviation of the range (zero if missing).
@@ -298,11 +298,11 @@ def _losses(
 ) -> None:
     """Compute the negative log-likelihoods of K landmarks at N poses.
 
-    ``constants`` (N, 5): sensor constants for each pose. ``turn``: heading of the sensor in the robot frame.
-    ``noise``: range sigma, relative range sigma, bearing sigma. ``tails``: scale of the robust loss, and the late ranges.
+    ``constants`` (N, 5): sensor constants for each pose. ``turn``: heading of the sensor in the robot frame. ``noise``:
+    range sigma, relative range sigma, bearing sigma. ``tails``: scale of the robust loss, and the late ranges.
     ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
-    ``losses`` (N, K): output. With covariances it contains half the logarithm of the determinant of the noise covariance with the
-    points' part relative to that without.
+    ``losses`` (N, K): output. With covariances it contains half the logarithm of the determinant of the noise
+    covariance with the points' part relative to that without.
     """
     robust, share, mean, spread = tails
     range_sigma, range_sigma_relative, bearing_sigma = noise

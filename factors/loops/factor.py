@@ -26,11 +26,11 @@ from factors.se2 import Array
 class LoopFactor:
     """A loop closure as a robust factor on two poses.
 
-    ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are known to be equal.
-    ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If ``measured`` is None, the
-    standard deviation (1,) [m] of each coordinate of the difference of the positions.
-    ``offset``: the motion from the later pose variable to the pose at the time of the loop closure. Its covariance is added to the
-    noise. None if both are the same pose. ``earlier_offset``: the same for the earlier pose variable.
+    ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are known to be
+    equal. ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If
+    ``measured`` is None, the standard deviation (1,) [m] of each coordinate of the difference of the positions.
+    ``offset``: the motion from the later pose variable to the pose at the time of the loop closure. Its covariance is
+    added to the noise. None if both are the same pose. ``earlier_offset``: the same for the earlier pose variable.
     ``robust``: scale of the loss in standard deviations.
 
     The methods take a list of two values: the later pose (3,) and the earlier pose (3,).
@@ -54,8 +54,8 @@ class LoopFactor:
         return weight * error, [weight * by_later, weight * by_earlier]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """The whitened residual (2,) or (3,), its Jacobian by the later pose, and its Jacobian by the earlier pose, without robust
-        weights."""
+        """The whitened residual (2,) or (3,), its Jacobian by the later pose, and its Jacobian by the earlier pose,
+        without robust weights."""
         moved = [None if o is None else o.delta for o in (self.offset, self.earlier_offset)]
         later, earlier = (v if o is None else se2.compose(v, o) for v, o in zip(values, moved, strict=True))
         if self.measured is not None:

@@ -1,12 +1,12 @@
-"""Integration of a run's odometry in a frame of its own. The result is a chain of knots, one for each odometry measurement. A knot
-is the integrated state at the time of the measurement.
+"""Integration of a run's odometry in a frame of its own. The result is a chain of knots, one for each odometry
+measurement. A knot is the integrated state at the time of the measurement.
 
-Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9). Commanded velocities
-act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
+Between knots the robot follows a circular arc (Thrun, Burgard, Fox, "Probabilistic Robotics", 2005, eq. 5.9). Commanded
+velocities act after a delay and through a first-order lag, ``v' = (u(t - delay) - v) / lag``.
 
-The rotation measured by a gyro replaces that of the wheels. If there is no recent gyro measurement, the rotation of the wheels is
-used. The robot is at rest if the wheels report rest and the gyro reports a small rate, so that gyro noise and bias do not turn a
-resting robot.
+The rotation measured by a gyro replaces that of the wheels. If there is no recent gyro measurement, the rotation of the
+wheels is used. The robot is at rest if the wheels report rest and the gyro reports a small rate, so that gyro noise and
+bias do not turn a resting robot.
 """
 
 import math
@@ -53,15 +53,15 @@ TWIST_TIME = 0.1  # s; a velocity is the mean over this time
 class OdometryChain:
     """The integrated odometry of a run. Add rows (odometry measurements), then ask for states and motions at any time.
 
-    Rows may arrive late. The integrated states at the later rows (knots) are then computed again. After the last row, the robot is
-    assumed to continue with its velocity.
+    Rows may arrive late. The integrated states at the later rows (knots) are then computed again. After the last row,
+    the robot is assumed to continue with its velocity.
 
     ``model``: the odometry's constants and noise.
     ``use_gyro``: True if gyro rows replace the rotation of the wheels.
-    ``horizon`` [s]: rows that are this much older than the newest row may be deleted. New rows before the oldest remaining row are
-    rejected.
-    ``estimated``: indices in :data:`~factors.odometry.model.PARAMETERS` of the P constants that the estimator estimates. Methods
-    with ``constants`` (P,) correct motions for changes of these.
+    ``horizon`` [s]: rows that are this much older than the newest row may be deleted. New rows before the oldest
+    remaining row are rejected.
+    ``estimated``: indices in :data:`~factors.odometry.model.PARAMETERS` of the P constants that the estimator
+    estimates. Methods with ``constants`` (P,) correct motions for changes of these.
     """
 
     def __init__(
@@ -90,15 +90,15 @@ class OdometryChain:
         self._noise = np.array(m.noise())
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
-        """Add a row with forward velocity [m/s] and turn rate [rad/s], valid from ``t`` until the next row. Returns False if the
-        row is too old and is ignored."""
+        """Add a row with forward velocity [m/s] and turn rate [rad/s], valid from ``t`` until the next row. Returns
+        False if the row is too old and is ignored."""
         return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
         """Add the motion (dx, dy, dtheta) from the previous row until ``t``, in the robot frame at the previous row.
 
-        ``unknown`` [s]: the part of the time since the previous row in which the motion is unknown. If there is already a
-        motion until ``t``, the new motion is composed with it. Returns False if the row is too old and is ignored.
+        ``unknown`` [s]: the part of the time since the previous row in which the motion is unknown. If there is already
+        a motion until ``t``, the new motion is composed with it. Returns False if the row is too old and is ignored.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
@@ -112,8 +112,8 @@ class OdometryChain:
         return self._insert(t, INCREMENT, x, y, turned, unknown)
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
-        """Add a gyro row with turn rate ``w`` [rad/s], valid from ``t`` until the next gyro row. It replaces the rotation of the
-        wheels. Returns False if the row is too old and is ignored."""
+        """Add a gyro row with turn rate ``w`` [rad/s], valid from ``t`` until the next gyro row. It replaces the
+        rotation of the wheels. Returns False if the row is too old and is ignored."""
         return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
@@ -129,8 +129,8 @@ class OdometryChain:
         return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array, unknown: Array | None = None) -> None:
-        """Add N motions as :meth:`add_increment` does, in order of time and after all existing rows. Motions with equal timestamps
-        are composed.
+        """Add N motions as :meth:`add_increment` does, in order of time and after all existing rows. Motions with equal
+        timestamps are composed.
         """
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
@@ -145,8 +145,8 @@ class OdometryChain:
         self._now_has(count, forgets=count < end)
 
     def state(self, t: float) -> ChainState:
-        """The integrated state at time ``t`` [s]. Before the first row the pose is constant and the motion counts as unknown.
-        Raises ValueError if the rows of that time are deleted."""
+        """The integrated state at time ``t`` [s]. Before the first row the pose is constant and the motion counts as
+        unknown. Raises ValueError if the rows of that time are deleted."""
         if t < self.begin:
             raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
@@ -160,8 +160,8 @@ class OdometryChain:
     def begin_slip(self, since: float) -> None:
         """Report that the wheels slip since the time ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
 
-        If a row from before ``since`` arrives later, all later states are integrated again. The motion between ``since`` and the
-        newest row then counts as known again.
+        If a row from before ``since`` arrives later, all later states are integrated again. The motion between
+        ``since`` and the newest row then counts as known again.
         """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
@@ -177,20 +177,20 @@ class OdometryChain:
         return bool(self._constants[SLIPPING])
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
-        """The motion from ``start`` to ``end``, two results of :meth:`state`. If rows before ``start`` arrived after ``start`` was
-        computed, the motion includes their corrections."""
+        """The motion from ``start`` to ``end``, two results of :meth:`state`. If rows before ``start`` arrived after
+        ``start`` was computed, the motion includes their corrections."""
         return Increment(*relative(self._noise, tuple(start), tuple(end)))
 
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
-        """The integrated state at ``t`` [s] and the motion from ``start`` to this state: :meth:`state` and :meth:`relative` in one
-        call."""
+        """The integrated state at ``t`` [s] and the motion from ``start`` to this state: :meth:`state` and
+        :meth:`relative` in one call."""
         known = self._knots, self._count, self._constants, self._noise
         end, delta, covariance, duration, still = travelled(*known, tuple(start), t)
         return ChainState(*end), Increment(delta, covariance, duration, still)
 
     def twist(self, t: float) -> Array:
-        """The robot's mean velocity (3,) in the :data:`TWIST_TIME` before ``t``, in the robot frame [m/s, m/s, rad/s]. Raises
-        ValueError if the rows of that time are deleted."""
+        """The robot's mean velocity (3,) in the :data:`TWIST_TIME` before ``t``, in the robot frame [m/s, m/s, rad/s].
+        Raises ValueError if the rows of that time are deleted."""
         if t - TWIST_TIME < self.begin:
             raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return np.array(twist_at(self._knots, self._count, self._constants, t))
@@ -206,13 +206,13 @@ class OdometryChain:
     ) -> tuple[ChainState, Array, Array, Array, Array]:
         """Predict a Gaussian error state (S,) from the odometry state ``start`` to time ``t`` [s].
 
-        ``pose`` (3,), ``covariance`` (S, S): the estimate at ``start``. The first three components of the error state are the pose.
-        ``constants`` (P,): corrections of the estimated odometry constants. ``first``: the index of the first of them in the error
-        state.
+        ``pose`` (3,), ``covariance`` (S, S): the estimate at ``start``. The first three components of the error state
+        are the pose. ``constants`` (P,): corrections of the estimated odometry constants. ``first``: the index of the
+        first of them in the error state.
 
-        Returns five values: the odometry state at ``t``; the predicted pose (3,); the first three rows (3, S) of the transition
-        matrix, whose remaining rows equal an identity matrix; the covariance (3, 3) of the motion; the predicted covariance
-        (S, S).
+        Returns five values: the odometry state at ``t``; the predicted pose (3,); the first three rows (3, S) of the
+        transition matrix, whose remaining rows equal an identity matrix; the covariance (3, 3) of the motion; the
+        predicted covariance (S, S).
         """
         size = len(covariance)
         at, transition, noise, out = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
@@ -241,8 +241,8 @@ class OdometryChain:
     ) -> tuple[Array, Array, Array]:
         """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to time ``t`` [s].
 
-        ``constants`` (P,): corrections of the estimated odometry constants. Returns the pose (3,), its body-frame covariance
-        (3, 3), and its covariance (3, 3) of (x, y, heading) in the world frame.
+        ``constants`` (P,): corrections of the estimated odometry constants. Returns the pose (3,), its body-frame
+        covariance (3, 3), and its covariance (3, 3) of (x, y, heading) in the world frame.
         """
         known = self._knots, self._count, self._constants, self._noise
         contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order
@@ -250,14 +250,14 @@ class OdometryChain:
         return at, body, world
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
-        """The motions from ``starts`` to ``ends``, N states (N, 8) each from :meth:`states`. ``constants`` (P,): corrections of the
-        estimated odometry constants. Returns relative poses (N, 3) and covariances (N, 3, 3)."""
+        """The motions from ``starts`` to ``ends``, N states (N, 8) each from :meth:`states`. ``constants`` (P,):
+        corrections of the estimated odometry constants. Returns relative poses (N, 3) and covariances (N, 3, 3)."""
         deltas, covariances = relatives(self._noise, starts, ends, constants, self._indices)
         return deltas, covariances
 
     def factor(self, increment: Increment, *, scale_known: bool) -> OdometryFactor:
-        """An increment as a factor on two poses and on the estimated odometry constants. ``scale_known``: True if measurements
-        other than odometry determine the scale of the map."""
+        """An increment as a factor on two poses and on the estimated odometry constants. ``scale_known``: True if
+        measurements other than odometry determine the scale of the map."""
         kind = OdometryFactor if scale_known else ScaleFreeOdometryFactor
         return kind(increment, self._estimated)
 

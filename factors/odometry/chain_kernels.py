@@ -1,7 +1,7 @@
 """Compiled integration of odometry.
 
-A row is one odometry or gyro measurement. A knot is the integrated state at the time of a row, with the velocity after it. Each row
-has one knot, with the same index.
+A row is one odometry or gyro measurement. A knot is the integrated state at the time of a row, with the velocity after
+it. Each row has one knot, with the same index.
 """
 
 import math
@@ -38,8 +38,8 @@ def copy(row: Array, to: Array) -> None:
 
 @compiled
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
-    """Delete rows, and the integrated states at these rows (knots), that are more than ``horizon`` seconds older than the newest
-    row. ``count``: the number of rows. Returns the new number.
+    """Delete rows, and the integrated states at these rows (knots), that are more than ``horizon`` seconds older than
+    the newest row. ``count``: the number of rows. Returns the new number.
 
     Nothing is deleted before the oldest row is two horizons old, because each deletion moves all remaining rows to the front.
     """
@@ -67,9 +67,9 @@ def append(
 ) -> int:
     """Append velocities to the ``count`` existing rows, integrate them into ``knots`` (the state at each row), and delete old rows.
 
-    ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the times.
-    ``constants``: the model as an array. Rows older than ``horizon`` [s] are old. Returns the new count. If the first new row is
-    older than the last existing one, returns -1 and changes nothing.
+    ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the
+    times. ``constants``: the model as an array. Rows older than ``horizon`` [s] are old. Returns the new count. If the
+    first new row is older than the last existing one, returns -1 and changes nothing.
     """
     if count and t[0] + delay < knots[count - 1, T]:
         return -1
@@ -96,9 +96,9 @@ def insert(
 ) -> int:
     """Insert one row among the ``count`` existing rows, in order of time and after rows of equal time.
 
-    ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`, with the values ``a``, ``b``, ``c`` and, for an increment, the
-    time ``unknown`` [s] of unknown motion. The states ``knots`` are updated. If the new row is the newest, rows older than
-    ``horizon`` [s] are deleted. Returns the new count.
+    ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`, with the values ``a``, ``b``, ``c`` and, for an
+    increment, the time ``unknown`` [s] of unknown motion. The states ``knots`` are updated. If the new row is the
+    newest, rows older than ``horizon`` [s] are deleted. Returns the new count.
     """
     i = count
     if count and t < knots[count - 1, T]:
@@ -112,8 +112,8 @@ def insert(
 
 @compiled
 def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array) -> None:
-    """Integrate the odometry rows from index ``begin`` up to, but not including, ``end``. Writes the state at each row into
-    ``knots``, computed from the previous one."""
+    """Integrate the odometry rows from index ``begin`` up to, but not including, ``end``. Writes the state at each row
+    into ``knots``, computed from the previous one."""
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
     c, s, lag, hold = constants[_COS], constants[_SIN], constants[LAG], constants[HOLD]
@@ -161,8 +161,8 @@ def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array)
 
 @compiled
 def _take_gyro(knot: Array, t: float, turn: float) -> None:
-    """Set the turn rate in ``knot``, the integrated state at time ``t``, to the rate ``turn`` that a gyro measures. If both wheels
-    and gyro are at rest, the rate is set to zero."""
+    """Set the turn rate in ``knot``, the integrated state at time ``t``, to the rate ``turn`` that a gyro measures. If
+    both wheels and gyro are at rest, the rate is set to zero."""
     knot[_GYRO_T] = t
     knot[_UW] = knot[_W] = 0.0 if knot[_STANDS] and abs(turn) <= _GYRO_REST else turn
 
@@ -171,8 +171,8 @@ def _take_gyro(knot: Array, t: float, turn: float) -> None:
 def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
     """Integrate the increment in row ``i``, with the translation of the increment and the rotation of the gyro.
 
-    This also recomputes the states (``knots``) at the gyro rows since the previous increment, because the translation in that time
-    is known only now.
+    This also recomputes the states (``knots``) at the gyro rows since the previous increment, because the translation
+    in that time is known only now.
     """
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift = constants[3], constants[4]
@@ -210,8 +210,8 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
     """Predict the integrated state ``knot`` by ``duration`` seconds, and write the new state into ``out``.
 
-    The velocity converges to its target with the time constant ``lag`` [s], and continues for at most ``hold`` seconds. The motion
-    after that is unknown. If ``slipping`` is 1, all motion is unknown.
+    The velocity converges to its target with the time constant ``lag`` [s], and continues for at most ``hold`` seconds.
+    The motion after that is unknown. If ``slipping`` is 1, all motion is unknown.
     """
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)

@@ -30,8 +30,8 @@ class Steps(NamedTuple):
 class OdometryStack:
     """Several odometry factors with the same estimated constants, linearised together.
 
-    ``factors``: K factors. ``first`` (K,): the number of the first pose of each factor; the second pose is the next one.
-    ``column``: the index of the first estimated constant among the parameters of the graph.
+    ``factors``: K factors. ``first`` (K,): the number of the first pose of each factor; the second pose is the next
+    one. ``column``: the index of the first estimated constant among the parameters of the graph.
     """
 
     def __init__(self, factors: Sequence["OdometryFactor"], first: Sequence[int], column: int) -> None:
@@ -46,8 +46,8 @@ class OdometryStack:
         return np.repeat(self._first, 3)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Write the whitened residuals into ``residual`` (3 K,) and their Jacobian into ``jacobian`` (3 K, 6 + P), whose columns
-        :mod:`factors.chain` defines."""
+        """Write the whitened residuals into ``residual`` (3 K,) and their Jacobian into ``jacobian`` (3 K, 6 + P),
+        whose columns :mod:`factors.chain` defines."""
         given = self._steps, self._constants(parameters), self._indices
         linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
 
@@ -105,19 +105,19 @@ class OdometryFactor:
 
 
 class ScaleFreeOdometryFactor(OdometryFactor):
-    """An odometry factor for graphs in which only the wheels determine the scale of the map. The residual is in the unit of the
-    wheels' report.
+    """An odometry factor for graphs in which only the wheels determine the scale of the map. The residual is in the
+    unit of the wheels' report.
 
-    A residual in metres becomes smaller if the estimated world shrinks, and no other measurement opposes that. The most probable
-    world would be too small by the fraction ``n s^2``, where ``n`` is the number of increments and ``s`` the standard deviation of
-    the scale.
+    A residual in metres becomes smaller if the estimated world shrinks, and no other measurement opposes that. The most
+    probable world would be too small by the fraction ``n s^2``, where ``n`` is the number of increments and ``s`` the
+    standard deviation of the scale.
     """
 
     kind = None  # always linearised alone
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, whose translation is divided by the estimated scale, and
-        its Jacobian by each value."""
+        """The whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, whose translation is divided by the estimated
+        scale, and its Jacobian by each value."""
         start, end, *constants = values
         if not constants:
             return super().linearize(values)
@@ -153,8 +153,8 @@ def linearize(
     ``by_changes`` (3, P): the derivative of ``delta``, as a body-frame perturbation, by the estimated constants.
     ``whitener`` (3, 3): the matrix that whitens the residual.
 
-    Returns the whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by ``start`` (3, 3), by ``end`` (3, 3)
-    and by the constants (3, P).
+    Returns the whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobians by ``start`` (3, 3), by
+    ``end`` (3, 3) and by the constants (3, P).
     """
     relative = between_one(start, end)
     rx, ry, turned = relative[0], relative[1], relative[2]
@@ -177,8 +177,8 @@ def linearize(
 def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Linearise an increment for changed constants, as :func:`linearize` does. ``twist`` (3,): the logarithm of the increment.
-    ``moving``, ``constants``, ``indices``: as of :func:`factors.odometry.kernels.changed`."""
+    """Linearise an increment for changed constants, as :func:`linearize` does. ``twist`` (3,): the logarithm of the
+    increment. ``moving``, ``constants``, ``indices``: as of :func:`factors.odometry.kernels.changed`."""
     delta, by_changes = changed(twist, moving, constants, indices)
     return linearize(start, end, delta, by_changes, whitener)
 
@@ -187,8 +187,8 @@ def linearize_changed(
 def linearize_as_reported(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """:func:`linearize_changed`, but with the residual's translation divided by the estimated scale of distances. The translation
-    is then in the unit of the wheels' report, like its noise."""
+    """:func:`linearize_changed`, but with the residual's translation divided by the estimated scale of distances. The
+    translation is then in the unit of the wheels' report, like its noise."""
     unit = 1.0 + all_changes(constants, indices)[0]
     as_reported = whitener.copy()
     for i in range(3):

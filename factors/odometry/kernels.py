@@ -1,5 +1,5 @@
-"""Compiled functions for odometry: the relative motion between two measurements, its covariance, and its change with the odometry's
-constants."""
+"""Compiled functions for odometry: the relative motion between two measurements, its covariance, and its change with
+the odometry's constants."""
 
 import math
 
@@ -40,8 +40,8 @@ State = tuple[float, ...]  # a state of the integrated odometry: t, x, y, headin
 def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
     """The motion between two states of the integrated odometry, as in :func:`factors.odometry.model.relative_motion`.
 
-    ``noise``: a :data:`Noise` as an array. Returns the relative pose (3,), its covariance (3, 3), the duration [s], and the time at
-    rest [s].
+    ``noise``: a :data:`Noise` as an array. Returns the relative pose (3,), its covariance (3, 3), the duration [s], and
+    the time at rest [s].
     """
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
     x, y, turned = c * dx + s * dy, c * dy - s * dx, wrap_scalar(end[3] - start[3])
@@ -74,8 +74,8 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """The motions between N pairs of states (N, 8) by :func:`relative`, corrected for changed constants by :func:`recalibrated`.
 
-    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants. Returns the
-    relative poses (N, 3) and their covariances (N, 3, 3).
+    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants.
+    Returns the relative poses (N, 3) and their covariances (N, 3, 3).
     """
     count = len(starts)
     deltas, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
@@ -129,13 +129,13 @@ def predicted(
 ) -> None:
     """Predict a Gaussian error state (S,) of a pose and further components over one motion.
 
-    ``delta`` (3,), ``noise`` (3, 3): the motion and its covariance. ``moving`` [s]: the time in motion.
-    ``pose`` (3,), ``covariance`` (S, S): the pose and the covariance of the error state before the motion.
-    ``constants`` (P,), ``indices`` (P,): corrections of the estimated odometry constants, and their indices among all constants.
-    ``first``: the index of the first of these constants in the error state.
+    ``delta`` (3,), ``noise`` (3, 3): the motion and its covariance. ``moving`` [s]: the time in motion. ``pose`` (3,),
+    ``covariance`` (S, S): the pose and the covariance of the error state before the motion. ``constants`` (P,),
+    ``indices`` (P,): corrections of the estimated odometry constants, and their indices among all constants. ``first``:
+    the index of the first of these constants in the error state.
     ``at`` (3,): output, the predicted pose.
-    ``transition`` (3, S): output, the first three rows of the transition matrix. The remaining rows are rows of an identity
-    matrix. ``out`` (S, S): output, the predicted covariance.
+    ``transition`` (3, S): output, the first three rows of the transition matrix. The remaining rows are rows of an
+    identity matrix. ``out`` (S, S): output, the predicted covariance.
     """
     size, count = len(covariance), len(constants)
     columns = np.arange(3 + count)  # the columns of the transition that are not zero
@@ -199,8 +199,8 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
     """Correct an increment for changed odometry constants. The increment counts as one arc, which is exact for constant curvature.
 
     ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: its time in motion.
-    ``changes`` (4,): the relative changes of the scales of distance and rotation, the change of the heading-rate bias [rad/s], and
-    the change of the heading drift [rad/m].
+    ``changes`` (4,): the relative changes of the scales of distance and rotation, the change of the heading-rate bias
+    [rad/s], and the change of the heading drift [rad/m].
 
     Returns the corrected increment (3,) and its Jacobian (3, 4) by ``changes``.
     """
@@ -222,8 +222,8 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """Correct an increment as :func:`recalibrate` does, for P of the four constants.
 
-    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants. Returns the
-    corrected increment (3,) and its Jacobian (3, P) by ``constants``.
+    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants.
+    Returns the corrected increment (3,) and its Jacobian (3, P) by ``constants``.
     """
     delta, by_changes = recalibrate(twist, moving, all_changes(constants, indices))
     out = np.empty((3, len(indices)))

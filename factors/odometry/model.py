@@ -1,10 +1,10 @@
 """The model of wheel odometry and gyro: relative poses with covariance.
 
-:mod:`factors.odometry.chain` integrates the odometry in a frame of its own. A relative pose is the difference of two states of this
-integration.
+:mod:`factors.odometry.chain` integrates the odometry in a frame of its own. A relative pose is the difference of two
+states of this integration.
 
-The variances of longitudinal, lateral and heading errors grow linearly with distance, rotation and time. The covariance of a path
-therefore does not depend on its division into increments.
+The variances of longitudinal, lateral and heading errors grow linearly with distance, rotation and time. The covariance
+of a path therefore does not depend on its division into increments.
 
 A robot at rest is a measurement of zero velocity. While the robot rests, its variances do not grow with time, except for a minimum
 noise. The minimum noise is part of all increments, because an increment without noise would make a graph singular.
@@ -60,8 +60,8 @@ class OdometryModel:
     ``speed_bias`` [m/s], ``heading_rate_bias`` [rad/s], ``gyro_bias`` [rad/s]: the values reported by a robot at rest.
     ``heading_drift`` [rad/m]: the change of heading per distance that the wheels do not report.
     ``direction`` [rad]: the direction of travel in the robot frame.
-    ``delay``, ``lag`` [s]: the dead time of commanded velocities, and the time constant of the robot's first-order response.
-    ``turn_slowdown`` [m/rad]: the loss of forward speed per turn rate, for commanded velocities.
+    ``delay``, ``lag`` [s]: the dead time of commanded velocities, and the time constant of the robot's first-order
+    response. ``turn_slowdown`` [m/rad]: the loss of forward speed per turn rate, for commanded velocities.
     ``max_hold`` [s]: the longest time for which a velocity is assumed to continue. After that the motion is unknown.
     ``unknown_distance`` [m per sqrt(s)], ``unknown_rotation`` [rad per sqrt(s)]: the noise of an unknown motion.
     ``along``, ``lateral``, ``heading``: the noise along the direction of travel, across that direction, and of the heading.
@@ -96,8 +96,8 @@ class OdometryModel:
 def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) -> Increment:
     """The motion between two states of the integrated odometry, with its covariance.
 
-    The heading error is a random walk along the path, so it also displaces the end of the motion. Let v be the variance of the
-    heading, and r the distance from start to end. For a uniform walk along a straight line, the variance of the
+    The heading error is a random walk along the path, so it also displaces the end of the motion. Let v be the variance
+    of the heading, and r the distance from start to end. For a uniform walk along a straight line, the variance of the
     displacement is v r^2 / 3. Its covariance with the heading is v r / 2.
     """
     return Increment(*relative(np.array(model.noise()), start, end))
@@ -127,8 +127,8 @@ PARAMETERS = ("scale_distance", "scale_rotation", "heading_rate_bias", "heading_
 def composed(t: Array | NDArray[np.int64], moves: Array) -> tuple[NDArray[np.int64], Array]:
     """Compose the motions that have equal timestamps.
 
-    ``t`` (N,): sorted timestamps. ``moves`` (N, 3): motions. Returns the index of the last row of each distinct timestamp (M,), and
-    the composed motion (M, 3) of each distinct timestamp.
+    ``t`` (N,): sorted timestamps. ``moves`` (N, 3): motions. Returns the index of the last row of each distinct
+    timestamp (M,), and the composed motion (M, 3) of each distinct timestamp.
     """
     last = np.flatnonzero(np.append(np.diff(t) > 0, True)[: len(t)])
     first = np.append(0, last[:-1] + 1)[: len(last)]

@@ -19,8 +19,8 @@ class PositionFactor:
 
     ``position`` (2,) [m]: the measured position in the world frame, with ``covariance`` (2, 2).
     ``arm`` (2,) [m]: the measured point in the robot frame, such as the place of the antenna.
-    ``offset``: the robot's motion from the time of the pose to the time of the measurement. None if the times are equal.
-    ``robust``: scale of the Geman-McClure loss in standard deviations.
+    ``offset``: the robot's motion from the time of the pose to the time of the measurement. None if the times are
+    equal. ``robust``: scale of the Geman-McClure loss in standard deviations.
 
     Methods with ``values`` take a list of one pose (3,).
     """
@@ -64,8 +64,8 @@ class PositionFactor:
         return np.asarray(geman_mcclure_loss(squared, self.robust))
 
     def squared(self, pose: Array, covariance: Array) -> float:
-        """The normalised innovation squared: the squared Mahalanobis distance between the measured position and that predicted from
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+        """The normalised innovation squared: the squared Mahalanobis distance between the measured position and that
+        predicted from ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
         residual, (jacobian,) = self.whitened([pose])
         return float(positive.squared(residual[0], np.eye(2) + jacobian[0] @ covariance @ jacobian[0].T))
 

@@ -1,9 +1,9 @@
 """The likelihood of RFID reads and misses with a map of tags.
 
-For Gaussian states and graphs the likelihood is exact and has derivatives (:mod:`factors.rfid.kernels`). For particles it comes
-from tables, without derivatives. The log-likelihood is tempered: it is multiplied by an exponent below 1, because reads are
-correlated. A tag is "as surveyed" if it works and is where the map has it. The likelihood of a tag that may be dead, weak or moved
-is a mixture (:mod:`factors.rfid.tag_states`).
+For Gaussian states and graphs the likelihood is exact and has derivatives (:mod:`factors.rfid.kernels`). For particles
+it comes from tables, without derivatives. The log-likelihood is tempered: it is multiplied by an exponent below 1,
+because reads are correlated. A tag is "as surveyed" if it works and is where the map has it. The likelihood of a tag
+that may be dead, weak or moved is a mixture (:mod:`factors.rfid.tag_states`).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from factors.se2 import Array, Integers
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
-    """T tags of a map. ``points`` (T, 3) [m]: positions in the world. ``facing`` (T,) [rad]: the direction that each tag faces, NaN
-    if it is unknown."""
+    """T tags of a map. ``points`` (T, 3) [m]: positions in the world. ``facing`` (T,) [rad]: the direction that each
+    tag faces, NaN if it is unknown."""
 
     points: Array
     facing: Array
@@ -46,15 +46,15 @@ class TagArray:
 class TagReadCounts:
     """The reads of tags in K measurements. A measurement is a number of inventory rounds of one antenna at one robot pose.
 
-    ``offsets`` (K, 3): the robot's pose at each measurement, in the frame of a reference pose. The likelihood is a function of the
-    reference pose.
-    ``antennas`` (K,): indices of the antennas in the model. ``rounds`` (K,): numbers of inventory rounds.
-    ``hits`` (K, C): the number of rounds that read each of C listed tags. Tags that are not listed were not read.
-    ``odds`` (C,): prior log-odds that a listed tag is weak, moved or dead (:class:`~factors.rfid.tag_states.TagStates`), and not as
+    ``offsets`` (K, 3): the robot's pose at each measurement, in the frame of a reference pose. The likelihood is a
+    function of the reference pose.
+    ``antennas`` (K,): indices of the antennas in the model. ``rounds`` (K,): numbers of inventory rounds. ``hits`` (K,
+    C): the number of rounds that read each of C listed tags. Tags that are not listed were not read. ``odds`` (C,):
+    prior log-odds that a listed tag is weak, moved or dead (:class:`~factors.rfid.tag_states.TagStates`), and not as
     surveyed. ``-inf``, the default, means certainly as surveyed.
-    ``elsewhere`` (C,): the tempered log-likelihood ratio of a tag's reads and misses, between a tag that is not as surveyed and a
-    tag out of reach that is never read. The default is that of dead tags: 0, or ``-inf`` for a tag that was read.
-    ``tags`` (C,): indices in the map of the listed tags, ascending. The default is all tags of the map.
+    ``elsewhere`` (C,): the tempered log-likelihood ratio of a tag's reads and misses, between a tag that is not as
+    surveyed and a tag out of reach that is never read. The default is that of dead tags: 0, or ``-inf`` for a tag that
+    was read. ``tags`` (C,): indices in the map of the listed tags, ascending. The default is all tags of the map.
     ``unlisted_odds``: the odds of tags that are not listed.
     ``twists`` (K, 3): the robot's body-frame velocity [m/s, m/s, rad/s] at each measurement. The default is zero.
     """
@@ -103,14 +103,14 @@ class TagReadCounts:
         return replace(self, hits=hits, odds=all_odds, elsewhere=all_elsewhere, tags=both)
 
     def moved(self, offset: Array) -> TagReadCounts:
-        """The counts relative to another reference pose. ``offset`` (3,): the present reference pose in the frame of the new
-        one."""
+        """The counts relative to another reference pose. ``offset`` (3,): the present reference pose in the frame of
+        the new one."""
         return replace(self, offsets=moved(offset, self.offsets))
 
 
 def merged(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Merge several counts with the same reference pose into one. ``parts``: counts in order of time. A tag has the ``odds``
-    from the first part that lists it. Its ``elsewhere`` is the sum over all parts."""
+    """Merge several counts with the same reference pose into one. ``parts``: counts in order of time. A tag has the
+    ``odds`` from the first part that lists it. Its ``elsewhere`` is the sum over all parts."""
     first = parts[0]
     if len(parts) == 1:
         return first
@@ -132,10 +132,10 @@ class Score(NamedTuple):
     """The tempered likelihood of a measurement at N poses, with derivatives.
 
     ``nll`` (N,): the negative log-likelihood, multiplied by the tempering exponent.
-    ``gradient`` (N, 3): its derivative by the body-frame perturbation of the pose. ``information`` (N, 3, 3): its Fisher
-    information.
-    ``expected`` (N,), ``variance`` (N,): mean and variance of ``nll`` over all outcomes, if model and pose are correct. The
-    variance is proportional to the tempering, which accounts for correlated reads.
+    ``gradient`` (N, 3): its derivative by the body-frame perturbation of the pose. ``information`` (N, 3, 3): its
+    Fisher information.
+    ``expected`` (N,), ``variance`` (N,): mean and variance of ``nll`` over all outcomes, if model and pose are correct.
+    The variance is proportional to the tempering, which accounts for correlated reads.
     """
 
     nll: Array
@@ -146,16 +146,16 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """The score of signal strengths or phases, whose mean and variance are not computed: ``expected`` is ``nll``, and
-        ``variance`` is zero."""
+        """The score of signal strengths or phases, whose mean and variance are not computed: ``expected`` is ``nll``,
+        and ``variance`` is zero."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
 
 class ExpectedReads(NamedTuple):
     """Observed and predicted reads of C tags in K measurements.
 
-    ``tags`` (C,): indices in the map. ``hits`` (K, C): numbers of reads. ``p`` (K, C): probability that one round reads the tag.
-    ``distance`` (K, C) [m]: horizontal distance from antenna to tag.
+    ``tags`` (C,): indices in the map. ``hits`` (K, C): numbers of reads. ``p`` (K, C): probability that one round reads
+    the tag. ``distance`` (K, C) [m]: horizontal distance from antenna to tag.
     """
 
     tags: Integers
@@ -168,8 +168,8 @@ class ExpectedReads(NamedTuple):
 class RfidLikelihood:
     """The likelihood of read counts as a function of the robot's pose, for given antennas and a map of tags.
 
-    ``parameters`` (Q,): adjustments of detection models, mounting and clock (:mod:`factors.rfid.parameters`), zero at first. With M
-    detection models and A antennas, Q is 2 M + A + 2.
+    ``parameters`` (Q,): adjustments of detection models, mounting and clock (:mod:`factors.rfid.parameters`), zero at
+    first. With M detection models and A antennas, Q is 2 M + A + 2.
     """
 
     model: RfidModel
@@ -199,8 +199,8 @@ class RfidLikelihood:
         return out
 
     def prepare(self) -> None:
-        """Compute the tables of the likelihood of particles now. Otherwise the first call of :meth:`log_likelihood` computes
-        them, which delays a running filter."""
+        """Compute the tables of the likelihood of particles now. Otherwise the first call of :meth:`log_likelihood`
+        computes them, which delays a running filter."""
         for name in ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
@@ -221,8 +221,8 @@ class RfidLikelihood:
     ) -> Score:
         """The tempered negative log-likelihood of ``counts`` at one pose (3,) and ``parameters`` (Q,), with derivatives by both.
 
-        ``estimated`` (P,): the indices of the parameters in the derivatives. None means all. The gradient is (1, 3 + P), and the
-        information (1, 3 + P, 3 + P), by the body-frame perturbation of the pose and by these parameters.
+        ``estimated`` (P,): the indices of the parameters in the derivatives. None means all. The gradient is (1, 3 +
+        P), and the information (1, 3 + P, 3 + P), by the body-frame perturbation of the pose and by these parameters.
         """
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
@@ -255,11 +255,11 @@ class RfidLikelihood:
         return tag_states.displaced(*self._tabled, counts.packed, poses, margin, odds, hypotheses, alpha, parameters)
 
     def log_likelihood(self, poses: Array, counts: TagReadCounts, parameters: Array | None = None) -> Array:
-        """The tempered log-likelihood (N,) of ``counts`` for particles at poses (N, 3), from tables (:mod:`factors.rfid.weighing`,
-        :mod:`factors.rfid.places`).
+        """The tempered log-likelihood (N,) of ``counts`` for particles at poses (N, 3), from tables
+        (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`).
 
-        ``parameters`` (N, Q): the parameters of each particle, by default :attr:`parameters`. If particles differ in their
-        time offset, the velocity of the first measurement is used for all measurements.
+        ``parameters`` (N, Q): the parameters of each particle, by default :attr:`parameters`. If particles differ in
+        their time offset, the velocity of the first measurement is used for all measurements.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
         if parameters is None and not (self.parameters.any() or counts.offsets.any()) and is_wide(poses, self.reach):
@@ -281,8 +281,8 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """An estimate of the cost of :meth:`log_likelihood` for each of many poses that are far apart: about the number of tags to
-        evaluate."""
+        """An estimate of the cost of :meth:`log_likelihood` for each of many poses that are far apart: about the number
+        of tags to evaluate."""
         return self._unadjusted._places.work(counts.packed)
 
     @property
@@ -305,17 +305,17 @@ class RfidLikelihood:
         return any(self.model.models[a.model].uses_facing for a in self.model.antennas)
 
     def robot_tables(self, finest: int, facings: int) -> RobotTables:
-        """Tables of read probabilities of each antenna by a tag's position in the robot frame. ``finest``: the cell size, as a
-        multiple of the cell size of the finest table that exists. ``facings``: number of facing directions. See
-        :func:`factors.rfid.places.robot_tables`."""
+        """Tables of read probabilities of each antenna by a tag's position in the robot frame. ``finest``: the cell
+        size, as a multiple of the cell size of the finest table that exists. ``facings``: number of facing directions.
+        See :func:`factors.rfid.places.robot_tables`."""
         antennas = antennas_of(self.packed, self._unadjusted._tables)
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
         """The likelihood of each tag's reads as a function of the tag's position, at one robot pose (3,).
 
-        ``counts`` must list all tags of the map. Returns the tempered negative log-likelihood (T,) of each tag, its gradient (T, 2)
-        by the tag's position in the world, and its information (T, 2, 2).
+        ``counts`` must list all tags of the map. Returns the tempered negative log-likelihood (T,) of each tag, its
+        gradient (T, 2) by the tag's position in the world, and its information (T, 2, 2).
         """
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)

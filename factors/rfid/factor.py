@@ -58,9 +58,9 @@ class TagLikelihood(Protocol):
 
 
 class TagProblem(NamedTuple):
-    """The likelihood of read counts, for compiled code. ``packed``: detection models before adjustment. ``of_map``: the tags of the
-    map. ``counts``: reads and misses. ``tempering``: exponent of the likelihood. ``parameters`` (Q,): adjustments of the models.
-    ``estimated`` (P,): the indices of the parameters that are estimated."""
+    """The likelihood of read counts, for compiled code. ``packed``: detection models before adjustment. ``of_map``: the
+    tags of the map. ``counts``: reads and misses. ``tempering``: exponent of the likelihood. ``parameters`` (Q,):
+    adjustments of the models. ``estimated`` (P,): the indices of the parameters that are estimated."""
 
     packed: Packed
     of_map: MapTags
@@ -75,13 +75,13 @@ class RfidFactor:
     """RFID measurements as a factor on the robot's pose, and optionally on parameters of the read model.
 
     ``likelihood``: a likelihood of read counts, signal strengths or phases.
-    ``reads``: :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`, otherwise
-    :class:`~factors.rfid.signals.RssiReads` or :class:`~factors.rfid.signals.PhaseReads`.
+    ``reads``: :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`,
+    otherwise :class:`~factors.rfid.signals.RssiReads` or :class:`~factors.rfid.signals.PhaseReads`.
     ``estimated`` (P,): indices of the parameters (:mod:`factors.rfid.parameters`) that are estimated; read counts only.
 
-    Methods with ``values`` take a list of the pose (3,) and, if P > 0, the parameters (P,). For any number of reads there are 4 + P
-    residuals. The sum of their squares has the value, the gradient and the Fisher information of the negative log-likelihood
-    (:func:`factors.graph.compressed`).
+    Methods with ``values`` take a list of the pose (3,) and, if P > 0, the parameters (P,). For any number of reads
+    there are 4 + P residuals. The sum of their squares has the value, the gradient and the Fisher information of the
+    negative log-likelihood (:func:`factors.graph.compressed`).
     """
 
     likelihood: TagLikelihood
@@ -114,8 +114,8 @@ class RfidFactor:
         return out
 
     def score(self, values: Sequence[Array]) -> Score:
-        """The tempered negative log-likelihood at one pose (3,) and the estimated parameters (P,), with gradient (1, 3 + P) and
-        information (1, 3 + P, 3 + P)."""
+        """The tempered negative log-likelihood at one pose (3,) and the estimated parameters (P,), with gradient (1, 3
+        + P) and information (1, 3 + P, 3 + P)."""
         if not self.estimated:
             return self.likelihood.score(values[0], self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -146,8 +146,8 @@ class RfidFactor:
         """Correct a Gaussian of the pose and the estimated parameters, by Fisher scoring.
 
         ``pose`` (3,), ``values`` (P,): the prediction. ``covariance`` (3 + P, 3 + P): its covariance, with a body-frame
-        perturbation of the pose. ``iterations``: maximum number of steps. A step that does not reduce the cost is halved. The
-        evidence in the result is computed by Laplace's method.
+        perturbation of the pose. ``iterations``: maximum number of steps. A step that does not reduce the cost is
+        halved. The evidence in the result is computed by Laplace's method.
         """
         pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
         problem = (*self._problems(), float(self.likelihood.model.tempering), pose, values)
@@ -178,8 +178,8 @@ class RfidTagFactor:
     ``likelihood``: its map has the height and facing of the tag; the position in that map is not used.
     ``tag``: the index of the tag in the map. ``counts``: reads that list all tags of the map.
 
-    The methods take a list of the pose (3,) and the tag's position (2,) in the world. For any number of reads there are six
-    residuals, see :func:`factors.graph.compressed`.
+    The methods take a list of the pose (3,) and the tag's position (2,) in the world. For any number of reads there are
+    six residuals, see :func:`factors.graph.compressed`.
     """
 
     likelihood: RfidLikelihood
@@ -197,8 +197,8 @@ class RfidTagFactor:
         return self.score(values)[0]
 
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
-        """The tempered negative log-likelihood, and its gradient (5,) and Fisher information (5, 5) by the body-frame perturbation
-        of the pose and by the tag's position in the world."""
+        """The tempered negative log-likelihood, and its gradient (5,) and Fisher information (5, 5) by the body-frame
+        perturbation of the pose and by the tag's position in the world."""
         tags, counts, alpha = self.likelihood.tags, self.counts, self.likelihood.model.tempering
         point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
         hits = np.ascontiguousarray(counts.hits[:, self.tag : self.tag + 1])
@@ -211,9 +211,9 @@ class RfidTagFactor:
 def _score(
     tags: Any, phase: Any, strength: Any, pose: Array, values: Array
 ) -> tuple[float, Array, Array, float, float]:
-    """Evaluate the likelihood of one pose (3,) and parameters ``values`` (P,). Exactly one of ``tags``, ``phase`` and ``strength``
-    is not None. Returns the tempered negative log-likelihood, its gradient (3 + P,) and information (3 + P, 3 + P), and its mean
-    and variance. For phase and strength the mean is the value itself, and the variance is 0."""
+    """Evaluate the likelihood of one pose (3,) and parameters ``values`` (P,). Exactly one of ``tags``, ``phase`` and
+    ``strength`` is not None. Returns the tempered negative log-likelihood, its gradient (3 + P,) and information (3 +
+    P, 3 + P), and its mean and variance. For phase and strength the mean is the value itself, and the variance is 0."""
     if tags is not None:
         parameters = tags.parameters.copy()
         for i in range(len(values)):
@@ -239,9 +239,9 @@ def _corrected(
     covariance: Array,
     iterations: int,
 ) -> tuple[Array, Array, float, int, float, float, float]:
-    """Compute :meth:`RfidFactor.correct`. Returns the correction (3 + P,), the covariance after it, the normalised innovation
-    squared and its degrees of freedom, the negative log-likelihood of the prediction minus its mean, the variance of that, and the
-    log-evidence."""
+    """Compute :meth:`RfidFactor.correct`. Returns the correction (3 + P,), the covariance after it, the normalised
+    innovation squared and its degrees of freedom, the negative log-likelihood of the prediction minus its mean, the
+    variance of that, and the log-evidence."""
     size = len(covariance)
     nll, gradient, information, expected, variance = _score(tags, phase, strength, pose, values)
     prior_information = inverse(covariance)
@@ -278,8 +278,8 @@ def _corrected(
 
 @compiled
 def _difference(pose: Array, values: Array, target: Array, other_values: Array) -> Array:
-    """The step (3 + P,) from ``pose`` (3,) and ``values`` (P,) to ``target`` and ``other_values``. The first three components are
-    the twist between the poses."""
+    """The step (3 + P,) from ``pose`` (3,) and ``values`` (P,) to ``target`` and ``other_values``. The first three
+    components are the twist between the poses."""
     out = np.empty(3 + len(values))
     out[0], out[1], out[2] = se2.twist_to(pose, target)
     for i in range(len(values)):
@@ -320,8 +320,8 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
 
 @compiled
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
-    """The normalised innovation squared of a likelihood and its degrees of freedom, from its ``gradient`` (D,) and ``information``
-    (D, D) at the prediction with ``covariance`` (D, D)."""
+    """The normalised innovation squared of a likelihood and its degrees of freedom, from its ``gradient`` (D,) and
+    ``information`` (D, D) at the prediction with ``covariance`` (D, D)."""
     size, predicted, pull = (
         len(gradient),
         product(product(information, covariance), information),
@@ -350,8 +350,8 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
 
 @compiled(error_model="numpy")
 def _rank(information: Array) -> int:
-    """The number of eigenvalues above :data:`LEAST_INFORMATION`. By Sylvester's law of inertia, it is the number of positive pivots
-    of the information minus this limit times the identity."""
+    """The number of eigenvalues above :data:`LEAST_INFORMATION`. By Sylvester's law of inertia, it is the number of
+    positive pivots of the information minus this limit times the identity."""
     size, left, count = len(information), information.copy(), 0
     for k in range(size):
         left[k, k] -= LEAST_INFORMATION

@@ -26,8 +26,8 @@ Counts = tuple[Array, Integers, Integers, Integers, Array, Array, Integers, floa
 class TagIndex(NamedTuple):
     """A spatial index of T tags in square cells.
 
-    ``corner`` (2,) [m]: the lower corner of the first cell. ``cell`` [m]: the size of a cell. ``columns``: the number of cells in a
-    row; the C cells are numbered row by row.
+    ``corner`` (2,) [m]: the lower corner of the first cell. ``cell`` [m]: the size of a cell. ``columns``: the number
+    of cells in a row; the C cells are numbered row by row.
     ``order`` (T,): the indices of the tags in the map, cell by cell, and ascending within a cell.
     ``start`` (C + 1,): the index in ``order`` of the first tag of each cell.
     """
@@ -55,8 +55,8 @@ def tag_index(points: Array) -> TagIndex:
 
 @compiled(inline="always")
 def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tuple[int, int]:
-    """The first and last cell along an axis (0 for x, 1 for y) that the interval from ``low`` to ``high`` [m] touches. ``count``:
-    number of cells along the axis. Returns (0, -1) if the interval touches none."""
+    """The first and last cell along an axis (0 for x, 1 for y) that the interval from ``low`` to ``high`` [m] touches.
+    ``count``: number of cells along the axis. Returns (0, -1) if the interval touches none."""
     first = (low - index.corner[axis]) / index.cell
     last = (high - index.corner[axis]) / index.cell
     if not (first < count and last >= 0.0):
@@ -86,8 +86,8 @@ def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArra
 
 
 class MapTags(NamedTuple):
-    """The tags of a map: ``points`` (T, 3) [m], ``normals`` (T, 2) (facing directions, zero if unknown), and the spatial index
-    ``cells``."""
+    """The tags of a map: ``points`` (T, 3) [m], ``normals`` (T, 2) (facing directions, zero if unknown), and the
+    spatial index ``cells``."""
 
     cells: TagIndex
     points: Array
@@ -120,8 +120,8 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 
 @compiled
 def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
-    """Select the tags that may change the likelihood of poses (N, 3): all tags within ``reach`` [m] of any pose, other tags in the
-    same cells, and the tags listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
+    """Select the tags that may change the likelihood of poses (N, 3): all tags within ``reach`` [m] of any pose, other
+    tags in the same cells, and the tags listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
     _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)

@@ -27,8 +27,8 @@ MOST_COLUMNS = 8  # largest number of components of pose and parameters that one
 def tag_logit(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """The logit of a tag at (p, q, height) from the antenna, in axes rotated by the antenna's yaw but not by its pitch, with facing
-    cosine c, and its derivatives by p, q, height and c."""
+    """The logit of a tag at (p, q, height) from the antenna, in axes rotated by the antenna's yaw but not by its pitch,
+    with facing cosine c, and its derivatives by p, q, height and c."""
     cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
     m = packed.which[antenna]
     x, z = cp * p + sp * height, cp * height - sp * p
@@ -40,8 +40,8 @@ def tag_logit(
 
 @compiled(inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
-    """The antenna's x, y, cosine and sine of its heading in the world, and the cosine and sine of the robot's heading. The robot is
-    at ``offset`` (3,) in the frame of ``pose`` (3,)."""
+    """The antenna's x, y, cosine and sine of its heading in the world, and the cosine and sine of the robot's heading.
+    The robot is at ``offset`` (3,) in the frame of ``pose`` (3,)."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
     c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
@@ -79,8 +79,8 @@ def of_tag(
 
 @compiled(inline="always")
 def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, float]:
-    """The read probability, including false reads, at the logit ``z``. Also returns its derivatives by the logit and by the
-    logarithm of ``rate``, a factor of the probability."""
+    """The read probability, including false reads, at the logit ``z``. Also returns its derivatives by the logit and by
+    the logarithm of ``rate``, a factor of the probability."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
     by_rate = packed.span * rate * sigmoid
     # without false reads, a probability may be 0 or 1, and the logarithm of it or of its complement is infinite
@@ -90,8 +90,8 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
 
 @compiled
 def reach_of(packed: Packed, offsets: Array) -> float:
-    """The largest distance [m] from the reference pose at which a tag can be read. ``offsets`` (K, 3): the robot's poses at the
-    measurements, in the frame of the reference pose."""
+    """The largest distance [m] from the reference pose at which a tag can be read. ``offsets`` (K, 3): the robot's
+    poses at the measurements, in the frame of the reference pose."""
     offset = farthest = 0.0
     for k in range(len(offsets)):
         offset = max(offset, math.hypot(offsets[k, 0], offsets[k, 1]))
@@ -103,8 +103,8 @@ def reach_of(packed: Packed, offsets: Array) -> float:
 
 @compiled(inline="always")
 def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
-    """Write the antenna of each measurement into ``out`` (K, 8): position and boresight in the world, then boresight and position
-    in the frame of the pose. Returns the largest distance [m] from the pose at which a tag can be read."""
+    """Write the antenna of each measurement into ``out`` (K, 8): position and boresight in the world, then boresight
+    and position in the frame of the pose. Returns the largest distance [m] from the pose at which a tag can be read."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]
@@ -123,11 +123,11 @@ def mixture(
 ) -> tuple[float, float, float, float]:
     """The likelihood of a tag that may be weak, moved or dead instead of as surveyed (:mod:`factors.rfid.tag_states`).
 
-    ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`. ``e``, ``mean``, ``variance``: the untempered
-    negative log-likelihood of a tag as surveyed, and its mean and variance over all outcomes. ``none``: the untempered negative
-    log-likelihood that a tag out of range is never read. Returns a factor for the derivatives of ``e``, and the tempered negative
-    log-likelihood with its mean and variance. An unknown state reduces the information on the pose, which the derivatives neglect
-    (Louis, JRSS B 44(2), 1982, eq. 3.2').
+    ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`. ``e``, ``mean``, ``variance``: the
+    untempered negative log-likelihood of a tag as surveyed, and its mean and variance over all outcomes. ``none``: the
+    untempered negative log-likelihood that a tag out of range is never read. Returns a factor for the derivatives of
+    ``e``, and the tempered negative log-likelihood with its mean and variance. An unknown state reduces the information
+    on the pose, which the derivatives neglect (Louis, JRSS B 44(2), 1982, eq. 3.2').
     """
     if odds == -np.inf or elsewhere == -np.inf:
         return tempering, tempering * e, tempering * mean, tempering * variance
@@ -143,8 +143,8 @@ def mixture(
 
 @compiled(inline="always")
 def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """The negative log-likelihood of ``hits`` reads in ``rounds`` rounds with read probability ``q``, its derivative by q, the
-    Fisher information on q, and the mean and variance of the negative log-likelihood over all outcomes."""
+    """The negative log-likelihood of ``hits`` reads in ``rounds`` rounds with read probability ``q``, its derivative by
+    q, the Fisher information on q, and the mean and variance of the negative log-likelihood over all outcomes."""
     log_q, log_p = math.log(q), math.log1p(-q)
     nll = -(hits * log_q + (rounds - hits) * log_p)
     gradient = -(hits / q - (rounds - hits) / (1.0 - q))
@@ -156,8 +156,8 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
 
 @compiled
 def _unread(packed: Packed, rounds: Integers) -> Array:
-    """For each of K measurements, the negative log-likelihood that a tag out of range is not read, and the mean and variance of the
-    negative log-likelihood over all outcomes (K, 3)."""
+    """For each of K measurements, the negative log-likelihood that a tag out of range is not read, and the mean and
+    variance of the negative log-likelihood over all outcomes (K, 3)."""
     out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
     for k in range(len(rounds)):
         out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])
@@ -260,8 +260,8 @@ def _add_measurement(
 def scores(
     packed: Packed, of_map: MapTags, counts: Counts, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Compute the fields of a :class:`~factors.rfid.detection.Score` at poses (N, 3). ``packed``: adjusted models. ``columns``
-    (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
+    """Compute the fields of a :class:`~factors.rfid.detection.Score` at poses (N, 3). ``packed``: adjusted models.
+    ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
     antennas, rounds, twists = counts[1], counts[2], counts[8]
     offsets = delayed(counts[0], twists, packed.delay)
     count, scans, size = len(poses), len(antennas), 3
@@ -322,9 +322,9 @@ def scores(
 def score(
     packed: Packed, of_map: MapTags, counts: Counts, alpha: float, pose: Array, parameters: Array, estimated: Integers
 ) -> tuple[float, Array, Array, float, float]:
-    """The tempered likelihood of one pose (3,) with ``parameters`` (Q,), and its derivatives. ``packed``: models before adjustment.
-    ``alpha``: the tempering. Returns the negative log-likelihood, its gradient (3 + P,) and information (3 + P, 3 + P) by the pose
-    and the parameters with indices ``estimated`` (P,), and its mean and variance."""
+    """The tempered likelihood of one pose (3,) with ``parameters`` (Q,), and its derivatives. ``packed``: models before
+    adjustment. ``alpha``: the tempering. Returns the negative log-likelihood, its gradient (3 + P,) and information (3
+    + P, 3 + P) by the pose and the parameters with indices ``estimated`` (P,), and its mean and variance."""
     columns = np.full(len(parameters), -1, np.int64)
     for i in range(len(estimated)):
         columns[estimated[i]] = 3 + i
@@ -368,8 +368,8 @@ def by_tag(
 def probabilities(
     packed: Packed, antennas: Integers, poses: Array, points: Array, normals: Array
 ) -> tuple[Array, Array]:
-    """The probability (N, T), including false reads, that one round of antenna ``antennas[n]`` on a robot at ``poses[n]`` reads
-    each tag. Also returns the horizontal distance (N, T) [m] from the antenna to the tag."""
+    """The probability (N, T), including false reads, that one round of antenna ``antennas[n]`` on a robot at
+    ``poses[n]`` reads each tag. Also returns the horizontal distance (N, T) [m] from the antenna to the tag."""
     none = np.zeros(3)
     p, distance = np.empty((len(poses), len(points))), np.empty((len(poses), len(points)))
     for n in range(len(poses)):

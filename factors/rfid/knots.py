@@ -1,5 +1,5 @@
-"""Interpolation between evenly spaced knots, for the grids and tables of detection models. The place of a value is its distance
-from the first knot in units of the spacing."""
+"""Interpolation between evenly spaced knots, for the grids and tables of detection models. The place of a value is its
+distance from the first knot in units of the spacing."""
 
 from typing import TypeVar
 
@@ -12,8 +12,8 @@ Place = TypeVar("Place", float, Array)
 
 
 def linear(place: Array, count: int) -> tuple[Integers, Array]:
-    """Linear interpolation at ``place`` (N,) among ``count`` knots. Returns the indices (N, 2) of the knots and their weights
-    (N, 2), or (N, 1) for a single knot. Places outside are clipped."""
+    """Linear interpolation at ``place`` (N,) among ``count`` knots. Returns the indices (N, 2) of the knots and their
+    weights (N, 2), or (N, 1) for a single knot. Places outside are clipped."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -23,8 +23,8 @@ def linear(place: Array, count: int) -> tuple[Integers, Array]:
 
 @register_jitable
 def cubic_weights(f: Place) -> tuple[Place, Place, Place, Place]:
-    """The weights of four consecutive knots in cubic convolution. ``f``: position between the second and third knot, in [0, 1], a
-    number or an array."""
+    """The weights of four consecutive knots in cubic convolution. ``f``: position between the second and third knot, in
+    [0, 1], a number or an array."""
     return (
         ((-0.5 * f + 1.0) * f - 0.5) * f,
         (1.5 * f - 2.5) * f * f + 1.0,
@@ -44,8 +44,8 @@ def cubic(place: Array, count: int) -> tuple[Integers, Array]:
 
 
 def matrix(places: tuple[Integers, Array], count: int) -> Array:
-    """The matrix (N, ``count``) that converts values at the knots to values at N places. ``places``: the result of :func:`linear`
-    or :func:`cubic`."""
+    """The matrix (N, ``count``) that converts values at the knots to values at N places. ``places``: the result of
+    :func:`linear` or :func:`cubic`."""
     knots, weights = places
     out = np.zeros((len(knots), count))
     np.add.at(out, (np.arange(len(knots))[:, None], knots), weights)

@@ -82,8 +82,8 @@ class BeamModel:
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """A detection model whose logit is linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients`` (11,): one for
-    each feature.
+    """A detection model whose logit is linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients``
+    (11,): one for each feature.
 
     The features are made of the horizontal distance r [m], w = 1 - cosine of the bearing, the height difference z [m], and c, the
     cosine of the angle between the tag's facing and the direction to the antenna (0 if the facing is unknown).
@@ -106,13 +106,13 @@ class LogisticModel:
 
 @dataclass(frozen=True, eq=False)
 class GridModel:
-    """A detection model with a grid of logits in the antenna's frame. ``logits`` (H, F, NX, NY): the logits of the read probability
-    at grid points ``cell`` [m] apart, the first at (``x0``, ``y0``).
+    """A detection model with a grid of logits in the antenna's frame. ``logits`` (H, F, NX, NY): the logits of the read
+    probability at grid points ``cell`` [m] apart, the first at (``x0``, ``y0``).
 
-    ``heights`` (H,) [m]: heights of the tag above the antenna, ascending and evenly spaced. The F facings are evenly spaced cosines
-    from -1 to 1 of the angle between the tag's facing and the direction to the antenna; F is 1 if the facing is irrelevant.
-    Interpolation is by cubic convolution in the plane and in the facing (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6), and linear in
-    height. The logit is constant from the edge of the grid up to ``reach``.
+    ``heights`` (H,) [m]: heights of the tag above the antenna, ascending and evenly spaced. The F facings are evenly
+    spaced cosines from -1 to 1 of the angle between the tag's facing and the direction to the antenna; F is 1 if the
+    facing is irrelevant. Interpolation is by cubic convolution in the plane and in the facing (Keys, IEEE TASSP 29(6),
+    1981, eq. 4 and 6), and linear in height. The logit is constant from the edge of the grid up to ``reach``.
     """
 
     logits: Array
@@ -143,8 +143,8 @@ class GridModel:
 
 @dataclass(frozen=True)
 class Antenna:
-    """Position ``x``, ``y``, ``z`` [m] and boresight ``yaw``, ``pitch`` (positive is up) [rad] of an antenna in the robot frame.
-    ``model``: index of its detection model."""
+    """Position ``x``, ``y``, ``z`` [m] and boresight ``yaw``, ``pitch`` (positive is up) [rad] of an antenna in the
+    robot frame. ``model``: index of its detection model."""
 
     x: float = 0.0
     y: float = 0.0
@@ -155,11 +155,11 @@ class Antenna:
 
 
 class Packed(NamedTuple):
-    """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw, and of pitch. ``which`` (A,):
-    the model of each. ``kinds`` (M,), ``parameters`` (M, 12): of each model. ``shapes`` (M, 5): H, F, NX, NY of a grid, and its
-    first index in ``knots``, the logits of all grids. ``reach`` (M,) [m]. ``span``: ``1 - false_read - miss``. ``scale``, ``rate``
-    (M,) and ``delay`` (1,) [s]: the adjustment by :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest probability of
-    each model."""
+    """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw, and of pitch.
+    ``which`` (A,): the model of each. ``kinds`` (M,), ``parameters`` (M, 12): of each model. ``shapes`` (M, 5): H, F,
+    NX, NY of a grid, and its first index in ``knots``, the logits of all grids. ``reach`` (M,) [m]. ``span``: ``1 -
+    false_read - miss``. ``scale``, ``rate`` (M,) and ``delay`` (1,) [s]: the adjustment by
+    :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest probability of each model."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -223,8 +223,8 @@ def _probability(logit: float) -> float:
 
 
 def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> tuple[Array, Array]:
-    """The logits (N,) of tags at ``points`` (N, 3) [m] in the antenna's frame, and their gradient (N, 4) by x, y, z and facing.
-    ``facing`` (N,): the cosine of the angle between each tag's facing and the direction to the antenna."""
+    """The logits (N,) of tags at ``points`` (N, 3) [m] in the antenna's frame, and their gradient (N, 4) by x, y, z and
+    facing. ``facing`` (N,): the cosine of the angle between each tag's facing and the direction to the antenna."""
     packed = RfidModel((Antenna(),), (model,)).packed()
     points = np.atleast_2d(np.asarray(points, dtype=float))
     facing = np.ascontiguousarray(np.broadcast_to(np.asarray(facing, dtype=float), len(points)))
@@ -234,16 +234,16 @@ def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) ->
 
 
 def probability(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> Array:
-    """The read probabilities (N,), without false reads, of tags at ``points`` (N, 3) [m] in the antenna's frame. ``facing`` (N,):
-    the cosine of the angle between each tag's facing and the direction to the antenna."""
+    """The read probabilities (N,), without false reads, of tags at ``points`` (N, 3) [m] in the antenna's frame.
+    ``facing`` (N,): the cosine of the angle between each tag's facing and the direction to the antenna."""
     return np.asarray(1.0 / (1.0 + np.exp(-logits(model, points, facing)[0])))
 
 
 def bake(
     model: DetectionModel, extent: float, cell: float = 0.1, heights: Sequence[float] = (0.0,), facings: int = 1
 ) -> GridModel:
-    """Convert any detection model to a grid from -``extent`` to ``extent`` [m] in x and y. ``cell`` [m]: the spacing. ``heights``
-    [m]: tag heights above the antenna. ``facings``: the number of evenly spaced cosines of the facing."""
+    """Convert any detection model to a grid from -``extent`` to ``extent`` [m] in x and y. ``cell`` [m]: the spacing.
+    ``heights`` [m]: tag heights above the antenna. ``facings``: the number of evenly spaced cosines of the facing."""
     count = 2 * math.ceil(extent / cell) + 1
     axis = cell * (np.arange(count) - (count - 1) / 2.0)
     cosines = np.linspace(-1.0, 1.0, facings) if facings > 1 else np.zeros(1)
@@ -309,8 +309,8 @@ def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> flo
 
 @compiled
 def _logistic_peak(b: Array, reach: float) -> float:
-    """The largest logit of a logistic model with coefficients ``b`` (11,), over all ranges up to ``reach`` [m], bearings and
-    facings, for tags at the antenna's height."""
+    """The largest logit of a logistic model with coefficients ``b`` (11,), over all ranges up to ``reach`` [m],
+    bearings and facings, for tags at the antenna's height."""
     largest = -np.inf
     for r in np.linspace(0.0, reach, 81):
         for w in np.linspace(0.0, 2.0, 9):
@@ -346,8 +346,8 @@ def _slope(f: float) -> tuple[float, float, float, float]:
 
 @compiled
 def _place(s: float, count: int) -> tuple[int, float, float]:
-    """Clip a coordinate ``s`` to a row of ``count`` grid points 0, 1, .... Returns the grid point below, the fractional part, and 1
-    if ``s`` was inside, otherwise 0."""
+    """Clip a coordinate ``s`` to a row of ``count`` grid points 0, 1, .... Returns the grid point below, the fractional
+    part, and 1 if ``s`` was inside, otherwise 0."""
     if count == 1 or s <= 0.0:
         return 0, 0.0, 0.0
     if s >= count - 1:

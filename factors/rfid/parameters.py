@@ -1,16 +1,16 @@
 """The parameters of the likelihood of RFID reads. They adapt detection models, antenna mounting and clock to an installation.
 
-Each detection model has two parameters, because power, cables and kinds of tags differ. ``a`` is the logarithm of a factor of the
-range. ``b`` is a shift of the logit of the largest read probability ``peak``. The read probability ``p(x, y, z)`` of a tag in the
-antenna's frame becomes
+Each detection model has two parameters, because power, cables and kinds of tags differ. ``a`` is the logarithm of a
+factor of the range. ``b`` is a shift of the logit of the largest read probability ``peak``. The read probability ``p(x,
+y, z)`` of a tag in the antenna's frame becomes
 
     rate * p(x / scale, y / scale, z),    scale = exp(a),    rate = sigmoid(logit(peak) + b) / peak.
 
 For a beam model this changes ``r_max`` and ``s_r`` in proportion, and ``p0``.
 
-The parameters of M models and A antennas are a vector (Q,) with Q = 2 M + A + 2. Its elements are ``a`` and ``b`` of each model,
-the common change of yaw [rad] of all antennas, the additional change of yaw of each antenna, and the time offset [s] that is added
-to the timestamps. Zeros change nothing.
+The parameters of M models and A antennas are a vector (Q,) with Q = 2 M + A + 2. Its elements are ``a`` and ``b`` of
+each model, the common change of yaw [rad] of all antennas, the additional change of yaw of each antenna, and the time
+offset [s] that is added to the timestamps. Zeros change nothing.
 """
 
 import math
@@ -27,8 +27,8 @@ MOST_CERTAIN = 0.99  # limit of the peak of a model, because a shift of the logi
 
 @compiled
 def rate_of(peak: float, shift: float) -> float:
-    """The factor ``rate`` by which the read probabilities of a model are multiplied, so that the logit of the largest probability
-    ``peak`` changes by ``shift`` (the parameter b)."""
+    """The factor ``rate`` by which the read probabilities of a model are multiplied, so that the logit of the largest
+    probability ``peak`` changes by ``shift`` (the parameter b)."""
     certain = min(peak, MOST_CERTAIN)
     return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
 

@@ -1,12 +1,12 @@
 """Likelihood tables by the tag's position in the robot frame, and the likelihood of reads at poses anywhere in a large map.
 
-All antennas of a robot measure from one robot pose. Their responses to a tag are therefore functions of the tag's position in the
-robot frame, and equal for all tags of one height. A global search for the pose uses these tables, and so does planning, with larger
-cells.
+All antennas of a robot measure from one robot pose. Their responses to a tag are therefore functions of the tag's
+position in the robot frame, and equal for all tags of one height. A global search for the pose uses these tables, and
+so does planning, with larger cells.
 
-For each pose, a :class:`~factors.rfid.index.TagIndex` finds the tags in reach. Most of these were not read, so one table has the
-log-likelihood that all antennas together miss a tag. If a model depends on the facing of tags, a search evaluates each antenna
-separately instead, because close to an antenna the facing changes within a cell.
+For each pose, a :class:`~factors.rfid.index.TagIndex` finds the tags in reach. Most of these were not read, so one
+table has the log-likelihood that all antennas together miss a tag. If a model depends on the facing of tags, a search
+evaluates each antenna separately instead, because close to an antenna the facing changes within a cell.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ BY_ANTENNA = 7
 class RobotTables(NamedTuple):
     """The responses of A antennas to a tag, by the tag's position in the robot frame. q is the read probability of one round.
 
-    A table has S x S cells of ``cell`` [m], for each of H heights and each of F facings of the tag. The last facing is for tags
-    whose facing is unknown or irrelevant.
+    A table has S x S cells of ``cell`` [m], for each of H heights and each of F facings of the tag. The last facing is
+    for tags whose facing is unknown or irrelevant.
     ``gain`` (A, H, F, S, S): log q - log(1 - q).
     ``missed`` (A, H, F, S, S): log(1 - q) minus its value out of reach.
     ``level`` (T,): the index of each tag's height. ``none`` (A, 2): log q and log(1 - q) out of reach.
@@ -53,8 +53,8 @@ class RobotTables(NamedTuple):
 
 
 class MissTable(NamedTuple):
-    """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is relative to the
-    log-likelihood that they miss a tag out of reach.
+    """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is
+    relative to the log-likelihood that they miss a tag out of reach.
 
     ``surveyed`` (H, S, S): untempered, for a tag that works and is where the map has it, at H heights.
     ``folded`` (H, S, S): tempered, for a tag that may be weak, moved or dead.
@@ -70,8 +70,8 @@ class MissTable(NamedTuple):
 class Scan(NamedTuple):
     """The reads of one likelihood evaluation. W tags are exceptional: they were read, or their odds differ from those of most tags.
 
-    ``antennas`` (K,), ``rounds`` (K,): of each measurement. ``hits`` (K, W): the number of reads of each exceptional tag.
-    ``number`` (T,): for each tag, in the order of the index, its number among the exceptional tags, or -1.
+    ``antennas`` (K,), ``rounds`` (K,): of each measurement. ``hits`` (K, W): the number of reads of each exceptional
+    tag. ``number`` (T,): for each tag, in the order of the index, its number among the exceptional tags, or -1.
     ``odds`` (W,), ``elsewhere`` (W,): of the exceptional tags. ``unlisted_odds``: of all remaining tags. See
     :class:`~factors.rfid.detection.TagReadCounts`.
     """
@@ -86,9 +86,9 @@ class Scan(NamedTuple):
 
 
 class Antennas(NamedTuple):
-    """The detection models of all antennas, and their tables. ``logs`` (M, Z, 2): the logarithms of read and miss probability of M
-    models, at the Z logits of the tables. ``reach`` [m]: the largest distance from the robot's origin at which a tag can be
-    read."""
+    """The detection models of all antennas, and their tables. ``logs`` (M, Z, 2): the logarithms of read and miss
+    probability of M models, at the Z logits of the tables. ``reach`` [m]: the largest distance from the robot's origin
+    at which a tag can be read."""
 
     packed: Packed
     tables: Tables
@@ -118,9 +118,9 @@ def in_reach(points: Array, reach: float) -> float:
 def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: int = 0) -> RobotTables:
     """Compute the tables of a model by the tag's position in the robot frame.
 
-    ``heights`` (T,) [m]: heights of the tags. ``facings``: number of facing directions, besides that for an irrelevant facing.
-    ``finest``: the size of cells and of height steps, as a multiple of their size in the tables of ``antennas``. It is increased if
-    the tables would be too large.
+    ``heights`` (T,) [m]: heights of the tags. ``facings``: number of facing directions, besides that for an irrelevant
+    facing. ``finest``: the size of cells and of height steps, as a multiple of their size in the tables of
+    ``antennas``. It is increased if the tables would be too large.
     """
     scale, size, (packed, tables, logs, reach) = finest, MOST + 1, antennas
     while size > MOST:
@@ -156,10 +156,10 @@ def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) 
 class Places:
     """The likelihood of reads at poses anywhere in a map.
 
-    ``antennas``: the model and its tables. ``tables``: the tables by position in the robot frame, empty if the model depends on the
-    facing of tags.
-    ``index``: the spatial index of the map's tags. ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): the tags' positions,
-    facings and numbers of tables, in the order of the index.
+    ``antennas``: the model and its tables. ``tables``: the tables by position in the robot frame, empty if the model
+    depends on the facing of tags.
+    ``index``: the spatial index of the map's tags. ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): the tags'
+    positions, facings and numbers of tables, in the order of the index.
     """
 
     antennas: Antennas
@@ -277,11 +277,11 @@ def _log_likelihood(
 def _of_tag(
     model: Antennas, scan: Scan, x: float, y: float, height: float, nx: float, ny: float, levels: Integers, w: int
 ) -> float:
-    """The untempered log-likelihood of one tag that works and is where the map has it, from the tables of each antenna. It is
-    relative to the log-likelihood that a tag out of reach is never read.
+    """The untempered log-likelihood of one tag that works and is where the map has it, from the tables of each antenna.
+    It is relative to the log-likelihood that a tag out of reach is never read.
 
-    ``x``, ``y``, ``height``, ``nx``, ``ny``: position and facing of the tag in the robot frame. ``levels`` (A,): the tables of the
-    tag. ``w``: its number among the exceptional tags, -1 if it was not read.
+    ``x``, ``y``, ``height``, ``nx``, ``ny``: position and facing of the tag in the robot frame. ``levels`` (A,): the
+    tables of the tag. ``w``: its number among the exceptional tags, -1 if it was not read.
     """
     packed, own = model.packed, 0.0
     for k in range(len(scan.antennas)):
@@ -327,8 +327,8 @@ def _fill(
     gain: Array32,
     missed: Array32,
 ) -> None:
-    """Compute ``gain`` and ``missed`` of :class:`RobotTables` from the tables of the antennas. ``levels`` (A, H): the number of the
-    table of each antenna and height."""
+    """Compute ``gain`` and ``missed`` of :class:`RobotTables` from the tables of the antennas. ``levels`` (A, H): the
+    number of the table of each antenna and height."""
     layers, half = gain.shape[2], gain.shape[3] // 2
     for a in range(len(gain)):
         at, m = packed.antennas[a], packed.which[a]

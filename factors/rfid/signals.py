@@ -9,17 +9,17 @@ of concentration kappa and the most likely offset, the negative log-likelihood o
  nll = kappa (R - |S|),  S = sum exp(i psi).
 
 Let c and s be cosine and sine of psi - arg S, and m the mean of the gradient dpsi weighted by c. The gradient is
-``kappa sum s dpsi``. The Hessian, without the curvature of the distances, is ``kappa sum c (dpsi - m)(dpsi - m)^T``. Reads with c <
-0 are excluded from the Hessian, which makes it positive semi-definite.
+``kappa sum s dpsi``. The Hessian, without the curvature of the distances, is ``kappa sum c (dpsi - m)(dpsi - m)^T``.
+Reads with c < 0 are excluded from the Hessian, which makes it positive semi-definite.
 
 **Strength** follows log-distance path loss with the antenna's pattern,
 
  rssi = a0 - 10 a1 log10(d) + a2 w + a3 w^2 + a4 c + a5 c^2  [dBm],
 
-with the distance d [m] from the antenna to the tag, w = 1 - cosine of the angle from the boresight, and c the cosine of the angle
-between the tag's facing and the direction to the antenna (0 if unknown): Rappaport, "Wireless Communications", 2002, eq. 4.69a,
-with a series for the gains. Residuals have a Student density, because reflections cause outliers
-(Lange, Little, Taylor, JASA 84, 1989); its Fisher information is ``(dof + 1) / (dof + 3) / sigma^2``.
+with the distance d [m] from the antenna to the tag, w = 1 - cosine of the angle from the boresight, and c the cosine of
+the angle between the tag's facing and the direction to the antenna (0 if unknown): Rappaport, "Wireless
+Communications", 2002, eq. 4.69a, with a series for the gains. Residuals have a Student density, because reflections
+cause outliers (Lange, Little, Taylor, JASA 84, 1989); its Fisher information is ``(dof + 1) / (dof + 3) / sigma^2``.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ DECIBEL = 10.0 / math.log(10.0)
 class TagReads:
     """R reads of tags, each at its own robot pose.
 
-    ``offsets`` (R, 3): the robot's pose at each read, in the frame of a reference pose. The likelihood is a function of the
-    reference pose. ``antennas`` (R,), ``tags`` (R,): indices in the model and in the map.
+    ``offsets`` (R, 3): the robot's pose at each read, in the frame of a reference pose. The likelihood is a function of
+    the reference pose. ``antennas`` (R,), ``tags`` (R,): indices in the model and in the map.
     """
 
     offsets: Array
@@ -76,8 +76,8 @@ class RssiReads(TagReads):
 
 @dataclass(frozen=True, eq=False)
 class PhaseReads(TagReads):
-    """R reads with phases. ``phase`` (R,) [rad]: as reported. ``frequency`` (R,) [Hz]: of the carrier. ``windows`` (R,): the number
-    of each read's time window."""
+    """R reads with phases. ``phase`` (R,) [rad]: as reported. ``frequency`` (R,) [Hz]: of the carrier. ``windows``
+    (R,): the number of each read's time window."""
 
     phase: Array
     frequency: Array
@@ -106,8 +106,8 @@ class PhaseReads(TagReads):
 
 
 class _Ordered(NamedTuple):
-    """Phase reads sorted by group. ``doubled`` (R,) [rad]: twice the phase. ``wavenumber`` (R,) [rad/m]: its change per metre of
-    distance. ``bounds`` (G + 1,): the indices at which the G groups begin and end."""
+    """Phase reads sorted by group. ``doubled`` (R,) [rad]: twice the phase. ``wavenumber`` (R,) [rad/m]: its change per
+    metre of distance. ``bounds`` (G + 1,): the indices at which the G groups begin and end."""
 
     offsets: Array
     antennas: Integers
@@ -118,8 +118,8 @@ class _Ordered(NamedTuple):
 
 
 class PhaseProblem(NamedTuple):
-    """Phase reads, map and model as arrays for compiled code. ``antennas`` (A, 6): the result of :func:`mounting`. ``points``
-    (T, 3): positions of the tags. ``weight``: the tempering exponent times the concentration kappa."""
+    """Phase reads, map and model as arrays for compiled code. ``antennas`` (A, 6): the result of :func:`mounting`.
+    ``points`` (T, 3): positions of the tags. ``weight``: the tempering exponent times the concentration kappa."""
 
     antennas: Array
     points: Array
@@ -128,9 +128,9 @@ class PhaseProblem(NamedTuple):
 
 
 class StrengthProblem(NamedTuple):
-    """Signal strengths, map and model for compiled code: ``antennas`` (A, 6) from :func:`mounting`, ``points`` (T, 3) and
-    ``normals`` (T, 2) of the tags, the fields of the model, and the fields of the reads. ``weight``: tempering. ``which`` (R,):
-    antennas."""
+    """Signal strengths, map and model for compiled code: ``antennas`` (A, 6) from :func:`mounting`, ``points`` (T, 3)
+    and ``normals`` (T, 2) of the tags, the fields of the model, and the fields of the reads. ``weight``: tempering.
+    ``which`` (R,): antennas."""
 
     antennas: Array
     points: Array
@@ -208,8 +208,8 @@ class PhaseLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of signal strengths as a function of the robot's pose, for a map of tags. It is relative to its value for
-    residuals of zero."""
+    """The likelihood of signal strengths as a function of the robot's pose, for a map of tags. It is relative to its
+    value for residuals of zero."""
 
     model: RssiModel
     tags: TagArray
@@ -255,16 +255,16 @@ def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: Rs
 
 @compiled(inline="always")
 def _on_robot(offset: Array, x: float, y: float) -> tuple[float, float]:
-    """Transform a position (x, y) from the robot frame at a read to the frame of the reference pose. ``offset`` (3,): the robot's
-    pose at the read in that frame."""
+    """Transform a position (x, y) from the robot frame at a read to the frame of the reference pose. ``offset`` (3,):
+    the robot's pose at the read in that frame."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * x - s * y, offset[1] + s * x + c * y
 
 
 @compiled
 def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """The tempered negative log-likelihood (N,) of phases at poses (N, 3), its gradient (N, 3) and its information (N, 3, 3). The
-    last two are empty if ``derivatives`` is False."""
+    """The tempered negative log-likelihood (N,) of phases at poses (N, 3), its gradient (N, 3) and its information (N,
+    3, 3). The last two are empty if ``derivatives`` is False."""
     antennas, points, reads, factor = problem
     count, each = len(poses) if derivatives else 0, len(reads.doubled)
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -330,9 +330,9 @@ def _mounted(antenna: Array, offset: Array) -> tuple[float, float, float, float]
 def _features(
     at: tuple[float, float, float, float], height: float, up: float, ex: float, ey: float, nx: float, ny: float
 ) -> tuple[float, float, float, float, float]:
-    """The vector (x, y) from an antenna to a tag, their distance d, and w and c of :data:`FEATURES`. ``at``: from :func:`_mounted`.
-    ``height``: of the tag above the antenna. ``up``: vertical part of the boresight. (``ex``, ``ey``), (``nx``, ``ny``): position
-    and facing of the tag in the frame of the reference pose."""
+    """The vector (x, y) from an antenna to a tag, their distance d, and w and c of :data:`FEATURES`. ``at``: from
+    :func:`_mounted`. ``height``: of the tag above the antenna. ``up``: vertical part of the boresight. (``ex``,
+    ``ey``), (``nx``, ``ny``): position and facing of the tag in the frame of the reference pose."""
     ex, ey = ex - at[0], ey - at[1]
     d = math.sqrt(ex * ex + ey * ey + height * height + NEAR * NEAR)
     return ex, ey, d, 1.0 - (ex * at[2] + ey * at[3] + height * up) / d, -(nx * ex + ny * ey) / d
@@ -363,8 +363,8 @@ def _all_features(
 
 @compiled
 def strength_scores(problem: StrengthProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """The tempered negative log-likelihood (N,) of signal strengths at poses (N, 3), its gradient (N, 3) and its information
-    (N, 3, 3). The last two are empty if ``derivatives`` is False."""
+    """The tempered negative log-likelihood (N,) of signal strengths at poses (N, 3), its gradient (N, 3) and its
+    information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
     antennas, points, normals, b, sigma, dof, factor, offsets, which, tags, rssi = problem
     count = len(poses) if derivatives else 0
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))

@@ -1,7 +1,7 @@
 """Tables of detection models, to evaluate many poses (particles) without derivatives.
 
-A table has the logits of one detection model in the horizontal plane of the antenna's frame, for tags of one height. Its cells have
-the size :data:`CELL`. It has several layers if the model depends on the facing of tags.
+A table has the logits of one detection model in the horizontal plane of the antenna's frame, for tags of one height.
+Its cells have the size :data:`CELL`. It has several layers if the model depends on the facing of tags.
 """
 
 import math
@@ -43,8 +43,8 @@ _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIB
 class Tables(NamedTuple):
     """L tables of detection models, stored one after the other. Table l is an array (F, NX, NX) of facings and cells.
 
-    ``sigmoids`` (Z,): the sigmoids of logits that are :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its negative.
-    ``rows``: the elements of all tables, as indices into ``sigmoids``. ``chances``: the sigmoids of these.
+    ``sigmoids`` (Z,): the sigmoids of logits that are :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its
+    negative. ``rows``: the elements of all tables, as indices into ``sigmoids``. ``chances``: the sigmoids of these.
     ``start`` (L,): the index of the first element of each table.
     ``half`` (L,): the number of cells from the middle of a table to its edge. ``facings`` (L,): F of each table.
     ``level`` (A, T): the number of the table of each antenna and tag.
@@ -133,8 +133,8 @@ def logit_row(z: float) -> int:
 
 
 def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
-    """Interpolate a grid model at the facings and cells of tables with ``shape`` (F, NX, NX). Returns logits (H, F, NX, NX) at the
-    H heights of the grid."""
+    """Interpolate a grid model at the facings and cells of tables with ``shape`` (F, NX, NX). Returns logits (H, F, NX,
+    NX) at the H heights of the grid."""
     heights, facings, nx, ny, first = packed.shapes[model].tolist()
     x0, y0, cell = packed.parameters[model, :3]
     grid = packed.knots[first : first + heights * facings * nx * ny].reshape(heights, facings, nx, ny)
@@ -145,8 +145,8 @@ def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
 
 
 def _fill_level(planes: Array, packed: Packed, model: int, height: float, table: NDArray[np.uint16]) -> None:
-    """Compute a ``table`` of a grid model for an antenna without pitch, like :func:`_fill` but faster. ``planes``: the result of
-    :func:`_planes`. ``height`` [m]: the tags' height above the antenna."""
+    """Compute a ``table`` of a grid model for an antenna without pitch, like :func:`_fill` but faster. ``planes``: the
+    result of :func:`_planes`. ``height`` [m]: the tags' height above the antenna."""
     z0, step = packed.parameters[model, 3:5]
     levels, weights = knots.linear(np.array(((height - z0) / step,)), len(planes))
     z = sum(weight * planes[level] for level, weight in zip(levels[0], weights[0], strict=True) if weight > 0.0)
@@ -159,8 +159,8 @@ def _fill_level(planes: Array, packed: Packed, model: int, height: float, table:
 
 @compiled
 def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray[np.uint16]) -> None:
-    """Compute a ``table`` of any model, for tags at ``height`` [m] above the antenna. ``half``: the number of cells from the middle
-    of the table to its edge."""
+    """Compute a ``table`` of any model, for tags at ``height`` [m] above the antenna. ``half``: the number of cells
+    from the middle of the table to its edge."""
     facings = len(table)
     for f in range(facings):
         c = 2.0 * f / (facings - 1) - 1.0 if facings > 1 else 0.0
@@ -213,11 +213,11 @@ def relevant(
 ) -> NDArray[np.bool_]:
     """A mask (K, T) of measurements and tags that change the likelihood of any particle noticeably.
 
-    ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models adjusted to the first
-    row of ``parameters``. ``near`` (T,): a mask of tags in reach.
+    ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models adjusted to
+    the first row of ``parameters``. ``near`` (T,): a mask of tags in reach.
 
-    The mask is True for near tags that were read, and for near tags that have a relevant read probability according to the blocks
-    of the tables. In a dense map most tags have none, which saves time.
+    The mask is True for near tags that were read, and for near tags that have a relevant read probability according to
+    the blocks of the tables. In a dense map most tags have none, which saves time.
     """
     offsets, antennas, rounds = measured
     points, _, levels, hits = tags
@@ -251,8 +251,8 @@ def relevant(
 
 @compiled
 def _largest(tables: Tables, level: int, along: float, across: float, radius: float) -> float:
-    """An upper bound of the sigmoids of the table ``level`` within ``radius`` [m] of the position (``along``, ``across``). Beyond
-    its edge a table continues with the values at the edge."""
+    """An upper bound of the sigmoids of the table ``level`` within ``radius`` [m] of the position (``along``,
+    ``across``). Beyond its edge a table continues with the values at the edge."""
     half, largest = tables.half[level], 0.0
     last, reach = 2 * half, radius / CELL + 1.0
     i, j, count = along / CELL + half, across / CELL + half, 2 * half // COARSE + 1

@@ -5,21 +5,21 @@
 - *moved*: the tag is at one of several displacements from its position in the map (:func:`displacements`);
 - *dead*: the tag is broken, hidden or gone, and is never read.
 
-Given the robot's poses, the states of tags are independent. So each tag has its own filter. The filter has no prediction step,
-because states do not change. Only tags as surveyed inform the robot's pose.
+Given the robot's poses, the states of tags are independent. So each tag has its own filter. The filter has no
+prediction step, because states do not change. Only tags as surveyed inform the robot's pose.
 
-Let ``exp(odds)`` be the prior odds that a tag is not as surveyed. Let E be the negative log-likelihood of its reads and misses if
-it is as surveyed, relative to that of misses out of range. Then the tag's likelihood of a pose is the mixture
+Let ``exp(odds)`` be the prior odds that a tag is not as surveyed. Let E be the negative log-likelihood of its reads and
+misses if it is as surveyed, relative to that of misses out of range. Then the tag's likelihood of a pose is the mixture
 
  log p = log(exp(-E) + exp(odds + elsewhere)) - log(1 + exp(odds)).
 
-``elsewhere`` is the log-likelihood of the same reads and misses if the tag is not as surveyed. It is the mean over the states weak,
-moved and dead at the predicted pose, weighted by their probabilities before the scan. It does not depend on the pose, which bounds
-the influence of a tag. E and the evidence on the state have the same tempering. The odds are those before the scan, so that no scan
-is used twice.
+``elsewhere`` is the log-likelihood of the same reads and misses if the tag is not as surveyed. It is the mean over the
+states weak, moved and dead at the predicted pose, weighted by their probabilities before the scan. It does not depend
+on the pose, which bounds the influence of a tag. E and the evidence on the state have the same tempering. The odds are
+those before the scan, so that no scan is used twice.
 
-The fraction of moved tags is also estimated, up to :data:`MOST_MOVED`: the more of the read tags have moved, the higher is the
-prior of the rest. The fraction has a beta prior, whose mean is a setting.
+The fraction of moved tags is also estimated, up to :data:`MOST_MOVED`: the more of the read tags have moved, the higher
+is the prior of the rest. The fraction has a beta prior, whose mean is a setting.
 """
 
 import math
@@ -79,8 +79,8 @@ def _log(probability: float) -> float:
 class TagStates:
     """The filters of the states of T tags.
 
-    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, together below 1.
-    Attributes: ``odds`` (T,), the log-odds that each tag is not as surveyed; ``prior``, these odds of a tag without evidence;
+    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, together below 1. Attributes:
+    ``odds`` (T,), the log-odds that each tag is not as surveyed; ``prior``, these odds of a tag without evidence;
     ``hypotheses`` (S, 4), the result of :func:`hypotheses`; ``last_read`` [s], the time of the last read.
     """
 
@@ -108,8 +108,8 @@ class TagStates:
 
     @property
     def suspects(self) -> dict[str, dict[int, float]]:
-        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`. For each of the three states, a
-        dictionary from the index of a tag to the probability."""
+        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`. For each of the three
+        states, a dictionary from the index of a tag to the probability."""
         doubtful, suspects = self.doubtful, dict[str, dict[int, float]]()
         weights = self._weights[doubtful]
         shares = np.exp(weights - weights.max(axis=1, keepdims=True))
@@ -135,8 +135,8 @@ class TagStates:
     def expect(self, tags: Integers, evidence: Array) -> Array:
         """The log-likelihood (U,) of a scan's reads and misses of ``tags`` (U,) if these are weak, moved or dead (``elsewhere``).
 
-        ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative to the
-        log-likelihood that a tag out of range is never read.
+        ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative
+        to the log-likelihood that a tag out of range is never read.
         """
         return _expected(self._weights, tags, evidence)
 
@@ -178,8 +178,8 @@ class TagStates:
 
 @compiled
 def sigma_poses(pose: Array, covariance: Array, width: float) -> Array:
-    """Sigma points (6, 3) of a Gaussian of poses: ``pose`` (3,) moved by plus and minus ``width`` times each column of the lower
-    root of the body-frame ``covariance`` (3, 3)."""
+    """Sigma points (6, 3) of a Gaussian of poses: ``pose`` (3,) moved by plus and minus ``width`` times each column of
+    the lower root of the body-frame ``covariance`` (3, 3)."""
     out = np.empty((6, 3))
     root, exists = cholesky(covariance)
     if not exists:  # because of rounding; correlations are then ignored
@@ -302,8 +302,8 @@ def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
 
 @compiled
 def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.float32], sign: float) -> bool:
-    """Add ``sign`` times the log-likelihoods ``evidence`` to the weights of ``tags``. Returns True if this changes which tags are
-    believed to be weak, moved or dead."""
+    """Add ``sign`` times the log-likelihoods ``evidence`` to the weights of ``tags``. Returns True if this changes
+    which tags are believed to be weak, moved or dead."""
     changed = False
     for u in range(len(tags)):
         of_tag, old_odds = weights[tags[u]], odds[tags[u]]
@@ -324,11 +324,11 @@ def _all_odds(weights: Array) -> Array:
 def _raised(weights: Array, odds: Array, moved: float, raised: float) -> float:
     """The increase of the log prior of moved tags, from the fraction of moved tags among those that were read.
 
-    ``weights`` (T, W), ``odds`` (T,): of all tags, with a prior that is already increased by ``raised``. ``moved``: the prior
-    probability before any increase.
+    ``weights`` (T, W), ``odds`` (T,): of all tags, with a prior that is already increased by ``raised``. ``moved``: the
+    prior probability before any increase.
 
-    A higher prior makes more tags count as moved, which makes the prior higher. The result is the smallest fixed point of this
-    iteration. It depends on the evidence only, not on the order of its arrival.
+    A higher prior makes more tags count as moved, which makes the prior higher. The result is the smallest fixed point
+    of this iteration. It depends on the evidence only, not on the order of its arrival.
     """
     if moved == 0.0:
         return 0.0

@@ -1,8 +1,8 @@
 """Likelihoods of reads and misses for many poses that are near each other, such as particles, from tables.
 
-Three measures make this fast. The probabilities of all measurements of a tag are multiplied before one logarithm is taken. The
-inner loops run over poses, which access nearby cells of a table for one tag. These loops use vector instructions, also for
-logarithms and exponentials, for which a library would be called pose by pose.
+Three measures make this fast. The probabilities of all measurements of a tag are multiplied before one logarithm is
+taken. The inner loops run over poses, which access nearby cells of a table for one tag. These loops use vector
+instructions, also for logarithms and exponentials, for which a library would be called pose by pose.
 """
 
 import math
@@ -40,8 +40,8 @@ def log_likelihood(
 ) -> Array:
     """The tempered log-likelihood (N,) of read ``counts`` at poses (N, 3).
 
-    ``packed``: models before adjustment. ``of_map``: the map's tags. ``parameters`` (N or 1, Q): the parameters of each pose
-    (:mod:`factors.rfid.parameters`), or of all poses.
+    ``packed``: models before adjustment. ``of_map``: the map's tags. ``parameters`` (N or 1, Q): the parameters of each
+    pose (:mod:`factors.rfid.parameters`), or of all poses.
     """
     first_row = adjusted(packed, parameters[0])
     measured = delayed(counts[0], counts[8], first_row.delay), counts[1], counts[2]
@@ -97,8 +97,8 @@ def log_likelihood(
 
 @compiled
 def mixed(own: float, odds: float, elsewhere: float) -> float:
-    """The log-likelihood of a tag that may be weak, moved or dead. ``own``: the log-likelihood if it is none of these. ``odds``,
-    ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`."""
+    """The log-likelihood of a tag that may be weak, moved or dead. ``own``: the log-likelihood if it is none of these.
+    ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`."""
     if odds == -np.inf or elsewhere == -np.inf:
         return own
     displaced = odds + elsewhere
@@ -110,8 +110,8 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """The data of C near tags for :func:`weigh_tag`: points (C, 3), normals (C, 2), the numbers (A, C) of the tables of each
-    antenna and tag, and the numbers of reads (K, C)."""
+    """The data of C near tags for :func:`weigh_tag`: points (C, 3), normals (C, 2), the numbers (A, C) of the tables of
+    each antenna and tag, and the numbers of reads (K, C)."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):
@@ -199,8 +199,8 @@ def weigh_tag(
 ) -> None:
     """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
 
-    ``at``, ``models``: the results of :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of measurements to evaluate.
-    ``product`` (N,), ``room`` (N,): working memory.
+    ``at``, ``models``: the results of :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of measurements to
+    evaluate. ``product`` (N,), ``room`` (N,): working memory.
     """
     points, normals, levels, hits = tags
     _, antennas, rounds = measured
@@ -273,8 +273,8 @@ def _chances(
 
 @compiled(inline="always")
 def _floored(packed: Packed, rate: float, chance: float) -> float:
-    """The read probability from the sigmoid ``chance`` of a logit, including false reads, at least :data:`LEAST` and at most
-    1 - :data:`LEAST`. ``rate``: the factor of the probability, from ``models`` of :func:`place_antennas`."""
+    """The read probability from the sigmoid ``chance`` of a logit, including false reads, at least :data:`LEAST` and at
+    most 1 - :data:`LEAST`. ``rate``: the factor of the probability, from ``models`` of :func:`place_antennas`."""
     return float(min(max(packed.false_read + rate * chance, LEAST), 1.0 - LEAST))
 
 

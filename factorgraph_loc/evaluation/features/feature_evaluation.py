@@ -29,8 +29,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Feature:
-    """A kind of point feature. ``find``: a function that detects the points of an image. It returns the points and their
-    descriptors, which are None for a detector without descriptors."""
+    """A kind of point feature. ``find``: a function that detects the points of an image. It returns the points and
+    their descriptors, which are None for a detector without descriptors."""
 
     name: str
     find: Callable[[Image], tuple[Keypoints, Descriptors | None]]
@@ -39,9 +39,9 @@ class Feature:
 class MatchScores(NamedTuple):
     """Matching scores of a pair of images. They are NaN for a detector without descriptors, and 0 if there are no matches.
 
-    ``matching_score``: number of correct mutual matches divided by the smaller number of features in the common part of the images.
-    ``matches``: number of mutual matches with a distance ratio below :data:`~factorgraph_loc.vision.matching.RATIO`.
-    ``precision``: fraction of these ``matches`` that is correct.
+    ``matching_score``: number of correct mutual matches divided by the smaller number of features in the common part of
+    the images. ``matches``: number of mutual matches with a distance ratio below
+    :data:`~factorgraph_loc.vision.matching.RATIO`. ``precision``: fraction of these ``matches`` that is correct.
     """
 
     matches: int = 0
@@ -56,9 +56,9 @@ def evaluate(
 
     The keys are ``feature``, ``sequence``, ``image`` (number of the later image), ``change`` and ``amount`` (see
     :class:`~factorgraph_loc.evaluation.features.sequences.Sequence`), ``features`` (number in the later image),
-    ``milliseconds`` (time to detect and describe the features of the later image), and the fields of :class:`MatchScores` and
-    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`. Each image is processed on one thread.
-    ``progress`` is called after each image.
+    ``milliseconds`` (time to detect and describe the features of the later image), and the fields of
+    :class:`MatchScores` and :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`. Each image is
+    processed on one thread. ``progress`` is called after each image.
     """
     with _one_thread():
         what.find(sequence.first)  # compilation and allocation at first use are not part of the measured time
@@ -90,8 +90,8 @@ def evaluate(
 def match_scores(
     first: Keypoints, second: Keypoints, mutual: Matches, clear: Matches, homography: Array, shapes: Shapes
 ) -> MatchScores:
-    """Return the scores of the matches between two images. A match is correct if both points lie in the common part of the images
-    and their regions overlap.
+    """Return the scores of the matches between two images. A match is correct if both points lie in the common part of
+    the images and their regions overlap.
 
     ``first``, ``second``: points of the images. ``mutual``: mutual nearest neighbours. ``clear``: the mutual matches with a
     small distance ratio. ``homography``: from the first image to the second. ``shapes``: (height, width, ...) of both images.

@@ -49,8 +49,8 @@ class Repeatability(NamedTuple):
 class Candidates:
     """M pairs of regions that may correspond. ``first``, ``second`` (M,): indices of the regions in each image.
 
-    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region, mapped to the first image, divided by that of the
-    first.
+    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region, mapped to the first image, divided by that
+    of the first.
     """
 
     first: Integers
@@ -76,8 +76,8 @@ class Candidates:
 def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> Repeatability:
     """Return the repeatability of points that are detected in two images.
 
-    ``homography`` (3, 3): maps the first image to the second. ``shapes``: (height, width, ...) of both images. Points at the same
-    position with several orientations count as one region.
+    ``homography`` (3, 3): maps the first image to the second. ``shapes``: (height, width, ...) of both images. Points
+    at the same position with several orientations count as one region.
     """
     in_first, in_second = common(first, second, homography, shapes)
     first, second = distinct(first[in_first]), distinct(second[in_second])
@@ -91,8 +91,8 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 
 def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
-    """Return one-to-one pairs of points whose regions overlap at their own size (see ``magnified`` of :func:`overlaps`). The
-    ratio between the sizes of the two points is below :data:`SCALE_RATIO`."""
+    """Return one-to-one pairs of points whose regions overlap at their own size (see ``magnified`` of
+    :func:`overlaps`). The ratio between the sizes of the two points is below :data:`SCALE_RATIO`."""
     pairs = overlaps(first, second, homography, magnified=False)
     alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
     return pairs.best((pairs.error < OVERLAP_ERROR) & alike)
@@ -152,8 +152,8 @@ def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magni
 def shared_area(centres: Array, ellipses: Array) -> Array:
     """Return the areas (N,) of the intersections of the unit disc with N ellipses {c + x : x^T S^-1 x <= 1}.
 
-    ``centres``: c (N, 2). ``ellipses``: S (N, 2, 2). The lengths of common vertical chords are integrated numerically, with denser
-    nodes at the sides of the disc. The error is below 0.006.
+    ``centres``: c (N, 2). ``ellipses``: S (N, 2, 2). The lengths of common vertical chords are integrated numerically,
+    with denser nodes at the sides of the disc. The error is below 0.006.
     """
     angles = (np.arange(_NODES) + 0.5) * np.pi / _NODES - np.pi / 2.0
     x, half = np.sin(angles), np.cos(angles)

@@ -96,8 +96,8 @@ def tables(scores: pl.DataFrame) -> str:
 
 
 def figure3(scores: pl.DataFrame) -> Any:
-    """Plot repeatability over the change between the images, with a panel for each sequence. Photographs with the same warp are
-    averaged."""
+    """Plot repeatability over the change between the images, with a panel for each sequence. Photographs with the same
+    warp are averaged."""
     panels = _panels(scores)
     names = scores["feature"].unique(maintain_order=True).to_list()
     figure, axes = grid(len(panels), 1, 3.6 * len(panels) + 1.2)

@@ -2,8 +2,8 @@
 
 A homography maps points of the first image to another image. It contains a zoom, a rotation and a tilt.
 
-A folder in the Oxford format (Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005) has the images ``img1``
-to ``imgN``, and the homographies ``H1to2p`` to ``H1toNp`` from the first image to each other image.
+A folder in the Oxford format (Mikolajczyk et al., "A Comparison of Affine Region Detectors", IJCV 65, 2005) has the
+images ``img1`` to ``imgN``, and the homographies ``H1to2p`` to ``H1toNp`` from the first image to each other image.
 """
 
 import re
@@ -35,8 +35,8 @@ _SUFFIXES = ("", ".txt", ".xml")
 class ViewChange(NamedTuple):
     """Change of view from a first image to a second one.
 
-    ``zoom``: above 1 if the scene is larger in the second image. ``rotation`` [rad]. ``tilt``: a small circle becomes an ellipse,
-    and this is the ratio of its axes, at least 1.
+    ``zoom``: above 1 if the scene is larger in the second image. ``rotation`` [rad]. ``tilt``: a small circle becomes
+    an ellipse, and this is the ratio of its axes, at least 1.
     """
 
     zoom: float
@@ -148,8 +148,8 @@ class Sequence:
 
 
 def find_sequences(paths: Several[Path]) -> list[Sequence]:
-    """Read sequences of images. A path is a folder with a sequence, a folder of such folders, or a photograph, from which
-    :func:`warped` makes two sequences.
+    """Read sequences of images. A path is a folder with a sequence, a folder of such folders, or a photograph, from
+    which :func:`warped` makes two sequences.
 
     Raises InputError for other paths and for damaged files.
     """
@@ -193,10 +193,10 @@ def warped(photograph: Image, source: Path) -> list[Sequence]:
     """Make two sequences from a photograph: one with the photograph reduced by :data:`ZOOMS`, one with it rotated by
     :data:`ROTATIONS`.
 
-    A reduced photograph (area averaging) is pasted onto the centre of its mirror image at full size. This imitates a more
-    distant camera, which sees many points outside of the scene. Rotated images, and their first image, are cropped to the
-    largest square without empty corners in any of them. Raises InputError with the file ``source`` if the photograph is too
-    small.
+    A reduced photograph (area averaging) is pasted onto the centre of its mirror image at full size. This imitates a
+    more distant camera, which sees many points outside of the scene. Rotated images, and their first image, are cropped
+    to the largest square without empty corners in any of them. Raises InputError with the file ``source`` if the
+    photograph is too small.
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:
@@ -262,8 +262,8 @@ def _images(folder: Path) -> dict[int, Path]:
 
 
 def _change(views: Several[ViewChange]) -> tuple[str, tuple[float, ...]]:
-    """Return the dominant change of a sequence, and its amount in each view. If no view changes much, as with blur or light, the
-    amounts are the numbers of the images."""
+    """Return the dominant change of a sequence, and its amount in each view. If no view changes much, as with blur or
+    light, the amounts are the numbers of the images."""
     zooms = [max(v.zoom, 1.0 / v.zoom) for v in views]
     if max(v.tilt for v in views) > _TILTED:
         return VIEWPOINT, tuple(v.tilt for v in views)

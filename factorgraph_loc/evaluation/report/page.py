@@ -36,10 +36,10 @@ def write_report(
 ) -> None:
     """Write the report to the file ``out``.
 
-    ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional columns are
-    label, sensors, kind (of a failure), warnings and ``sweep.*``.
-    ``runs``: returns the result files of a run by its key. ``metrics``: keys of the scores to show.
-    ``baseline``: label of the runs with which all other runs are compared. If it is None or no run has it, the first label is used.
+    ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional
+    columns are label, sensors, kind (of a failure), warnings and ``sweep.*``.
+    ``runs``: returns the result files of a run by its key. ``metrics``: keys of the scores to show. ``baseline``: label
+    of the runs with which all other runs are compared. If it is None or no run has it, the first label is used.
     ``experiment``: content of the experiment file. ``damaged``: descriptions of runs with unusable results.
     ``versions``: version of each used software by name.
 
@@ -109,8 +109,8 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
 
 
 def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
-    """Return the values of the page that are read from the files of the runs. Of runs that differ only in the seed, the page
-    shows the trajectory of the one with the median of the score ``metric``."""
+    """Return the values of the page that are read from the files of the runs. Of runs that differ only in the seed, the
+    page shows the trajectory of the one with the median of the score ``metric``."""
     read = read_runs(results, metric, runs)
     return {
         "tracks": read.tracks,
@@ -125,8 +125,8 @@ def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
 
 
 def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
-    """Return the metrics with the given ``keys`` for which at least one run has a score. If there are none, return all metrics if
-    ``whole`` is set, otherwise an empty list."""
+    """Return the metrics with the given ``keys`` for which at least one run has a score. If there are none, return all
+    metrics if ``whole`` is set, otherwise an empty list."""
     known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return known or ([metric_of(k) for k in keys] if whole else [])
 

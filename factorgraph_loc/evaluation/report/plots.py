@@ -68,8 +68,8 @@ def consistency(
 ) -> Picture | None:
     """Plot the mean NEES of each variant on each log, the mean over logs, and its 95 % interval for correct covariances.
 
-    ``trust``: by variant, the mean over logs and the bounds of the interval. ``nees``: by variant and log, the mean NEES. Return
-    None if there are no values.
+    ``trust``: by variant, the mean over logs and the bounds of the interval. ``nees``: by variant and log, the mean
+    NEES. Return None if there are no values.
     """
     rows = []
     for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):

@@ -276,8 +276,8 @@ def score(row: Row, metric: str) -> float | None:
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
-    """Return the best of the complete variants, or None if there is none. A variant is complete if it has a score on every log
-    on which at least one variant has a score."""
+    """Return the best of the complete variants, or None if there is none. A variant is complete if it has a score on
+    every log on which at least one variant has a score."""
     if metric.better is None or not figures:
         return None
     complete = {

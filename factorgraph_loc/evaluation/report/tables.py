@@ -173,8 +173,8 @@ def _difference_cell(c: MetricComparison, variant: str) -> Cell:
 
 
 def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float | None) -> Cell:
-    """Return a cell with a score on one log. ``known``: scores of the runs. ``planned``: number of all runs. ``best``: best score
-    of the row."""
+    """Return a cell with a score on one log. ``known``: scores of the runs. ``planned``: number of all runs. ``best``:
+    best score of the row."""
     if not known:
         return Cell(_NONE)
     value = float(average(known, rms=metric.rms))

@@ -81,8 +81,8 @@ def sigma(estimates: Estimates) -> Array:
 def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
     """Select about ``count`` poses of a trajectory, and return them as lists of rounded numbers, None for unknown ones.
 
-    The lists are ``t`` [s], ``x``, ``y`` [m], ``e`` (position error [m]) and ``s`` (see :func:`sigma`). The trajectory is divided
-    into intervals, and the poses with the smallest and the largest error of each interval are selected.
+    The lists are ``t`` [s], ``x``, ``y`` [m], ``e`` (position error [m]) and ``s`` (see :func:`sigma`). The trajectory
+    is divided into intervals, and the poses with the smallest and the largest error of each interval are selected.
     """
     error, trajectory = estimates.errors["error_position"], estimates.trajectory
     x, y, _ = trajectory.poses.T

@@ -1,7 +1,7 @@
 """Association of the poses of an estimate with those of the reference, and alignment of both.
 
-Least squares in space: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
-Transactions on Pattern Analysis and Machine Intelligence, 1991, equations 38 to 43. In the plane:
+Least squares in space: Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
+IEEE Transactions on Pattern Analysis and Machine Intelligence, 1991, equations 38 to 43. In the plane:
 :func:`~factors.se2.align_points`.
 """
 
@@ -28,8 +28,8 @@ _DEGENERATE = 1e-12  # positions are on a line if the second squared singular va
 class Associated:
     """N poses of an ``estimate``, and the N poses of the ``reference`` with which they are compared.
 
-    ``gaps``: indices of poses that follow a gap. Relative errors are not computed across gaps. ``from_reference``: whether the
-    lengths of pieces for relative errors are measured along the reference instead of the estimate.
+    ``gaps``: indices of poses that follow a gap. Relative errors are not computed across gaps. ``from_reference``:
+    whether the lengths of pieces for relative errors are measured along the reference instead of the estimate.
     """
 
     estimate: PosePath
@@ -43,8 +43,8 @@ def associate(
 ) -> Associated:
     """Pair the poses of an estimate with poses of the reference.
 
-    If a trajectory has no timestamps, poses are paired by index, and both must have the same number of poses. Otherwise ``how`` is
-    one of these:
+    If a trajectory has no timestamps, poses are paired by index, and both must have the same number of poses. Otherwise
+    ``how`` is one of these:
 
     - "nearest": each pose of the trajectory with fewer poses is paired with the pose of the other trajectory that is nearest in
       time, if it is at most ``max_diff`` [s] away.
@@ -101,8 +101,8 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
 def in_plane(
     pair: Pairs, estimate: Trajectory, reference: Trajectory, names: tuple[str, str] = ("", ""), t0_ns: int = 0
 ) -> Associated:
-    """Convert ``pair``, the paired poses of two planar trajectories, to poses in space. Pairs with a NaN pose are omitted, and
-    count as gaps.
+    """Convert ``pair``, the paired poses of two planar trajectories, to poses in space. Pairs with a NaN pose are
+    omitted, and count as gaps.
 
     ``estimate``, ``reference``: the trajectories that were paired. ``names``: their names. ``t0_ns``: timestamp of the time 0.
     """

@@ -1,8 +1,8 @@
 """Absolute and relative errors of an estimated trajectory against a reference.
 
-Absolute (APE) and relative pose errors (RPE): Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012,
-section IV. Relative errors are also computed over a metre of path. With the association ``nearest`` the figures are those of the
-package evo.
+Absolute (APE) and relative pose errors (RPE): Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems",
+IROS 2012, section IV. Relative errors are also computed over a metre of path. With the association ``nearest`` the
+figures are those of the package evo.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _MANY = 0.5  # there is a warning if a smaller fraction of the poses is paired
 class PoseErrors:
     """K absolute or relative pose errors.
 
-    ``position`` (K,) [m]. ``rotation`` (K,) [rad]: an angle, None if a trajectory has no rotations. ``ends`` (K,): index of the
-    pose of an absolute error, or of the last pose of the piece of a relative error.
+    ``position`` (K,) [m]. ``rotation`` (K,) [rad]: an angle, None if a trajectory has no rotations. ``ends`` (K,):
+    index of the pose of an absolute error, or of the last pose of the piece of a relative error.
     """
 
     position: Array
@@ -62,8 +62,8 @@ class TrajectoryScore:
 
     ``estimate``, ``reference``: the N paired poses of both; those of the estimate are aligned.
     ``transform``: the alignment, from the frame of the estimate to that of the reference. ``ape``: N absolute errors.
-    ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a second, None without rotations or timestamps.
-    ``rpe``: relative errors over other distances and durations, by a text such as "5m".
+    ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a second, None without rotations or
+    timestamps. ``rpe``: relative errors over other distances and durations, by a text such as "5m".
     ``lengths`` [m], ``poses``: length and number of poses of the whole estimate and of the whole reference.
     ``settings``: the settings of association and alignment. ``warnings``: likely mistakes in the comparison.
     """
@@ -84,9 +84,9 @@ class TrajectoryScore:
     def figures(self) -> dict[str, float | None]:
         """All statistics by key, in metres and radians. A statistic that is undefined is None.
 
-        ``pairs``: number of compared poses. ``ape.position_*``, ``ape.rotation_*``, ``rpe_per_m.position_*`` and so on have the
-        endings ``rmse``, ``mean``, ``median``, ``p95``, ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``, ``rpe_per_s.pieces``:
-        number of relative errors.
+        ``pairs``: number of compared poses. ``ape.position_*``, ``ape.rotation_*``, ``rpe_per_m.position_*`` and so on
+        have the endings ``rmse``, ``mean``, ``median``, ``p95``, ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``,
+        ``rpe_per_s.pieces``: number of relative errors.
         """
         figures: dict[str, float | None] = {"pairs": len(self.estimate)}
         figures |= self.ape.figures("ape")
@@ -236,8 +236,8 @@ def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> No
 def _relative(
     estimate: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
 ) -> PoseErrors:
-    """Return the translation and rotation of ``Q^-1 P`` for each piece. Q is the motion of the reference over the piece, and P the
-    motion of the estimate.
+    """Return the translation and rotation of ``Q^-1 P`` for each piece. Q is the motion of the reference over the
+    piece, and P the motion of the estimate.
 
     ``steps`` (N - 1,): distances or times between poses. ``length``: of a piece, in the same unit. No piece crosses ``gaps``.
     """
@@ -271,8 +271,8 @@ def _angles(rotations: Array) -> Array:
 
 
 def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
-    """Return the times (N,) [s] of pairs since the first pair, from the timestamps of the estimate if it has any, or else from
-    those of the reference ``truth``. Return None if neither has timestamps."""
+    """Return the times (N,) [s] of pairs since the first pair, from the timestamps of the estimate if it has any, or
+    else from those of the reference ``truth``. Return None if neither has timestamps."""
     t_ns = truth.t_ns if estimate.t_ns is None else estimate.t_ns
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
@@ -280,8 +280,8 @@ def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
 def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[Notice]:
     """Return warnings about likely mistakes.
 
-    One is a path whose heights vary much although ``align`` ignores them. The other is a planar trajectory that is compared in
-    space with one at other heights.
+    One is a path whose heights vary much although ``align`` ignores them. The other is a planar trajectory that is
+    compared in space with one at other heights.
     """
     if align == "se2":
         rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]

@@ -22,8 +22,8 @@ NARROWED = 0.5  # the factor by which the scales decrease in each step
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
-    """All measurements of a graph as one problem. ``width`` multiplies the scales of robust losses. ``link_width`` multiplies the
-    scales of the losses of links (factors between two poses, such as loop closures) instead."""
+    """All measurements of a graph as one problem. ``width`` multiplies the scales of robust losses. ``link_width``
+    multiplies the scales of the losses of links (factors between two poses, such as loop closures) instead."""
     assert graph.prior is not None
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
@@ -41,8 +41,8 @@ def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> 
 
 
 def convex_width(graph: Graph, values: Values) -> float:
-    """The smallest factor, at least 1, that makes the losses of all links (such as loop closures) convex at ``values`` when it
-    multiplies their scales."""
+    """The smallest factor, at least 1, that makes the losses of all links (such as loop closures) convex at ``values``
+    when it multiplies their scales."""
     linked = {name: sensor for name, sensor in graph.sensors.items() if sensor.links}
     nodes = (node for k in graph.keyframes.values() for node in k.nodes if linked and node.sensor in linked)
     return max(
@@ -52,9 +52,9 @@ def convex_width(graph: Graph, values: Values) -> float:
 
 
 def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, Solution]:
-    """Optimise a graph from the values ``start``, directly and by graduated non-convexity. Returns the problem and the better
-    optimum. ``widest``: the initial factor on the scales of the losses. If it is 1 and the graph has no loop closures, only the
-    direct optimum is computed."""
+    """Optimise a graph from the values ``start``, directly and by graduated non-convexity. Returns the problem and the
+    better optimum. ``widest``: the initial factor on the scales of the losses. If it is 1 and the graph has no loop
+    closures, only the direct optimum is computed."""
     problem = whole_problem(graph)
     best = problem.solve(start)
     width = max(widest, convex_width(graph, start))
@@ -95,24 +95,24 @@ def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, 
 
 
 class AtTheEnd:
-    """A backend that solves the graph only at the end of the run. During the run it has rough estimates like those of an EKF,
-    which become the initial values of the solution."""
+    """A backend that solves the graph only at the end of the run. During the run it has rough estimates like those of
+    an EKF, which become the initial values of the solution."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
         self._guesses: Values = {}  # rough estimates of all variables except poses
 
     def begin(self, newest: Keyframe) -> None:
-        """Begin with the keyframe ``newest``: at the start of the graph, or after keyframes were removed and ``newest`` was
-        added."""
+        """Begin with the keyframe ``newest``: at the start of the graph, or after keyframes were removed and ``newest``
+        was added."""
         graph = self._graph
         graph.forget_landmarks(())
         self._guesses = {key: value for key, value in self._guesses.items() if key in graph.values}
         newest.causal = graph.pose, graph.covariance
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Store the new variables of ``addition``, which were observed at ``keyframe``. ``guess``: the pose and covariance of this
-        keyframe, or None if it is not the newest keyframe."""
+        """Store the new variables of ``addition``, which were observed at ``keyframe``. ``guess``: the pose and
+        covariance of this keyframe, or None if it is not the newest keyframe."""
         self._guesses |= addition.values
         if guess is not None:
             keyframe.causal = self._graph.pose, self._graph.covariance = guess

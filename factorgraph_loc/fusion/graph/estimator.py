@@ -1,7 +1,7 @@
 """The graph estimators: the smoother, which is a factor graph over the run, and the batch solution.
 
-By default, causal estimates come from a window: poses older than 10 s are marginalised. The whole problem is solved at the end.
-Other modes are settings:
+By default, causal estimates come from a window: poses older than 10 s are marginalised. The whole problem is solved at
+the end. Other modes are settings:
 
 - ``lag = "all"`` keeps the whole history in iSAM2. This is the default if landmarks or points are estimated, because a loop may
   close at any time.
@@ -10,9 +10,9 @@ Other modes are settings:
 - ``final_only``, as in the batch, builds the graph with rough estimates and solves it only at the end. If points are estimated,
   rough estimates drift too far to associate sightings with points, so iSAM2 solves the graph during the run.
 
-When the search rejects the track and finds another pose, the graph is cut at the time when the track became wrong. It continues at
-the new pose, after a step of unknown length. Later measurements are replayed in slices of fixed cost, so that results do not depend
-on the machine. The status is not ``localized`` before the replay has ended.
+When the search rejects the track and finds another pose, the graph is cut at the time when the track became wrong. It
+continues at the new pose, after a step of unknown length. Later measurements are replayed in slices of fixed cost, so
+that results do not depend on the machine. The status is not ``localized`` before the replay has ended.
 """
 
 from __future__ import annotations
@@ -134,8 +134,8 @@ class Smoother(Timeline):
         return _learnt(end.graph, end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of all poses since the start, at the ticks (the times at which a run records the pose). Empty if the
-        start pose was never found."""
+        """The best estimate of all poses since the start, at the ticks (the times at which a run records the pose).
+        Empty if the start pose was never found."""
         if self._graph.prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         end = self._concluded()
@@ -146,14 +146,14 @@ class Smoother(Timeline):
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for the part in the window. If ``lag`` is not a number of
-        seconds, nothing is deleted."""
+        """Delete the trajectory before the time ``until`` [s], except for the part in the window. If ``lag`` is not a
+        number of seconds, nothing is deleted."""
         if isinstance(self._backend, Incremental):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
     def _concluded(self) -> _Conclusion:
-        """The final solution, on a copy of the graph. The graph itself is not changed, so that later results do not depend on this
-        call."""
+        """The final solution, on a copy of the graph. The graph itself is not changed, so that later results do not
+        depend on this call."""
         if self._conclusion is None:
             graph = self._graph.copy()
             graph.newest.nodes += self._builder.waiting()
@@ -177,8 +177,8 @@ class Smoother(Timeline):
         return PosePrior(t, pose, FOUND) if start is None else start.facing(float(pose[2]))
 
     def _doubt(self, m: Measurement) -> None:
-        """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do, continue at the
-        pose that the search has found."""
+        """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do,
+        continue at the pose that the search has found."""
         graph, odometry = self._graph, self._odometry
 
         def track() -> Tracked:
@@ -196,8 +196,8 @@ class Smoother(Timeline):
             self._go_on(refuted, best)
 
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
-        """Remove the keyframes since ``refuted.since``, when the estimated pose became wrong, and process their measurements again,
-        beginning at the pose ``best``."""
+        """Remove the keyframes since ``refuted.since``, when the estimated pose became wrong, and process their
+        measurements again, beginning at the pose ``best``."""
         graph, since = self._graph, refuted.since
         first = graph.newest.index + 1  # the number of the first keyframe to remove
         while first > 1 and graph.keyframes[first - 1].t >= since and self._backend.is_open(first - 2):
@@ -222,8 +222,8 @@ class Smoother(Timeline):
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
-        """The robot's pose (3,) at time ``t`` [s], computed back from the pose ``best`` that the search has found for a later time,
-        by the odometry in between."""
+        """The robot's pose (3,) at time ``t`` [s], computed back from the pose ``best`` that the search has found for a
+        later time, by the odometry in between."""
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
 
@@ -256,8 +256,8 @@ class Batch(Smoother):
 
 
 def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
-    """The estimated constants, landmarks and points of a graph. ``poses``, ``covariances``: the final poses (3,) of all keyframes,
-    and their body-frame covariances (3, 3)."""
+    """The estimated constants, landmarks and points of a graph. ``poses``, ``covariances``: the final poses (3,) of all
+    keyframes, and their body-frame covariances (3, 3)."""
     blocks = [(name, graph.values[key], graph.covariances[key]) for name, key in graph.keys.items()]
     numbered = graph.keyframes.values()
     means, bodies = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
@@ -268,8 +268,8 @@ def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Arr
 def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:
     """The trajectory at the ticks, interpolated between keyframes. See :func:`factors.motion.poses_between`.
 
-    ``poses`` (M, 3), ``covariances`` (M, 3, 3): the final poses of all keyframes and their body-frame covariances. Ticks at which
-    the pose is unknown, because the robot was carried, are left out.
+    ``poses`` (M, 3), ``covariances`` (M, 3, 3): the final poses of all keyframes and their body-frame covariances.
+    Ticks at which the pose is unknown, because the robot was carried, are left out.
     """
     newest = {tick.t: tick for tick in graph.ticks}
     stamps = np.array(sorted(newest))

@@ -1,5 +1,5 @@
-"""The data of a factor graph: keyframes, other variables, and factors. Also the interface of mappers, which add points to a
-graph."""
+"""The data of a factor graph: keyframes, other variables, and factors. Also the interface of mappers, which add points
+to a graph."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ class Keyframe:
 
 
 class TickAt(NamedTuple):
-    """A time ``t`` [s] at which the trajectory needs a pose. ``keyframe``: the number of the previous keyframe. ``odometry``: the
-    integrated odometry at ``t``."""
+    """A time ``t`` [s] at which the trajectory needs a pose. ``keyframe``: the number of the previous keyframe.
+    ``odometry``: the integrated odometry at ``t``."""
 
     t: float
     keyframe: int
@@ -133,8 +133,8 @@ class Mapper:
         return False
 
     def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
-        """Process a measurement at the newest keyframe, and add its factors and points to ``addition``. ``guess``: pose and
-        covariance of the keyframe. Returns the pose and covariance after a correction by the measurement."""
+        """Process a measurement at the newest keyframe, and add its factors and points to ``addition``. ``guess``: pose
+        and covariance of the keyframe. Returns the pose and covariance after a correction by the measurement."""
         return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:
@@ -153,23 +153,23 @@ class Mapper:
         """Discard all points except those with these ``keys``."""
 
     def forget(self, first: Keyframe) -> Sequence[int]:
-        """Delete the data of keyframes before ``first``, and of points that have left the graph and were not observed since.
-        Returns the keys of these points."""
+        """Delete the data of keyframes before ``first``, and of points that have left the graph and were not observed
+        since. Returns the keys of these points."""
         return ()
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        """A map of all points that were ever in the graph and are not deleted, or None. ``values``, ``covariances``: the estimates
-        of points and keyframes by key."""
+        """A map of all points that were ever in the graph and are not deleted, or None. ``values``, ``covariances``:
+        the estimates of points and keyframes by key."""
         return None
 
 
 class Graph:
     """A factor graph of a run: ``keyframes`` by number, and all other variables by key in ``values`` and ``covariances``.
 
-    ``newest``: the last keyframe, whose present estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3). ``keys``: the keys
-    of constants and landmarks by name. ``departed``: estimates and covariances of points that have left the graph. ``t`` [s]: the
-    newest time. The backend sets two functions: ``current(key)`` returns the present estimate of a variable, and
-    ``is_open(number)`` is True if a keyframe may still get factors.
+    ``newest``: the last keyframe, whose present estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3).
+    ``keys``: the keys of constants and landmarks by name. ``departed``: estimates and covariances of points that have
+    left the graph. ``t`` [s]: the newest time. The backend sets two functions: ``current(key)`` returns the present
+    estimate of a variable, and ``is_open(number)`` is True if a keyframe may still get factors.
     """
 
     newest: Keyframe
@@ -211,8 +211,8 @@ class Graph:
         return graph
 
     def anchor(self) -> None:
-        """Store the integrated odometry at the first keyframe. Call this at the first measurement after a start, when all odometry
-        from before the start has arrived."""
+        """Store the integrated odometry at the first keyframe. Call this at the first measurement after a start, when
+        all odometry from before the start has arrived."""
         self.newest.odometry, self.is_anchored = self.motion.state(self.newest.t), True
 
     def append(self, keyframe: Keyframe) -> None:
@@ -248,8 +248,8 @@ class Graph:
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
     def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
-        """The motion from a keyframe to a time ``t`` [s] before the next keyframe. It is interpolated along the arc to the next
-        keyframe in proportion to time, because the odometry may already be deleted."""
+        """The motion from a keyframe to a time ``t`` [s] before the next keyframe. It is interpolated along the arc to
+        the next keyframe in proportion to time, because the odometry may already be deleted."""
         following = self.keyframes[keyframe.index + 1]
         assert following.from_previous is not None
         step, share = self.recalibrated(following.from_previous), (t - keyframe.t) / (following.t - keyframe.t)
@@ -257,8 +257,8 @@ class Graph:
         return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
 
     def moved(self, t: float) -> tuple[Array, Array, Array]:
-        """The newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns its covariance (3, 3) twice, in
-        the body frame and in the world frame."""
+        """The newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns its covariance (3,
+        3) twice, in the body frame and in the world frame."""
         newest = self.newest
         if t <= newest.t:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
@@ -280,8 +280,8 @@ class Graph:
         return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
     def value(self, name: str, default: Array | None = None) -> Array:
-        """The estimate of the constants or the landmark with this name. If it is not in the graph, ``default`` is returned, or
-        KeyError is raised if that is None."""
+        """The estimate of the constants or the landmark with this name. If it is not in the graph, ``default`` is
+        returned, or KeyError is raised if that is None."""
         if default is not None and name not in self.keys:
             return default
         return self.values[self.keys[name]]
@@ -292,8 +292,8 @@ class Graph:
         return {key: np.zeros(len(s)) for key, s in sigmas.items()}, {key: np.diag(s**2) for key, s in sigmas.items()}
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
-        """Add the landmark or bias ``new`` as a variable, and return its key. ``covariance`` (3, 3): the covariance of the pose
-        from which it was observed."""
+        """Add the landmark or bias ``new`` as a variable, and return its key. ``covariance`` (3, 3): the covariance of
+        the pose from which it was observed."""
         is_position = len(new.mean) > 1
         numbers = [index_of(key) for key in self.keys.values() if is_landmark(key) is is_position]
         first = 0 if is_position else len(self.constants)
@@ -308,8 +308,8 @@ class Graph:
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
     def odometry_factor(self, keyframe: Keyframe) -> tuple[Factor, tuple[int, ...]]:
-        """The odometry factor from the previous keyframe to this one, and the keys of its variables. If the robot was carried in
-        between, the factor does not depend on the odometry's constants."""
+        """The odometry factor from the previous keyframe to this one, and the keys of its variables. If the robot was
+        carried in between, the factor does not depend on the odometry's constants."""
         assert keyframe.from_previous is not None
         keys: tuple[int, ...] = (keyframe.key - 1, keyframe.key)
         if MOTION in self.keys and not keyframe.is_elsewhere:
@@ -323,8 +323,8 @@ class Graph:
         return keyframe.factor, keys
 
     def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
-        """Remove observations in ``keyframes`` that do not fit the estimate of their point in ``values``, and points with too few
-        remaining observations. Returns True if any was removed."""
+        """Remove observations in ``keyframes`` that do not fit the estimate of their point in ``values``, and points
+        with too few remaining observations. Returns True if any was removed."""
         mapper = self.mapper
         if not mapper.estimates:
             return False
@@ -358,8 +358,8 @@ class Graph:
             del self.values[key]  # the tilt of a removed keyframe
 
     def forget_landmarks(self, known: Collection[int]) -> None:
-        """Remove landmarks and biases that no remaining keyframe observes. ``known``: the keys of variables on which marginalised
-        keyframes left information; these are kept."""
+        """Remove landmarks and biases that no remaining keyframe observes. ``known``: the keys of variables on which
+        marginalised keyframes left information; these are kept."""
         observed = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
         for name, key in list(self.keys.items()):
             if name not in self.constants and key not in observed and key not in known:

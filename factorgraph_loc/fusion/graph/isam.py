@@ -1,8 +1,8 @@
 """Incremental solution of a graph by iSAM2 (Kaess et al., IJRR 31(2), 2012), with the full history or with a window.
 
-A window is a fixed-lag smoother: poses that are older than the lag are marginalised. A solver of GTSAM is unusable after an
-exception in an update. Factors and values are therefore also stored here. After a failure a new solver is built from them once. If
-the new solver also fails, the run ends with an error.
+A window is a fixed-lag smoother: poses that are older than the lag are marginalised. A solver of GTSAM is unusable
+after an exception in an update. Factors and values are therefore also stored here. After a failure a new solver is
+built from them once. If the new solver also fails, the run ends with an error.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class Incremental:
         self._oldest = 0  # the number of the oldest keyframe that has not left the window
 
     def forget(self, until: float) -> None:
-        """Delete the keyframes before the time ``until`` [s] that have left the window. If the whole problem is solved at the end,
-        all keyframes are needed and nothing is deleted."""
+        """Delete the keyframes before the time ``until`` [s] that have left the window. If the whole problem is solved
+        at the end, all keyframes are needed and nothing is deleted."""
         graph = self._graph
         if self._is_whole or not graph.keyframes or until < next(iter(graph.keyframes.values())).t:
             return
@@ -116,8 +116,8 @@ class Incremental:
         self._start_again(newest, summary)
 
     def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
-        """Add a new keyframe with the factors and variables of ``addition``. ``guess``: the predicted pose of the keyframe, and its
-        covariance."""
+        """Add a new keyframe with the factors and variables of ``addition``. ``guess``: the predicted pose of the
+        keyframe, and its covariance."""
         keyframe.causal = guess
         addition.nodes.insert(0, self._odometry_node(keyframe))
         addition.values[keyframe.key] = guess[0]
@@ -127,8 +127,8 @@ class Incremental:
             self._update(addition)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Add the factors and variables of ``addition`` on an existing keyframe. ``guess``: its pose corrected by the factors, with
-        covariance, or None if ``keyframe`` is not the newest."""
+        """Add the factors and variables of ``addition`` on an existing keyframe. ``guess``: its pose corrected by the
+        factors, with covariance, or None if ``keyframe`` is not the newest."""
         if guess is None or not (self._waits or keyframe.t < self._solved + self._solve_every):
             self._update(addition)
             return
@@ -138,8 +138,8 @@ class Incremental:
         self._wait(addition, guess)
 
     def _wait(self, addition: Addition, guess: Guess) -> None:
-        """Store the factors and variables of ``addition`` for the next update of the solver. Until then the newest pose is
-        ``guess``."""
+        """Store the factors and variables of ``addition`` for the next update of the solver. Until then the newest pose
+        is ``guess``."""
         self._waiting.nodes += addition.nodes
         self._waiting.values |= addition.values
         self._graph.pose, self._graph.covariance = guess
@@ -219,8 +219,8 @@ class Incremental:
     def _leave(self, window: Window, now: float, new: Collection[int]) -> None:
         """Store the final estimates of keyframes that are older than the lag, before the next update marginalises them.
 
-        ``window``: the solver. ``now`` [s]: the time of the newest keyframe. ``new``: keys of variables that are not yet in the
-        solver. The estimates of all constants and landmarks in the solver are stored too.
+        ``window``: the solver. ``now`` [s]: the time of the newest keyframe. ``new``: keys of variables that are not
+        yet in the solver. The estimates of all constants and landmarks in the solver are stored too.
         """
         assert self._lag is not None
         graph, oldest = self._graph, self._graph.keyframes[self._oldest]
@@ -255,8 +255,8 @@ class Incremental:
         self._forget(points, marginals)
 
     def _forget(self, points: Iterable[int], marginals: Mapping[int, Array]) -> None:
-        """Store the estimates and covariances of points that leave the window, and remove the points from the graph. ``marginals``:
-        covariances that are already computed, by key."""
+        """Store the estimates and covariances of points that leave the window, and remove the points from the graph.
+        ``marginals``: covariances that are already computed, by key."""
         for key in points:
             try:
                 estimate = self._marginal(key, marginals.get(key))
@@ -268,10 +268,9 @@ class Incremental:
     def _start_again(self, newest: Keyframe, summary: MarginalSummary | None, *, failed: bool = False) -> None:
         """Build a new solver from the graph, whose last keyframe is ``newest``.
 
-        ``summary``: the information of variables that have left the window. The new solver begins with this summary, and with all
-        measurements that are not part of it. If it is None, the solver begins with the priors. ``failed``: True if the previous
-        solver failed.
-        Raises RunFailedError if the new solver fails.
+        ``summary``: the information of variables that have left the window. The new solver begins with this summary,
+        and with all measurements that are not part of it. If it is None, the solver begins with the priors. ``failed``:
+        True if the previous solver failed. Raises RunFailedError if the new solver fails.
         """
         graph, first = self._graph, 0 if summary is None else summary.oldest
         self._solver, self._waiting, self._solved = self._new_solver(failed=failed), Addition(), newest.t
@@ -303,8 +302,8 @@ class Incremental:
         return [start, *(gtsam.PriorFactorVector(key, mean, gaussian(covariances[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
-        """The time [s] of each variable of a new window, by key. A variable leaves the window when it is older than the lag. Points
-        get the time of the newest keyframe."""
+        """The time [s] of each variable of a new window, by key. A variable leaves the window when it is older than the
+        lag. Points get the time of the newest keyframe."""
         now = keyframes[-1].t
         oldest = -math.inf if self._lag is None else now - self._lag - self._margin
         stamps = {key: now if key in self._graph.values else oldest for key in values}

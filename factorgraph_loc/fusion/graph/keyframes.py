@@ -1,13 +1,13 @@
 """The keyframe rule: the times of the graph's pose variables (keyframes), and the keyframe of each measurement.
 
 A measurement becomes a keyframe if the last keyframe is at least an interval older. The interval is the sensor's
-``keyframe_every``, or longer if landmarks are estimated. A mapper of points may need a keyframe earlier (``is_due``). A tick
-becomes a keyframe after :data:`LONGEST_INTERVAL`. All other measurements, including late ones, become factors on the previous
-keyframe, with the odometry since that keyframe as an offset.
+``keyframe_every``, or longer if landmarks are estimated. A mapper of points may need a keyframe earlier (``is_due``). A
+tick becomes a keyframe after :data:`LONGEST_INTERVAL`. All other measurements, including late ones, become factors on
+the previous keyframe, with the odometry since that keyframe as an offset.
 
-Some sensors, such as RFID readers, measure many times a second, each time with little information. Such a sensor gathers: the
-observations on one keyframe are combined into a few factors, which enter the graph together with the next keyframe. Until then
-these observations update only the newest pose, as in a filter.
+Some sensors, such as RFID readers, measure many times a second, each time with little information. Such a sensor
+gathers: the observations on one keyframe are combined into a few factors, which enter the graph together with the next
+keyframe. Until then these observations update only the newest pose, as in a filter.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ Backend = AtTheEnd | Incremental  # solves the graph
 class _KeyframeView:
     """Read access to the state of the graph, for the sensor of a measurement on one keyframe.
 
-    ``guess``: pose and covariance of the keyframe. ``offset``: the motion from the keyframe to the measurement, None for zero.
-    ``newest``: True if the keyframe is the newest one.
+    ``guess``: pose and covariance of the keyframe. ``offset``: the motion from the keyframe to the measurement, None
+    for zero. ``newest``: True if the keyframe is the newest one.
     """
 
     localized = True
@@ -104,8 +104,8 @@ class Builder:
         graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
     def take(self, m: Measurement, odometry: ChainState) -> bool:
-        """Process a measurement. ``odometry``: the integrated odometry at its time. Returns False if the measurement is ignored,
-        because its keyframe has already left the solver."""
+        """Process a measurement. ``odometry``: the integrated odometry at its time. Returns False if the measurement is
+        ignored, because its keyframe has already left the solver."""
         graph, sensor = self._graph, self._graph.sensors[m.source]
         graph.t = max(graph.t, m.t)
         if self._needs_keyframe(m, sensor):
@@ -156,9 +156,9 @@ class Builder:
     def _gather_from(
         self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None, guess: Guess
     ) -> None:
-        """Correct the newest pose by a measurement of a sensor whose observations are collected until :meth:`gather`. ``odometry``:
-        the integrated odometry at its time. ``offset``: the motion from the newest pose to this time, or None. ``guess``: the
-        newest pose and its covariance."""
+        """Correct the newest pose by a measurement of a sensor whose observations are collected until :meth:`gather`.
+        ``odometry``: the integrated odometry at its time. ``offset``: the motion from the newest pose to this time, or
+        None. ``guess``: the newest pose and its covariance."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
@@ -173,9 +173,9 @@ class Builder:
     def _observe(
         self, sensor: Sensor, m: Measurement, view: _KeyframeView, odometry: ChainState, addition: Addition | None
     ) -> bool:
-        """Convert a measurement of ``sensor`` to observations, and add these to ``addition``, or collect them if ``addition`` is
-        None. ``odometry``: the integrated odometry at its time. On the newest keyframe, each observation also corrects the pose in
-        ``view``. Returns True if any observation was accepted."""
+        """Convert a measurement of ``sensor`` to observations, and add these to ``addition``, or collect them if
+        ``addition`` is None. ``odometry``: the integrated odometry at its time. On the newest keyframe, each
+        observation also corrects the pose in ``view``. Returns True if any observation was accepted."""
         applied = False
         for observation in sensor.observe(m, view):
             if isinstance(observation, Link):
@@ -247,8 +247,8 @@ class Builder:
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
-        """Add a link of ``sensor`` (such as a loop closure) between a keyframe and an earlier one to ``addition``. If the earlier
-        keyframe has left the solver, the link is only part of the final problem."""
+        """Add a link of ``sensor`` (such as a loop closure) between a keyframe and an earlier one to ``addition``. If
+        the earlier keyframe has left the solver, the link is only part of the final problem."""
         earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)

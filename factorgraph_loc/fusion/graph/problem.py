@@ -1,8 +1,8 @@
 """A nonlinear least-squares problem of a whole graph, and its marginal covariances.
 
-The problem is solved by Levenberg-Marquardt in Python. Factors are linearised in Python, because a callback from GTSAM would copy
-all values. A run without loop closures and points is a chain of poses with common constants, which compiled code solves
-(:mod:`factors.chain`). Any other graph is solved by GTSAM's sparse elimination.
+The problem is solved by Levenberg-Marquardt in Python. Factors are linearised in Python, because a callback from GTSAM
+would copy all values. A run without loop closures and points is a chain of poses with common constants, which compiled
+code solves (:mod:`factors.chain`). Any other graph is solved by GTSAM's sparse elimination.
 
 Marginal covariances by Cholesky decomposition lose half of the digits, and long dead reckoning appears indeterminate. QR
 decomposition is more accurate (Golub, van Loan, "Matrix Computations", section 5.3), and is used if Cholesky fails. If QR fails
@@ -65,8 +65,8 @@ class Covariances:
 
 
 def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys: Sequence[int]) -> Covariances:
-    """The marginal covariances of the variables ``keys`` of a linear graph. ``sizes``: the number of components of each variable of
-    the graph. Raises IndeterminateError if the graph does not determine a variable even with damping."""
+    """The marginal covariances of the variables ``keys`` of a linear graph. ``sizes``: the number of components of each
+    variable of the graph. Raises IndeterminateError if the graph does not determine a variable even with damping."""
     result = _solved(graph, keys, robust=False)
     if isinstance(result, dict):
         return Covariances(result, 0.0)
@@ -88,8 +88,8 @@ def blamed(error: Exception) -> int | None:
 def _solved(
     graph: gtsam.GaussianFactorGraph, keys: Sequence[int], *, robust: bool
 ) -> dict[int, Array] | IndeterminateError:
-    """The marginal covariances of the variables ``keys`` of a linear graph, by key. If the graph cannot be solved, the error is
-    returned and not raised. ``robust``: True to use QR instead of Cholesky."""
+    """The marginal covariances of the variables ``keys`` of a linear graph, by key. If the graph cannot be solved, the
+    error is returned and not raised. ``robust``: True to use QR instead of Cholesky."""
     order = gtsam.Ordering.OrderingType.COLAMD
     marginals: dict[int, Array] = {}
     try:
@@ -113,8 +113,8 @@ def _solved(
 
 
 def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
-    """The graph with a prior on each variable, whose information is ``damping`` times the diagonal of the graph's information.
-    ``sizes``: the number of components of each variable by key."""
+    """The graph with a prior on each variable, whose information is ``damping`` times the diagonal of the graph's
+    information. ``sizes``: the number of components of each variable by key."""
     keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
     ends = np.cumsum([sizes[key] for key in keys])
     # the last column is the right side of the equations
@@ -127,8 +127,8 @@ def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping:
 
 
 class Chained:
-    """A problem that is a chain of poses. Each factor depends on one pose or on two consecutive poses, and optionally on vectors,
-    such as sensor constants. ``factors``: the factors with the keys of their variables."""
+    """A problem that is a chain of poses. Each factor depends on one pose or on two consecutive poses, and optionally
+    on vectors, such as sensor constants. ``factors``: the factors with the keys of their variables."""
 
     def __init__(self, factors: Sequence[Placed]) -> None:
         keys = {key for _, of in factors for key in of}
@@ -181,8 +181,8 @@ class Chained:
         return chain.normal(len(poses), self._first, jacobian, residual)
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """One step of Levenberg and Marquardt. Returns the new state and the largest absolute component of the step. Returns None
-        if the problem is nearly singular."""
+        """One step of Levenberg and Marquardt. Returns the new state and the largest absolute component of the step.
+        Returns None if the problem is nearly singular."""
         try:
             is_solved, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
@@ -240,8 +240,8 @@ def _is_stackable(kind: type[Factor]) -> bool:
 
 
 class _Others:
-    """A stack of factors of different kinds, each linearised separately. ``placed``: factors with the keys of their variables.
-    ``place``: the number of each pose by key. ``columns``: the parameters of each vector by key."""
+    """A stack of factors of different kinds, each linearised separately. ``placed``: factors with the keys of their
+    variables. ``place``: the number of each pose by key. ``columns``: the parameters of each vector by key."""
 
     def __init__(self, placed: Sequence[Placed], place: dict[int, int], columns: dict[int, slice]) -> None:
         self._placed, self._place, self._columns = placed, place, columns
@@ -303,8 +303,8 @@ class Problem:
         return Solution(*descended(self.cost, self._moved, values, max_iterations)[:2])
 
     def _moved(self, values: Values, damping: float) -> tuple[Values, float] | None:
-        """One step of Levenberg and Marquardt. Returns the new values and the largest absolute component of the step. Returns None
-        if the problem is nearly singular."""
+        """One step of Levenberg and Marquardt. Returns the new values and the largest absolute component of the step.
+        Returns None if the problem is nearly singular."""
         linear = self.linearize(values)
         curvature = {key: np.full(len(value), LEAST) for key, value in values.items()}
         for i in range(linear.size()):

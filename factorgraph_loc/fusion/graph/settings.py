@@ -37,9 +37,9 @@ class SmootherSettings(GraphSettings):
     lag: Annotated[
         float | None, Field(ge=0.1, le=3600.0), InUnit("s"), WrapValidator(_lag), PlainSerializer(_written)
     ] = None
-    """length of the window; older poses are final. The value all keeps the full history in the solver. By default, causal
-    estimates come from a window of 10 s and the final trajectory from the whole problem; with loops, or if landmarks or points
-    are estimated, the default is all"""
+    """length of the window; older poses are final. The value all keeps the full history in the solver. By default,
+    causal estimates come from a window of 10 s and the final trajectory from the whole problem; with loops, or if
+    landmarks or points are estimated, the default is all"""
     smooth: bool = True
     """whether the final trajectory uses all measurements; otherwise it equals the causal estimates"""
     final_only: bool = False

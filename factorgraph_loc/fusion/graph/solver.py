@@ -69,8 +69,8 @@ class FullHistory:
         self._touched: Collection[int] = ()  # the keys of variables in the last update
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        """Add the factors ``nodes`` and new variables, and solve. ``values``: initial values of the new variables. ``t`` [s]: the
-        time of new poses."""
+        """Add the factors ``nodes`` and new variables, and solve. ``values``: initial values of the new variables.
+        ``t`` [s]: the time of new poses."""
         self.begin((), nodes, values, {})
         self._touched = {key for node in nodes for key in node.keys}
 
@@ -81,8 +81,8 @@ class FullHistory:
         values: Values,
         stamps: Mapping[int, float],
     ) -> None:
-        """The first update of a new solver. ``factors``: factors of GTSAM, such as priors and marginal factors. ``nodes``: factors
-        of measurements. ``values``: initial values. ``stamps``: the time [s] of each variable."""
+        """The first update of a new solver. ``factors``: factors of GTSAM, such as priors and marginal factors.
+        ``nodes``: factors of measurements. ``values``: initial values. ``stamps``: the time [s] of each variable."""
         graph, removed = self._ours.added(self._isam, factors, nodes, values)
         self._ours.place(self._isam.update(graph, to_gtsam(values), removed).getNewFactorsIndices())
         self._touched = ()
@@ -93,8 +93,8 @@ class FullHistory:
         return 0
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        """The information of all variables that have left the solver, or None if none has left. ``failed``: True if the last update
-        failed, to return the information from before this update."""
+        """The information of all variables that have left the solver, or None if none has left. ``failed``: True if the
+        last update failed, to return the information from before this update."""
         return None
 
     def value(self, key: int) -> Array:
@@ -122,8 +122,8 @@ _State = tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Values, frozenset[int]]
 
 
 class Window(FullHistory):
-    """A fixed-lag smoother: each update marginalises poses older than ``lag`` [s]. An update without such poses is faster, because
-    iSAM2 then puts the newest pose at the root of its elimination tree."""
+    """A fixed-lag smoother: each update marginalises poses older than ``lag`` [s]. An update without such poses is
+    faster, because iSAM2 then puts the newest pose at the root of its elimination tree."""
 
     _solver: gtsam.IncrementalFixedLagSmoother
 
@@ -181,8 +181,8 @@ class Window(FullHistory):
         return read(self._solver, key)
 
     def covariances(self, keys: Sequence[int]) -> dict[int, Array]:
-        """The marginal covariances of the variables ``keys``, by key, from one elimination of the window. Empty if the elimination
-        fails, or if a variable has left."""
+        """The marginal covariances of the variables ``keys``, by key, from one elimination of the window. Empty if the
+        elimination fails, or if a variable has left."""
         order = gtsam.Ordering()
         for key in keys:
             order.push_back(key)
@@ -230,9 +230,9 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
 class LinearFactors:
     """The factors of measurements in a solver, and the linearisation points of the solver's variables.
 
-    ``threshold``: variables that have changed by more are linearised again. ``skip``: the number of updates between two checks of
-    the changes. ``on_failure``: called with the reason if a factor cannot be linearised. This factor is left out.
-    A slot is the index of a factor in the solver's graph.
+    ``threshold``: variables that have changed by more are linearised again. ``skip``: the number of updates between two
+    checks of the changes. ``on_failure``: called with the reason if a factor cannot be linearised. This factor is left
+    out. A slot is the index of a factor in the solver's graph.
     """
 
     def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
@@ -255,9 +255,9 @@ class LinearFactors:
     ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
         """Prepare an update of the solver. Call :meth:`place` after the update.
 
-        ``factors``: new factors of GTSAM. ``nodes``: new factors of measurements. ``values``: initial values of new variables.
-        Returns a graph of the factors to add, and the slots of the factors to remove. Factors on variables that will be linearised
-        again are replaced.
+        ``factors``: new factors of GTSAM. ``nodes``: new factors of measurements. ``values``: initial values of new
+        variables. Returns a graph of the factors to add, and the slots of the factors to remove. Factors on variables
+        that will be linearised again are replaced.
         """
         self._updates += 1
         self._added = self._moved(solver) if self.at and not self._updates % self._skip else []
@@ -285,8 +285,8 @@ class LinearFactors:
         return graph, removed
 
     def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
-        """Correct the Jacobian of a factor that is ``linearized`` at a held variable, so that it agrees with the marginal factors
-        (see the module). Returns the factor with its linearisation point."""
+        """Correct the Jacobian of a factor that is ``linearized`` at a held variable, so that it agrees with the
+        marginal factors (see the module). Returns the factor with its linearisation point."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
         if sum(map(is_place, keys)) > 1:  # a factor on one position has absolute information, which must not be removed
@@ -364,12 +364,12 @@ _PLACED = attrgetter("node.factor", "node.keys", "node.rows")
 
 
 def project_out_gauge(jacobian: Array, motions: Array) -> Array:
-    """Remove the gauge directions from a Jacobian: the matrix nearest to ``jacobian`` (m, n) whose product with ``motions`` is
-    zero.
+    """Remove the gauge directions from a Jacobian: the matrix nearest to ``jacobian`` (m, n) whose product with
+    ``motions`` is zero.
 
     ``motions`` (n, 3): the changes of the variables when the whole graph moves or rotates, from
-    :func:`factors.graph.frame_motions`. Source: Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics 30(1), 2014,
-    section V.
+    :func:`factors.graph.frame_motions`. Source: Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics
+    30(1), 2014, section V.
     """
     basis = np.linalg.qr(motions)[0]
     return np.asarray(jacobian - jacobian @ basis @ basis.T)

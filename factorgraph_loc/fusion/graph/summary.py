@@ -38,8 +38,8 @@ class MarginalSummary:
     ) -> MarginalSummary:
         """Make the summary of a solver's graph.
 
-        ``points``: the linearisation points of iSAM2. ``at``: the linearisation points of the summary. ``ours``: the slots of the
-        measurements' factors in the graph, which are left out.
+        ``points``: the linearisation points of iSAM2. ``at``: the linearisation points of the summary. ``ours``: the
+        slots of the measurements' factors in the graph, which are left out.
         """
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         values = to_gtsam(at)
@@ -88,8 +88,8 @@ class MarginalSummary:
 def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
     """True if a rebuilt window must get the factor ``node`` in addition to its summary.
 
-    ``present``: the keys of the window's variables. ``known``: the keys of the summary's variables. The summary already contains
-    the priors of its variables except poses, and the factors on poses that have left.
+    ``present``: the keys of the window's variables. ``known``: the keys of the summary's variables. The summary already
+    contains the priors of its variables except poses, and the factors on poses that have left.
     """
     if any(key not in present for key in node.keys):
         return False

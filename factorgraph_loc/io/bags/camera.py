@@ -1,7 +1,7 @@
 """Images and camera descriptions of a ROS bag.
 
-A log refers to images as files. The images of a bag are therefore extracted to the user's cache folder. Compressed images are
-written unchanged, other images as PGM or PPM without loss.
+A log refers to images as files. The images of a bag are therefore extracted to the user's cache folder. Compressed
+images are written unchanged, other images as PGM or PPM without loss.
 """
 
 import hashlib
@@ -65,8 +65,8 @@ class CameraTopic(TopicSettings):
 class Images:
     """Collects the images of a topic.
 
-    ``known`` is True if all images are in the cache folder already. The messages are not read then. ``stack`` deletes the
-    temporary folder of newly extracted images when it is closed.
+    ``known`` is True if all images are in the cache folder already. The messages are not read then. ``stack`` deletes
+    the temporary folder of newly extracted images when it is closed.
     """
 
     def __init__(self, bag: Bag, name: str, stamper: Stamper, stack: ExitStack) -> None:

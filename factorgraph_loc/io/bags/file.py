@@ -2,9 +2,9 @@
 
 A bag of version 1 is a file ``.bag``. A bag of version 2 is a folder, or a single file ``.mcap`` or ``.db3``.
 
-Messages are read one by one. Only the index and the current chunk of a bag are kept in memory. A bag is compressed by chunks
-(``.bag``, ``.mcap``), by messages, or as a whole file that is unpacked to disk (version 2). The size of unpacked content is
-limited, because a few bytes may expand to gigabytes.
+Messages are read one by one. Only the index and the current chunk of a bag are kept in memory. A bag is compressed by
+chunks (``.bag``, ``.mcap``), by messages, or as a whole file that is unpacked to disk (version 2). The size of unpacked
+content is limited, because a few bytes may expand to gigabytes.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ class _File:
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag. ``type``: its message type in ROS 2 notation (``nav_msgs/msg/Odometry``). ``count``: the number of its
-    messages."""
+    """A topic of a bag. ``type``: its message type in ROS 2 notation (``nav_msgs/msg/Odometry``). ``count``: the number
+    of its messages."""
 
     name: str
     type: str
@@ -156,8 +156,8 @@ class Bag:
     def topic(self, name: str, *types: str) -> Topic:
         """Return the topic ``name``.
 
-        Raises InputError if the bag lacks the topic, if it has no messages or messages of several types, or if its type is not
-        among ``types``. Without ``types``, any type is accepted.
+        Raises InputError if the bag lacks the topic, if it has no messages or messages of several types, or if its type
+        is not among ``types``. Without ``types``, any type is accepted.
         """
         if name not in self.topics:
             raise InputError(f"{self.path}: has no topic {quoted(name)}{nearest(name, list(self.topics))}")

@@ -200,8 +200,8 @@ def _has_no_pose(bag: Bag, topic: Topic) -> bool:
 
 
 def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
-    """Return the proposed settings of wheels for a JointState topic. Wheels are recognised by the names of joints in its first
-    message. What the user should check is appended to ``remarks``."""
+    """Return the proposed settings of wheels for a JointState topic. Wheels are recognised by the names of joints in
+    its first message. What the user should check is appended to ``remarks``."""
     first = next(bag.messages([topic.name]), None)
     names = [name for name in getattr(first and first.message, "name", ()) if isinstance(name, str)]
     wheels = [name for name in names if WHEEL.search(name)] or names
@@ -230,8 +230,8 @@ def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
 def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
     """Add the topics of the reference and of a position sensor to ``out``. ``tree``: the coordinate frames of the bag.
 
-    A topic whose name suggests ground truth is the reference. Otherwise, a topic of poses with headings is the reference.
-    A topic of positions without headings is a position sensor.
+    A topic whose name suggests ground truth is the reference. Otherwise, a topic of poses with headings is the
+    reference. A topic of positions without headings is a position sensor.
     """
     poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]

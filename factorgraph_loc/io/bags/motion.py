@@ -41,8 +41,8 @@ Motion = Callable[[list[Notice]], tuple[Integers, Array]]
 
 
 class WheelSettings(motions.WheelSizes):
-    """The joints and the sizes of two or four wheels. The ``radius`` and ``track`` in [odometry.wheels] of the rig have precedence
-    over these settings."""
+    """The joints and the sizes of two or four wheels. The ``radius`` and ``track`` in [odometry.wheels] of the rig have
+    precedence over these settings."""
 
     left: str
     """name of the left wheel's joint; if each wheel has a topic, the field with the wheel's value"""
@@ -129,8 +129,8 @@ class OdometryTopic(PoseTopic):
     """The settings of the topic that gives the odometry: odometry messages, poses, velocities, tf, or wheel joints."""
 
     use: Literal["pose", "twist"] = "pose"
-    """part of odometry messages to use: pose, for the motion between messages, or twist, for the velocity; for wheels, pose means
-    their angles and twist their angular rates"""
+    """part of odometry messages to use: pose, for the motion between messages, or twist, for the velocity; for wheels,
+    pose means their angles and twist their angular rates"""
     wheels: WheelSettings | None = None
     """joints and sizes of the wheels, for a topic of joint states, or for two topics, of which topic is the left wheel's"""
 
@@ -174,8 +174,8 @@ class YawRates:
 
 
 def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """Register the collectors of an odometry topic at ``listeners``. Returns the function to call after the bag is read: it
-    computes the motion from the collected messages.
+    """Register the collectors of an odometry topic at ``listeners``. Returns the function to call after the bag is
+    read: it computes the motion from the collected messages.
 
     ``static`` has the static transforms of the bag. Raises InputError if the options do not fit the message type.
     """

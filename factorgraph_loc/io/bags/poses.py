@@ -108,9 +108,9 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
 def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
     """Return the poses of collected ``rows``.
 
-    A row has x, y, z, then a quaternion unless ``has_rotations`` is False, then optionally the variances of x and y. Null poses,
-    which a device reports while it has lost its pose, are skipped with a warning. Of rows with equal timestamps, the last is kept.
-    Raises InputError, with the number of the message, at an invalid row.
+    A row has x, y, z, then a quaternion unless ``has_rotations`` is False, then optionally the variances of x and y.
+    Null poses, which a device reports while it has lost its pose, are skipped with a warning. Of rows with equal
+    timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:
@@ -296,8 +296,8 @@ def matrices(positions: Array, rotations: Array) -> Array:
 class Tree:
     """The tree of coordinate frames in a bag.
 
-    ``parents``: the parent of each frame. ``topic``: the topic with the moving frames, "" if no frame moves. ``moving``: the frames
-    that move in their parents.
+    ``parents``: the parent of each frame. ``topic``: the topic with the moving frames, "" if no frame moves.
+    ``moving``: the frames that move in their parents.
     """
 
     parents: Mapping[str, str]

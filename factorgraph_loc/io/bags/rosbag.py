@@ -74,8 +74,8 @@ def antennas_of(
 ) -> RfidSettings:
     """Return the settings of RFID antennas, mounted where tf_static has their frames.
 
-    ``given``: the frame of each antenna that is not named like its frame. The x axis of a frame is the boresight. An antenna
-    without a frame is at the robot's origin. Notes about the mountings are added to ``notes``.
+    ``given``: the frame of each antenna that is not named like its frame. The x axis of a frame is the boresight. An
+    antenna without a frame is at the robot's origin. Notes about the mountings are added to ``notes``.
     """
     poses = {name: frames.pose(given.get(name, name)) for name in sorted(names)}
     for verb, known in (("has the", True), ("has no", False)):
@@ -228,9 +228,9 @@ def _rig(
 def read_trajectory(path: Path, topic: str) -> PosePath:
     """Return the trajectory in the ``topic`` of the bag ``path``.
 
-    The topic has messages with poses or points. ``/tf:PARENT.CHILD`` gives the poses of the frame CHILD in the frame PARENT.
-    A timestamp is the header's timestamp, or the time of receipt if a message has no header. Raises InputError with the number of
-    an invalid message.
+    The topic has messages with poses or points. ``/tf:PARENT.CHILD`` gives the poses of the frame CHILD in the frame
+    PARENT. A timestamp is the header's timestamp, or the time of receipt if a message has no header. Raises InputError
+    with the number of an invalid message.
     """
     name, _, frames = topic.partition(FRAMES)
     with open_bag(path) as bag:

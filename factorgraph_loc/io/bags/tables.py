@@ -1,7 +1,7 @@
 """Reads tables of sensors from a bag. The manifest maps fields of messages to the columns of a table.
 
-A row is a message, or an element of a list in a message. RFID reads are grouped into inventory rounds. Landmarks may be poses or
-corners of detected markers.
+A row is a message, or an element of a list in a message. RFID reads are grouped into inventory rounds. Landmarks may be
+poses or corners of detected markers.
 """
 
 import math
@@ -126,8 +126,8 @@ class RowsOfTopic:
     def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
         """Return the M collected rows that the rules keep, and their indices (M,) among all collected rows.
 
-        ``faults``: faults of rows that the caller has detected, which are treated like numbers that are missing or out of bounds.
-        Raises InputError at such a row, unless the rules skip it.
+        ``faults``: faults of rows that the caller has detected, which are treated like numbers that are missing or out
+        of bounds. Raises InputError at such a row, unless the rules skip it.
         """
         cells = {**self._names, **dict(zip(self._numbered, self._rows.values.T, strict=True))}
         cells |= {STAMP.name: self._rows.t_ns, INDEX: np.arange(len(self._rows))}
@@ -245,8 +245,8 @@ class LandmarkTopic(RowTopic, Turned):
     """The settings of a topic with observations of landmarks, such as that of a marker detector."""
 
     fields: dict[LandmarkField, str] | None = None
-    """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; not needed for
-    the messages of common marker detectors"""
+    """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; not
+    needed for the messages of common marker detectors"""
     axes: Axes = "optical"
     """axes of the sensor that point forward, left and up: body (x, y, z), optical (z, -x, -y), or a list of three axes"""
     frame: str | None = None
@@ -323,8 +323,8 @@ class Corners(RowsOfTopic):
 def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> RowsOfTopic:
     """Return a collector for the topic of a table.
 
-    The table is the first of ``tables`` that has default fields for the message type. If none has, it is ``tables[0]``. Corners of
-    AprilTags need no fields. Raises InputError if the fields do not fit the table.
+    The table is the first of ``tables`` that has default fields for the message type. If none has, it is ``tables[0]``.
+    Corners of AprilTags need no fields. Raises InputError if the fields do not fit the table.
     """
     kind = bag.topic(options.topic).type
     if tables[0].name == SIGHTINGS.name and not options.fields and kind == CORNERS:

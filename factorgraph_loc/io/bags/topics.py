@@ -46,8 +46,8 @@ class TopicSettings(FileModel):
     topic: str
     """name of the topic"""
     clock: Clock | None = None
-    """timestamps to use: header for the timestamps of message headers, receive for the times of receipt; by default the setting
-    clock of the bag"""
+    """timestamps to use: header for the timestamps of message headers, receive for the times of receipt; by default the
+    setting clock of the bag"""
 
 
 class RowTopic(TopicSettings, RowRules):
@@ -71,8 +71,8 @@ class Fields:
     def rows(self, message: Any, row: int) -> list[Row]:
         """Return the values of message number ``row``, as tuples in the order of ``names``.
 
-        Without lists in the paths there is one tuple, else one for each element of the lists. Raises InputError if the lists have
-        different lengths.
+        Without lists in the paths there is one tuple, else one for each element of the lists. Raises InputError if the
+        lists have different lengths.
         """
         values = [get(message) for get in self._getters]
         if not any(self._are_lists):
@@ -188,9 +188,9 @@ def _getter_of(paths: Sequence[str]) -> Callable[[Any], Any]:
 class TopicRows:
     """Collects rows of numbers, each with a timestamp and the number of its message within the topic, counted from 1.
 
-    ``source``: the bag and the topic, for errors. ``width``: how many numbers a row has. ``paths``: the fields that form the
-    row of a message. Without paths, the caller appends rows. A value that is not a number becomes NaN. ``rules``: what the
-    manifest says about invalid and late rows.
+    ``source``: the bag and the topic, for errors. ``width``: how many numbers a row has. ``paths``: the fields that
+    form the row of a message. Without paths, the caller appends rows. A value that is not a number becomes NaN.
+    ``rules``: what the manifest says about invalid and late rows.
     """
 
     def __init__(self, source: str, width: int, paths: Sequence[str] = (), rules: RowRules | None = None) -> None:
@@ -238,8 +238,8 @@ class TopicRows:
     def kept(self, faults: Sequence[Fault], warnings: list[Notice], among: Integers | None = None) -> Integers:
         """Return the indices of the rows without ``faults``, in order of time. Of rows with equal timestamps, the last is kept.
 
-        ``among``: indices of the rows that the faults describe, by default all. Raises InputError at a fault, or at a row that
-        is out of order, unless the rules skip or sort such rows.
+        ``among``: indices of the rows that the faults describe, by default all. Raises InputError at a fault, or at a
+        row that is out of order, unless the rules skip or sort such rows.
         """
         rows, t_ns = self.rows, self.t_ns
         keep = np.arange(len(rows)) if among is None else among

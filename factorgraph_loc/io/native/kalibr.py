@@ -29,8 +29,8 @@ ON_IMU = (
 
 
 class ChainCamera(FileModel):
-    """A camera of a Kalibr camera chain. ``T_cam_imu``: transform (4, 4) from the IMU to the camera. ``T_imu_cam``: its inverse.
-    ``T_cn_cnm1``: transform from the previous camera of the chain to this one."""
+    """A camera of a Kalibr camera chain. ``T_cam_imu``: transform (4, 4) from the IMU to the camera. ``T_imu_cam``: its
+    inverse. ``T_cn_cnm1``: transform from the previous camera of the chain to this one."""
 
     camera_model: str
     distortion_model: str = "none"
@@ -52,8 +52,8 @@ def is_chain(text: str) -> bool:
 def read_camera(text: str) -> tuple[dict[str, Any], list[str]]:
     """Return the section ``[camera]`` of a rig, and remarks on what the user has to check.
 
-    ``text``: the file of the chain, as ``FILE:cam1`` with the name of one of several cameras. Raises InputError with file and key
-    if the file is invalid, or if the rig has no such lens.
+    ``text``: the file of the chain, as ``FILE:cam1`` with the name of one of several cameras. Raises InputError with
+    file and key if the file is invalid, or if the rig has no such lens.
     """
     file, _, name = (text, "", "") if text.endswith(SUFFIXES) else text.rpartition(":")
     path = Path(file)
@@ -114,8 +114,8 @@ def _lens(path: Path, name: str, camera: ChainCamera) -> dict[str, Any]:
 
 
 def _on_imu(path: Path, chain: Mapping[str, ChainCamera], name: str) -> Array | None:
-    """Return the pose (4, 4) of the camera ``name`` in the frame of the IMU, also if only a camera before it in the chain has a
-    transform to the IMU. Returns None if no such transform is known."""
+    """Return the pose (4, 4) of the camera ``name`` in the frame of the IMU, also if only a camera before it in the
+    chain has a transform to the IMU. Returns None if no such transform is known."""
     names = list(chain)
     from_later = np.eye(4)
     for known in reversed(names[: names.index(name) + 1]):

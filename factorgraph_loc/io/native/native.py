@@ -110,8 +110,8 @@ def world_of(run: RunFile, source: Path) -> World:
 
 
 def read_tables(folder: Path, warnings: list[Notice], rules: RowRules) -> dict[str, TableRows]:
-    """Return the non-empty tables in a folder by name, without the rows that ``rules`` skip. A table of an unknown sensor is
-    skipped with a warning.
+    """Return the non-empty tables in a folder by name, without the rows that ``rules`` skip. A table of an unknown
+    sensor is skipped with a warning.
     """
     tables = {}
     stems = sorted(file.stem for file in folder.iterdir() if file.suffix in SUFFIXES)
@@ -162,10 +162,10 @@ def write_native(
 ) -> None:
     """Write a log atomically as a folder in the native format.
 
-    ``folder`` must be new or empty. With ``overwrite`` it may also contain a log in the native format, which is replaced.
-    Timestamps are exact to the nanosecond, numbers to the last digit. Images are copied. Two values are not written: covariances of
-    the reference, and the smaller of the start's standard deviations in x and y. Raises InputError for a log without measurements,
-    and for a log with features of images.
+    ``folder`` must be new or empty. With ``overwrite`` it may also contain a log in the native format, which is
+    replaced. Timestamps are exact to the nanosecond, numbers to the last digit. Images are copied. Two values are not
+    written: covariances of the reference, and the smaller of the start's standard deviations in x and y. Raises
+    InputError for a log without measurements, and for a log with features of images.
     """
     folder = Path(folder)
     if not log.streams:
@@ -187,8 +187,8 @@ def write_native(
 def require_new(folder: Path, *, overwrite: bool = False) -> None:
     """Raise InputError if a log cannot be written to ``folder``, because it is not empty.
 
-    With ``overwrite``, the folder may contain a log in the native format, but nothing else. Temporary folders that remain from
-    interrupted writing are removed.
+    With ``overwrite``, the folder may contain a log in the native format, but nothing else. Temporary folders that
+    remain from interrupted writing are removed.
     """
     sweep(folder.parent)
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):

@@ -115,8 +115,8 @@ class RobotOptions:
 
     ``odometry``: the drive, ``none`` without odometry.
     ``imu``: True if the robot has a gyro.
-    ``landmarks``: standard deviation of a measured range [m]. For several sensors of landmarks: a dict of values by sensor name.
-    ``position``: standard deviation of a measured x or y [m].
+    ``landmarks``: standard deviation of a measured range [m]. For several sensors of landmarks: a dict of values by
+    sensor name. ``position``: standard deviation of a measured x or y [m].
     ``antennas``: names of RFID antennas.
     ``camera``: width and height of the images [px], or a camera chain of Kalibr, as ``FILE`` or ``FILE:NAME``.
     """

@@ -30,8 +30,8 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
     """Return a map from the ``content`` of a world file.
 
     ``source``: the file to name in errors. ``folder``: the folder of the tables. ``walls`` may name an occupancy map,
-    ``markers`` a file of apriltag_ros, and a layer such as ``tags`` a table. The corners of ``markers`` become points. Raises
-    InputError as :func:`read_world`.
+    ``markers`` a file of apriltag_ros, and a layer such as ``tags`` a table. The corners of ``markers`` become points.
+    Raises InputError as :func:`read_world`.
     """
     for name, layer in layers().items():
         if layer.read and name in content:

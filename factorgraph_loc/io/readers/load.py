@@ -46,8 +46,8 @@ def reader(name: str) -> Any:
 class _Source:
     """Where a log comes from.
 
-    ``reader``: name of the reader. ``path``: its input. ``name``: name of the log, None if the reader names it. ``manifest``: the
-    manifest that describes the log, if there is one. ``file``: the file of the manifest.
+    ``reader``: name of the reader. ``path``: its input. ``name``: name of the log, None if the reader names it.
+    ``manifest``: the manifest that describes the log, if there is one. ``file``: the file of the manifest.
     """
 
     reader: str
@@ -77,10 +77,10 @@ def load(
 ) -> list[Log]:
     """Return the logs that ``log`` refers to.
 
-    ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a log. With
-    ``reader``, any path that the reader can read.
-    ``options``: options of the reader, which override those of a manifest. A list, or a text with commas, gives one log per value.
-    ``rig``, ``world``: values or files that replace the rig and the world of the log.
+    ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a log.
+    With ``reader``, any path that the reader can read.
+    ``options``: options of the reader, which override those of a manifest. A list, or a text with commas, gives one log
+    per value. ``rig``, ``world``: values or files that replace the rig and the world of the log.
     ``data_root``: the folder of data sets; by default the environment variable FGLOC_DATA.
     Raises InputError with a message of one line about what is invalid.
     """
@@ -208,8 +208,8 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
 def _read(source: _Source, rig: Rig | None, world: World | None, options: Mapping[str, Any], naming: list[str]) -> Log:
     """Read and check one log.
 
-    ``rig``, ``world``: replace those of the reader if given. ``options``: one value per option. ``naming``: the options that are
-    appended to the name of the log to make it unique.
+    ``rig``, ``world``: replace those of the reader if given. ``options``: one value per option. ``naming``: the options
+    that are appended to the name of the log to make it unique.
     """
     chosen, manifest = reader(source.reader), source.manifest
     options = with_wheels_of(rig, options)

@@ -40,8 +40,8 @@ RATE = replace(IMU["w"], may_lack=True)  # turn rate about one of three axes, wh
 
 
 class NamesFile(ColumnMapping):
-    """A table that translates names. ``columns`` maps ``file_name``, a name in the table of a sensor, and ``name``, the name in the
-    map."""
+    """A table that translates names. ``columns`` maps ``file_name``, a name in the table of a sensor, and ``name``, the
+    name in the map."""
 
 
 class NamedFile(TimedMapping):
@@ -52,8 +52,8 @@ class NamedFile(TimedMapping):
 
 
 class ImuFile(TimedMapping, Turned):
-    """The table of an IMU. ``columns`` maps t and w, the turn rate about the vertical axis; or t, wx, wy and wz, the angular
-    velocity in the frame of the IMU, whose orientation is given by ``axes`` and ``mounting``."""
+    """The table of an IMU. ``columns`` maps t and w, the turn rate about the vertical axis; or t, wx, wy and wz, the
+    angular velocity in the frame of the IMU, whose orientation is given by ``axes`` and ``mounting``."""
 
 
 class ImageFile(TimedMapping):
@@ -64,8 +64,8 @@ class ImageFile(TimedMapping):
 
 
 class Options(FileModel):
-    """The tables of a log. ``rfid`` describes the reads of one RFID reader. ``readers`` replaces it for several RFID readers, each
-    with a name that the user chooses."""
+    """The tables of a log. ``rfid`` describes the reads of one RFID reader. ``readers`` replaces it for several RFID
+    readers, each with a name that the user chooses."""
 
     odometry: OdometryFile | None = None
     imu: ImuFile | None = None

@@ -51,11 +51,11 @@ class PosesFile(TimedMapping, Turned):
 
 
 class OdometryFile(PosesFile, motions.WheelSizes):
-    """The table of odometry. ``columns`` maps t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since the previous
-    row); x, y, and heading or a quaternion (poses, of which only the relative motion is used); left, right (distances of the
-    wheels); left_speed, right_speed (speeds); left_angle, right_angle (angles); left_rate, right_rate (angular rates).
-    Four wheels also need rear_left, rear_right (rear_left_speed, ...). ``radius`` and ``track`` of the rig ([odometry.wheels]) have
-    precedence over these settings."""
+    """The table of odometry. ``columns`` maps t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since
+    the previous row); x, y, and heading or a quaternion (poses, of which only the relative motion is used); left, right
+    (distances of the wheels); left_speed, right_speed (speeds); left_angle, right_angle (angles); left_rate, right_rate
+    (angular rates). Four wheels also need rear_left, rear_right (rear_left_speed, ...). ``radius`` and ``track`` of the
+    rig ([odometry.wheels]) have precedence over these settings."""
 
 
 class ReferenceFile(PosesFile):
@@ -131,8 +131,8 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
 
 
 def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tuple[Cells, Integers]:
-    """Return the rows of ``mapped`` without null poses, and the timestamps [ns] of the null poses, which a device reports while it
-    has lost its pose.
+    """Return the rows of ``mapped`` without null poses, and the timestamps [ns] of the null poses, which a device
+    reports while it has lost its pose.
 
     Raises InputError if a quaternion is not a unit quaternion, unless the mapping skips such rows.
     """
@@ -148,8 +148,8 @@ def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tu
 
 
 def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array, Integers]:
-    """Return the timestamps (N,) [ns] and the planar poses (N, 3) of a file in TUM, KITTI or EuRoC format, and the timestamps
-    of its null poses.
+    """Return the timestamps (N,) [ns] and the planar poses (N, 3) of a file in TUM, KITTI or EuRoC format, and the
+    timestamps of its null poses.
     """
     path = folder.file(options.file)
     if options.columns or options.units:

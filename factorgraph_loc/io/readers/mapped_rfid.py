@@ -46,9 +46,9 @@ STANDARD = str.maketrans("-_", "+/")  # converts URL-safe base64 to standard bas
 def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as ``rssi_*``.
 
-    Each cell that is not empty is a read. The text in place of ``*`` is the name of the antenna. It is the EPC of the tag instead
-    if ``columns`` maps the antenna, or if ``antenna``, the name of the only antenna, is given. Raises InputError with file, row and
-    column of an invalid value.
+    Each cell that is not empty is a read. The text in place of ``*`` is the name of the antenna. It is the EPC of the
+    tag instead if ``columns`` maps the antenna, or if ``antenna``, the name of the only antenna, is given. Raises
+    InputError with file, row and column of an invalid value.
     """
     pattern = mapping.columns["rssi"]
     fixed = {field: column for field, column in mapping.columns.items() if field != "rssi"}
@@ -95,8 +95,8 @@ def presets() -> dict[str, dict[str, dict[str, str]]]:
 class RfidFile(TimedMapping, ReadNames):
     """A table of RFID reads. ``columns`` maps t, epc or epc_base64, antenna, rssi, phase, and frequency or channel.
 
-    A ``*`` in the column of rssi matches several columns, one for each tag or antenna. If a row summarizes several reads, t is the
-    time of the first one, ``last`` is the time of the last one, and ``count`` is their number.
+    A ``*`` in the column of rssi matches several columns, one for each tag or antenna. If a row summarizes several
+    reads, t is the time of the first one, ``last`` is the time of the last one, and ``count`` is their number.
     """
 
     columns: dict[str, str] = Field(default_factory=dict)
@@ -160,8 +160,8 @@ def _concatenated(path: Path, tables: Sequence[TableRows]) -> TableRows:
 def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
     """Return the reads of one file as the table ``rfid`` of the native format, sorted by time.
 
-    A row that summarizes several reads gives two reads, the first and the last one. The measured values belong to the first one.
-    Raises InputError with file, row and column of an invalid value.
+    A row that summarizes several reads gives two reads, the first and the last one. The measured values belong to the
+    first one. Raises InputError with file, row and column of an invalid value.
     """
     wide = "*" in options.columns.get("rssi", "")
     if not wide and ("antenna" in options.columns) == (options.antenna is not None):
@@ -242,8 +242,8 @@ def _from_base64(text: str) -> str:
 
 
 def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
-    """Return the rows of ``mapped`` whose last read is not before the first one. Raises InputError at other rows, unless the
-    options skip them."""
+    """Return the rows of ``mapped`` whose last read is not before the first one. Raises InputError at other rows,
+    unless the options skip them."""
     if "last" not in mapped.columns:
         return mapped
     wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)

@@ -42,9 +42,9 @@ EXPECTED = "{tum}, {kitti}, or {euroc}".format(**FORMATS)
 def read_kitti(path: Path, times: Path) -> PosePath:
     """Return the poses of a KITTI odometry file. ``times``: the file with a timestamp per line.
 
-    The file has poses of a camera with z forward and y down, in the frame of its first pose. They are converted to axes with
-    x forward and z up. Raises InputError with file and row of an invalid value. Format: Geiger, Lenz, Urtasun, "Are we ready for
-    autonomous driving?", CVPR 2012.
+    The file has poses of a camera with z forward and y down, in the frame of its first pose. They are converted to axes
+    with x forward and z up. Raises InputError with file and row of an invalid value. Format: Geiger, Lenz, Urtasun,
+    "Are we ready for autonomous driving?", CVPR 2012.
     """
     matrices = read_matrices(path)
     t_ns = read_times(times)
@@ -85,8 +85,8 @@ def _read(
     unit: str | None = None,
     rules: RowRules | None = None,
 ) -> Cells:
-    """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the timestamps.
-    ``rules``: what a manifest says about invalid and late rows, None without a manifest.
+    """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the
+    timestamps. ``rules``: what a manifest says about invalid and late rows, None without a manifest.
     """
     numbered = {name: str(i) for i, name in enumerate(columns, start=1)}
     units: dict[str, str | float] = {} if unit is None else {"t": unit}

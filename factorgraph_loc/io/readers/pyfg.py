@@ -1,8 +1,8 @@
 """The reader of PyFG files, the format of data sets of planar range-aided SLAM.
 
-A file has the odometry of one robot, its ranges to landmarks, and the true poses and landmarks. A range has the time of its pose.
-The covariances in the file become the noise of the rig. Format: Papalia and others, "Certifiably correct range-aided SLAM", IEEE
-Transactions on Robotics 40, 2024.
+A file has the odometry of one robot, its ranges to landmarks, and the true poses and landmarks. A range has the time of
+its pose. The covariances in the file become the noise of the rig. Format: Papalia and others, "Certifiably correct
+range-aided SLAM", IEEE Transactions on Robotics 40, 2024.
 """
 
 from collections.abc import Mapping, Sequence
@@ -164,8 +164,8 @@ def _require_chain(moves: TableRows, poses: Sequence[str]) -> None:
 def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, Landmark], t_ns: Integers) -> TableRows:
     """Return the ranges as rows of a table, in order of their poses.
 
-    ``numbers``: the index of each pose by name. ``marks``: the landmarks by name. ``t_ns``: the timestamp of each pose. Raises
-    InputError at a range from an unknown pose or to an unknown landmark.
+    ``numbers``: the index of each pose by name. ``marks``: the landmarks by name. ``t_ns``: the timestamp of each pose.
+    Raises InputError at a range from an unknown pose or to an unknown landmark.
     """
     names = zip(ranged.rows.tolist(), ranged.names["POSE"], ranged.names["LANDMARK"], strict=True)
     for row, pose, mark in names:

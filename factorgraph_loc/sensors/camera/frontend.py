@@ -1,7 +1,7 @@
 """Detects features, tracks and fiducial markers in images: in all images of a log, or in one image after the other.
 
-The images of a log are processed in parallel, and results are stored in the user's cache folder. A cache key is a hash of
-image, settings and code. A changed image is computed again, and equal images of two logs are computed once.
+The images of a log are processed in parallel, and results are stored in the user's cache folder. A cache key is a hash
+of image, settings and code. A changed image is computed again, and equal images of two logs are computed once.
 """
 
 import hashlib
@@ -56,8 +56,8 @@ Size = tuple[int, int]  # width, height
 class _ImageFile:
     """An image file and the result of feature detection.
 
-    ``key``: the cache key. ``found``: the features, None if not computed yet. ``fault``: the error message of an unusable file.
-    ``other_size``: the size of an image that differs from that of the rig's camera, otherwise None.
+    ``key``: the cache key. ``found``: the features, None if not computed yet. ``fault``: the error message of an
+    unusable file. ``other_size``: the size of an image that differs from that of the rig's camera, otherwise None.
     """
 
     file: Path
@@ -72,9 +72,9 @@ def with_features(
 ) -> tuple[Log, tuple[Notice, ...]]:
     """Replace the images of a log by features and tracks. Returns the log and warnings.
 
-    An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without features.
-    ``progress`` is called with the completed fraction. A log without images is returned unchanged. Raises InputError if the rig
-    has no camera, or if no image has the size that the camera is calibrated for.
+    An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without
+    features. ``progress`` is called with the completed fraction. A log without images is returned unchanged. Raises
+    InputError if the rig has no camera, or if no image has the size that the camera is calibrated for.
     """
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
@@ -105,8 +105,8 @@ def _features(
     kept: FeatureCache,
     progress: Callable[[float], None],
 ) -> list[_ImageFile]:
-    """Return the features of the image ``files``, from the cache ``kept`` if possible. ``size``: width and height of the
-    camera's images [px]."""
+    """Return the features of the image ``files``, from the cache ``kept`` if possible. ``size``: width and height of
+    the camera's images [px]."""
     about = f"{settings.model_dump_json()} {size} {code_version(FEATURE_CODE)} "
     new: dict[str, _ImageFile] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading, hashing and detection release the interpreter lock
@@ -123,8 +123,8 @@ def _features(
 
 
 def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
-    """Read an image's features from the cache ``kept``. The cache key depends on the bytes of the image ``file`` and on the text
-    ``about``."""
+    """Read an image's features from the cache ``kept``. The cache key depends on the bytes of the image ``file`` and on
+    the text ``about``."""
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:
@@ -135,8 +135,8 @@ def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
 
 
 def _find(file: Path, key: str, settings: FrontendSettings, size: Size, kept: FeatureCache) -> _ImageFile:
-    """Compute the features of an image and write them to the cache ``kept`` with the ``key``. Returns the features, or the error
-    message if the file is unusable. ``size``: width and height of the camera's images [px]."""
+    """Compute the features of an image and write them to the cache ``kept`` with the ``key``. Returns the features, or
+    the error message if the file is unusable. ``size``: width and height of the camera's images [px]."""
     try:
         image = read_image(file)
     except InputError as error:
@@ -231,8 +231,8 @@ def _doubts(log: Log, images: list[_ImageFile]) -> tuple[Notice, ...]:
 
 @cache
 def code_version(names: tuple[str, ...]) -> str:
-    """Return a hash of source files of :mod:`factorgraph_loc.vision`, by name, and of the versions of the libraries they
-    use."""
+    """Return a hash of source files of :mod:`factorgraph_loc.vision`, by name, and of the versions of the libraries
+    they use."""
     package = resources.files("factorgraph_loc.vision")
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     for name in names:

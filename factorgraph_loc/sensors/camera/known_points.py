@@ -61,8 +61,8 @@ class Predicted:
 
 
 class KnownPoints:
-    """Turns camera measurements into factors of known points. Points that the map lacks are counted as ignored, outliers as
-    rejected.
+    """Turns camera measurements into factors of known points. Points that the map lacks are counted as ignored,
+    outliers as rejected.
 
     ``estimated``: the camera's constants that are estimated. ``use``: how the map is used, see
     :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``name``: the name of the sensor in the diagnostics.
@@ -110,8 +110,8 @@ class KnownPoints:
         return TIME_OFFSET in self._estimated.indices
 
     def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
-        """Return the detected points whose survey is inexact, grouped by point or marker. Each value has the names of the
-        detected points of the group, and the covariance (3, 3) of their common displacement."""
+        """Return the detected points whose survey is inexact, grouped by point or marker. Each value has the names of
+        the detected points of the group, and the covariance (3, 3) of their common displacement."""
         inexact: dict[str, tuple[list[str], Array]] = {}
         if not isinstance(m, PixelSightings) or not self._inexact.any():
             return inexact
@@ -123,8 +123,8 @@ class KnownPoints:
         return inexact
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
-        """Return a factor of all named points that are in the map, without outlier rejection, on the pose at their time.
-        Returns None if there are none."""
+        """Return a factor of all named points that are in the map, without outlier rejection, on the pose at their
+        time. Returns None if there are none."""
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:
@@ -145,10 +145,10 @@ class KnownPoints:
     ) -> ReprojectionFactor | None:
         """Return the factor of the known points in an image after outliers are removed, or None if no points remain.
 
-        ``predicted``: the predicted pose and constants of the camera, at which outliers are detected.
-        ``offset``: the motion from the pose that the factor depends on to the image, None if the times are equal.
-        ``twist`` (3,): the robot's velocity at the image. It is required if the camera's time offset is estimated.
-        ``displaced``: by point name, the displacement (3,) of a point from the map, and the covariance (3, 3) of its position.
+        ``predicted``: the predicted pose and constants of the camera, at which outliers are detected. ``offset``: the
+        motion from the pose that the factor depends on to the image, None if the times are equal. ``twist`` (3,): the
+        robot's velocity at the image. It is required if the camera's time offset is estimated. ``displaced``: by point
+        name, the displacement (3,) of a point from the map, and the covariance (3, 3) of its position.
         """
         self.used = np.empty(0, dtype=np.int64)
         factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
@@ -186,8 +186,8 @@ class KnownPoints:
         return levelled
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
-        """Return the robot's pose at an image, found without a prediction, and the number of points that the image should show.
-        The pose is None if it is not found."""
+        """Return the robot's pose at an image, found without a prediction, and the number of points that the image
+        should show. The pose is None if it is not found."""
         model = self.model
         if not len(self.map):
             return None, 0
@@ -209,8 +209,8 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """Return a factor without points, to which matches are added. Returns None if the features cannot be matched with the
-        map."""
+        """Return a factor without points, to which matches are added. Returns None if the features cannot be matched
+        with the map."""
         self.names = ()
         if self.associator is None:
             if not self._others_matter:
@@ -224,8 +224,8 @@ class KnownPoints:
     def _matched(
         self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
     ) -> ReprojectionFactor | None:
-        """Match the features of a frame with the map near the predicted ``camera`` pose. Returns ``factor`` with the matched
-        points, or None without matches. ``focal``: standard deviation of the logarithm of the focal length."""
+        """Match the features of a frame with the map near the predicted ``camera`` pose. Returns ``factor`` with the
+        matched points, or None without matches. ``focal``: standard deviation of the logarithm of the focal length."""
         assert self.associator is not None
         matches = self.associator.guided(m, camera, model, focal)
         self.used = matches.features
@@ -246,8 +246,8 @@ class KnownPoints:
     ) -> ReprojectionFactor | None:
         """Update the learnt standard deviation of the robot's tilt by an image, and return ``factor`` with this value.
 
-        ``expected``: the same factor with fixed constants. Returns None if the image requires a tilt above :data:`STEEPEST`,
-        because it is probably wrong.
+        ``expected``: the same factor with fixed constants. Returns None if the image requires a tilt above
+        :data:`STEEPEST`, because it is probably wrong.
         """
         if expected.estimated:  # errors of the constants would be mistaken for a tilt
             return factor
@@ -259,8 +259,8 @@ class KnownPoints:
         return replace(factor, model=replace(factor.model, tilt=sigma))
 
     def _camera(self, expected: ReprojectionFactor, predicted: Predicted) -> CameraPose:
-        """Return the predicted pose of the camera at an image. Its covariance includes the uncertainty of the mounting and of
-        the time offset."""
+        """Return the predicted pose of the camera at an image. Its covariance includes the uncertainty of the mounting
+        and of the time offset."""
         pose, covariance = predicted.pose, predicted.covariance
         if expected.offset is not None:
             noise = np.zeros((3, 3)) if expected.offset_covariance is None else expected.offset_covariance

@@ -29,8 +29,8 @@ CAMERAS = ("camera", "sightings")  # channels of the camera: images with their f
 
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
-    """K named points in an image at the time ``t`` [s]. ``points``: their names. ``pixels`` (K, 2): their positions [px], x to
-    the right, y down."""
+    """K named points in an image at the time ``t`` [s]. ``points``: their names. ``pixels`` (K, 2): their positions
+    [px], x to the right, y down."""
 
     sensor: ClassVar[str] = "sightings"
     modality: ClassVar[str] = "camera"
@@ -143,11 +143,11 @@ FOLDER = "camera"
 
 
 def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Path | None = None) -> ImageStream:
-    """Return the stream of the images that a table lists and that exist, in order of arrival. Of several images with the same
-    timestamp the last is kept.
+    """Return the stream of the images that a table lists and that exist, in order of arrival. Of several images with
+    the same timestamp the last is kept.
 
-    ``folder``: the validated folder of the images, by default that of the native format. Raises InputError if a path leaves the
-    folder or is no regular file, or if a timestamp is more than 0.5 s late.
+    ``folder``: the validated folder of the images, by default that of the native format. Raises InputError if a path
+    leaves the folder or is no regular file, or if a timestamp is more than 0.5 s late.
     """
     latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings, rules=table.rules).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
@@ -168,8 +168,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """Return the rows of an image stream, and copy the images to the folder. Raises InputError for features, which cannot be
-    written."""
+    """Return the rows of an image stream, and copy the images to the folder. Raises InputError for features, which
+    cannot be written."""
     if not isinstance(stream, ImageStream):
         raise InputError(f"{writing.log}: the stream camera has features, expected the images they were computed from")
     return {
@@ -209,15 +209,15 @@ BYTE = replace(FEATURES["descriptors"], kind="whole", low=0.0, high=255.0)
 
 
 def check_sightings(m: PixelSightings, where: str) -> dict[str, Any]:
-    """Return the validated fields of named points. Raises InputError with the first invalid field. ``where``: the measurement's
-    name in messages."""
+    """Return the validated fields of named points. Raises InputError with the first invalid field. ``where``: the
+    measurement's name in messages."""
     points = values.names(where, "points", m.points)
     return {"points": points, "pixels": values.within(where, PAIRS, m.pixels, (len(points), 2))}
 
 
 def check_frame(m: CameraFrame | CameraImage, where: str) -> dict[str, Any]:
-    """Return the validated fields of an image's features. Raises InputError with the first invalid field. Returns {} for an
-    image, which is checked when its features are detected. ``where``: the measurement's name in messages."""
+    """Return the validated fields of an image's features. Raises InputError with the first invalid field. Returns {}
+    for an image, which is checked when its features are detected. ``where``: the measurement's name in messages."""
     if isinstance(m, CameraImage):
         return {}
     pixels = values.numbers(where, "pixels", m.pixels)

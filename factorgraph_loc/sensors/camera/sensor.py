@@ -1,9 +1,9 @@
 """The camera sensor of a run, and localization from images alone.
 
 The sensor observes points of the map, which are identified by name or by appearance. At an unknown start, or after a
-kidnapping, one image with enough inliers determines the pose. Otherwise the poses from several images must agree, after the
-odometry moved them to the same time. An image must also agree with the start position if that is known. A track is suspicious
-if several consecutive images do not show the points of the map at their predicted positions.
+kidnapping, one image with enough inliers determines the pose. Otherwise the poses from several images must agree, after
+the odometry moved them to the same time. An image must also agree with the start position if that is known. A track is
+suspicious if several consecutive images do not show the points of the map at their predicted positions.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ SOLVE_EVERY = 0.45  # s between updates of a graph's solver; other images only u
 class PixelObservation(ResidualObservation):
     """The observation of points in one image.
 
-    ``seen``: the factor of the points. It depends on the pose, and possibly on constants of the camera and displacements of
-    points. ``expected`` (3,): the pose that was predicted when the points were identified.
+    ``seen``: the factor of the points. It depends on the pose, and possibly on constants of the camera and
+    displacements of points. ``expected`` (3,): the pose that was predicted when the points were identified.
     ``held``: estimates (P,) and covariance (P, P) of the camera's constants if the observation depends on the pose only.
     """
 
@@ -54,8 +54,8 @@ class PixelObservation(ResidualObservation):
 
     @classmethod
     def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
-        """Return the observation of a factor ``seen``, whose values after the pose are these ``blocks``. ``expected`` (3,): the
-        predicted pose."""
+        """Return the observation of a factor ``seen``, whose values after the pose are these ``blocks``. ``expected``
+        (3,): the predicted pose."""
         return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(
@@ -88,8 +88,8 @@ class PixelObservation(ResidualObservation):
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, covariances)
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """Return the observation as a function of the pose only. The camera's constants and displacements of points are fixed at
-        ``values``, and their covariances ``spreads`` are added to the noise."""
+        """Return the observation as a function of the pose only. The camera's constants and displacements of points are
+        fixed at ``values``, and their covariances ``spreads`` are added to the noise."""
         if not self.blocks:
             return self
         seen, held, blocks = self.seen, None, self.blocks
@@ -189,8 +189,8 @@ class CameraSensor(Sensor):
 
 def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFactor:
     """Return a factor that also depends on displacements of points. ``which`` (K): for each point the number of its
-    displacement among the values, or -1 for none. A point with a displacement has no survey noise, because the displacement
-    accounts for it."""
+    displacement among the values, or -1 for none. A point with a displacement has no survey noise, because the
+    displacement accounts for it."""
     covariances = factor.point_covariances
     if covariances is not None:
         covariances = np.where(np.array(which)[:, None, None] < 0, covariances, 0.0)
@@ -198,8 +198,8 @@ def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFa
 
 
 def bind(binding: Binding) -> CameraSensor | None:
-    """Return the camera sensor of a run, or None if the run does not use it. The particle filter does not estimate the camera's
-    constants; their uncertainty is added to the noise."""
+    """Return the camera sensor of a run, or None if the run does not use it. The particle filter does not estimate the
+    camera's constants; their uncertainty is added to the noise."""
     setup = binding.setup
     if setup.rig.find(CameraSettings) is None or not any(sensor in setup.sensors for sensor in CAMERAS):
         return None
@@ -217,8 +217,8 @@ SEARCH_INTERVAL = 1.0  # s between unsuccessful searches
 
 @dataclass(frozen=True)
 class _Fix:
-    """The ``pose`` (3,) of the robot from one image, with body-frame ``covariance`` (3, 3). ``odometry``: the odometry state at the
-    image. ``clear``: True if this image alone is sufficient to localize the robot."""
+    """The ``pose`` (3,) of the robot from one image, with body-frame ``covariance`` (3, 3). ``odometry``: the odometry
+    state at the image. ``clear``: True if this image alone is sufficient to localize the robot."""
 
     odometry: ChainState
     pose: Array
@@ -319,8 +319,8 @@ class PixelFinder:
 
     @staticmethod
     def _is_not_from(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
-        """True if a robot that started at the known position ``start`` cannot be at the pose ``fix``, which one image determined.
-        ``now``: the odometry state at the image."""
+        """True if a robot that started at the known position ``start`` cannot be at the pose ``fix``, which one image
+        determined. ``now``: the odometry state at the image."""
         return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
@@ -336,7 +336,7 @@ class PixelFinder:
 
 
 def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
-    """Return the squared Mahalanobis distance between ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the pose of
-    ``fix``, which one image determined."""
+    """Return the squared Mahalanobis distance between ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the pose
+    of ``fix``, which one image determined."""
     error = se2.log(se2.between(pose, fix.pose))
     return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

@@ -30,8 +30,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"points": the largest number of simulated detections per second}. Raises ValueError if the world has points, but
-    the rig has no camera."""
+    """Return {"points": the largest number of simulated detections per second}. Raises ValueError if the world has
+    points, but the rig has no camera."""
     if settings.world.points and settings.rig.find(CameraSettings) is None:
         raise ValueError("the world has points, expected a rig with a camera")
     return {"points": settings.pixels.rate * settings.world.points}
@@ -42,8 +42,8 @@ def pixel_stream(
 ) -> SightingStream:
     """Simulate the points that the camera detects at ``times`` (N,) [s] from robot ``poses`` (N, 3).
 
-    A point is visible if it is inside the image, within range, not on a surface that is seen too obliquely, and not occluded.
-    Walls and furniture occlude points at any height.
+    A point is visible if it is inside the image, within range, not on a surface that is seen too obliquely, and not
+    occluded. Walls and furniture occlude points at any height.
     """
     points = world.points
     assert points is not None, "the world has points"
@@ -71,8 +71,8 @@ def pixel_stream(
 
 
 def surface_normals(world: World, places: Array) -> Array:
-    """Return the unit normal (K, 2) of the wall nearest to each position in ``places`` (K, 2). It points to the side of the
-    position. Without walls it is 0."""
+    """Return the unit normal (K, 2) of the wall nearest to each position in ``places`` (K, 2). It points to the side of
+    the position. Without walls it is 0."""
     if not world.walls:
         return np.zeros((len(places), 2))
     walls = np.array(world.walls, dtype=float).reshape(-1, 2, 2)[nearest_walls(world, places)[1]]
@@ -83,8 +83,8 @@ def surface_normals(world: World, places: Array) -> Array:
 
 
 def _at_most(count: int, frames: Array, rng: np.random.Generator) -> Array:
-    """Return sorted indices of at most ``count`` random rows per frame. ``frames`` (K,): the sorted frame number of each
-    row."""
+    """Return sorted indices of at most ``count`` random rows per frame. ``frames`` (K,): the sorted frame number of
+    each row."""
     shuffled = np.lexsort((rng.random(len(frames)), frames))
     starts = np.searchsorted(frames, frames)
     return np.sort(shuffled[np.arange(len(frames)) - starts < count])

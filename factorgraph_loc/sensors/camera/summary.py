@@ -1,8 +1,8 @@
 """Summarises the images and named points of a log, with warnings, and provides the images for viewers.
 
-The mounting of the camera is checked by the rotation of images. If a robot turns by an angle, the image rotates about the
-optical axis by that angle times the downward component of the axis. Images of a camera that points at the floor rotate with the
-robot, images of a camera that points forward only shift.
+The mounting of the camera is checked by the rotation of images. If a robot turns by an angle, the image rotates about
+the optical axis by that angle times the downward component of the axis. Images of a camera that points at the floor
+rotate with the robot, images of a camera that points forward only shift.
 """
 
 import math
@@ -198,8 +198,8 @@ def mounting_problems(log: Log) -> list[Notice]:
 
 
 def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
-    """Yield the rotations [rad] of robot and image between pairs of consecutive images with large rotations. Pairs whose image
-    rotation cannot be estimated are skipped."""
+    """Yield the rotations [rad] of robot and image between pairs of consecutive images with large rotations. Pairs
+    whose image rotation cannot be estimated are skipped."""
     assert log.reference is not None
     headings = log.reference.at(stream.t + log.rig.time_offset("camera"))[:, 2]
     turns = se2.wrap(np.diff(headings))
@@ -211,8 +211,8 @@ def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
 
 
 def _turned(files: Sequence[Path]) -> float | None:
-    """Return the rotation [rad] of the second of two images relative to the first, positive from right to down. Returns None if
-    it cannot be estimated."""
+    """Return the rotation [rad] of the second of two images relative to the first, positive from right to down. Returns
+    None if it cannot be estimated."""
     finder = extractor(FEATURE, COUNT)
     features = []
     for file in files:

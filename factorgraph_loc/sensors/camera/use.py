@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 
 def check(use: Use) -> Use:
-    """Return the run. If the map has no points for the camera, change the setting ``landmarks`` to ``unknown``, so that the
-    points are estimated, and add a warning. The setting is changed only if the user has not set it, the estimator can estimate
-    points, and no other sensor of the run needs a map."""
+    """Return the run. If the map has no points for the camera, change the setting ``landmarks`` to ``unknown``, so that
+    the points are estimated, and add a warning. The setting is changed only if the user has not set it, the estimator
+    can estimate points, and no other sensor of the run needs a map."""
     motion = moving(use.sensors, TURN)
     unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use)
     if "landmarks" in use.given or not unmapped or any(name not in (*CAMERAS, *motion) for name in use.sensors):
@@ -75,8 +75,8 @@ def _has_points(use: Use) -> bool:
 
 @dataclass(frozen=True)
 class PreparedLog:
-    """A ``log`` whose images are replaced by features. ``images``: number of images whose features were computed or loaded from
-    the cache. ``seconds``: the time that this took."""
+    """A ``log`` whose images are replaced by features. ``images``: number of images whose features were computed or
+    loaded from the cache. ``seconds``: the time that this took."""
 
     log: Log
     warnings: tuple[Notice, ...] = ()
@@ -85,8 +85,8 @@ class PreparedLog:
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
-    """Return the settings of feature detection. The kind of feature is the kind that the map's points have. If the map has no
-    points, it is the kind in the settings of the rig's camera.
+    """Return the settings of feature detection. The kind of feature is the kind that the map's points have. If the map
+    has no points, it is the kind in the settings of the rig's camera.
 
     Without a map, features are spread over the image, because most of the strongest features may be on a moving object.
     """
@@ -98,8 +98,8 @@ def frontend_of(rig: Rig, world: World) -> FrontendSettings:
 
 
 def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
-    """Return timestamps (N,) [s] and features of a log's images after feature detection. Raises InputError if the log has no
-    images."""
+    """Return timestamps (N,) [s] and features of a log's images after feature detection. Raises InputError if the log
+    has no images."""
     stream = log.streams.get("camera")
     if not isinstance(stream, FeatureStream):
         raise InputError(f"{log.name}: has no images (camera), so there are no points to map")
@@ -131,8 +131,8 @@ def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
 
 
 class CameraIntake(Intake):
-    """Detects and tracks features in pushed images. It checks that descriptors have the same length as the descriptors of the map,
-    or, without a map, as the descriptors of the first frame."""
+    """Detects and tracks features in pushed images. It checks that descriptors have the same length as the descriptors
+    of the map, or, without a map, as the descriptors of the first frame."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         points = world.points

@@ -47,9 +47,9 @@ FIRST = BearingRangeSettings(range_sigma=0.1)  # initial settings if the rig has
 class Sightings:
     """K sightings of mapped landmarks in one log.
 
-    ``t`` (K,): timestamps [s] by the sensor's clock. ``points`` (K, 2): positions of the landmarks [m] in the world frame, or
-    (K, 3) with heights above the sensor. ``ranges`` (K,) [m] and ``bearings`` (K,) [rad]: NaN if not measured.
-    ``sound`` (K, 2): the probabilities that range and bearing are not gross errors.
+    ``t`` (K,): timestamps [s] by the sensor's clock. ``points`` (K, 2): positions of the landmarks [m] in the world
+    frame, or (K, 3) with heights above the sensor. ``ranges`` (K,) [m] and ``bearings`` (K,) [rad]: NaN if not
+    measured. ``sound`` (K, 2): the probabilities that range and bearing are not gross errors.
     """
 
     log: Log
@@ -60,8 +60,8 @@ class Sightings:
     sound: Array
 
     def whitened(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Return range and bearing residuals (K, 2), predicted minus measured, in standard deviations. They are zero if not
-        measured.
+        """Return range and bearing residuals (K, 2), predicted minus measured, in standard deviations. They are zero if
+        not measured.
         ``moved`` (3,): a body-frame perturbation (x, y, heading) that is applied to all reference poses."""
         assert self.log.reference is not None
         poses = self.log.reference.at(self.t + settings.time_offset)
@@ -87,8 +87,8 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
     Returns the constant and the relative part of the standard deviation, and the probability (K,) that each error is not gross.
     The standard deviation at range r is the root of constant^2 + (relative r)^2. ``ranges`` (K,): measured ranges [m].
 
-    A mixture of two zero-mean Gaussians is fitted by expectation-maximisation, which starts from the median absolute error
-    (McLachlan and Peel, "Finite mixture models", 2000, section 3.2). The wider Gaussian models the gross errors.
+    A mixture of two zero-mean Gaussians is fitted by expectation-maximisation, which starts from the median absolute
+    error (McLachlan and Peel, "Finite mixture models", 2000, section 3.2). The wider Gaussian models the gross errors.
     """
     known = np.isfinite(errors)
     error, distance = errors[known], ranges[known]
@@ -112,8 +112,8 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
 def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
     """Return the constant and the relative part of the standard deviation of ``errors`` (K,) with ``weights`` (K,).
 
-    One step of Fisher scoring from ``start``, the previous two parts (Nelder and Pregibon, "An extended quasi-likelihood
-    function", Biometrika 74(2), 1987).
+    One step of Fisher scoring from ``start``, the previous two parts (Nelder and Pregibon, "An extended
+    quasi-likelihood function", Biometrika 74(2), 1987).
     """
     design = np.column_stack((np.ones(len(errors)), ranges**2))
     root = np.sqrt(weights) / (design @ np.square(start))
@@ -128,9 +128,9 @@ class LandmarkCalibrator(ConstantsCalibrator):
     first, rounds = FIRST, 4
 
     def part(self, log: Log) -> Sightings:
-        """Return the sightings of mapped landmarks at least ``MAX_OFFSET`` inside the time span of the reference. If there are
-        more than ``MOST_SIGHTINGS``, only every n-th timestamp is used. Raises InputError if there are fewer than
-        ``MIN_SIGHTINGS``."""
+        """Return the sightings of mapped landmarks at least ``MAX_OFFSET`` inside the time span of the reference. If
+        there are more than ``MOST_SIGHTINGS``, only every n-th timestamp is used. Raises InputError if there are fewer
+        than ``MIN_SIGHTINGS``."""
         stream, reference = log.streams["bearing_range"], log.reference
         assert isinstance(stream, BearingRangeStream)
         assert reference is not None
@@ -151,8 +151,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return Sightings(log, stream.t[rows], points, stream.range[rows], bearings[rows], np.ones((len(rows), 2)))
 
     def parameters(self, parts: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
-        """Return the constants to estimate, each with a prior around the rig's value. Without reference headings the mounting
-        and the time offset are not estimated."""
+        """Return the constants to estimate, each with a prior around the rig's value. Without reference headings the
+        mounting and the time offset are not estimated."""
         has_range = any(np.isfinite(part.ranges).any() for part in parts)
         has_bearing = any(np.isfinite(part.bearings).any() for part in parts)
         has_heading = all(part.log.reference is not None and part.log.reference.has_heading for part in parts)
@@ -169,8 +169,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings]:
-        """Return the sightings with new probabilities ``sound``, and the settings with the noise of the errors that are not
-        gross."""
+        """Return the sightings with new probabilities ``sound``, and the settings with the noise of the errors that are
+        not gross."""
         errors = np.concatenate([part.errors(settings) for part in parts])
         ranges = np.nan_to_num(np.concatenate([part.ranges for part in parts]))
         sigmas, sound = dict[str, float](), np.ones(errors.shape)
@@ -188,8 +188,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     ) -> tuple[Sequence[Sightings], BearingRangeSettings, Posterior | None]:
         """Return ``parts`` and ``settings`` with the estimates of the best fit, and its posterior.
 
-        Ranges are fitted as distances and as depths. A kind of range other than the one in ``settings`` is chosen only if its
-        range errors are clearly smaller (``BETTER_KIND``).
+        Ranges are fitted as distances and as depths. A kind of range other than the one in ``settings`` is chosen only
+        if its range errors are clearly smaller (``BETTER_KIND``).
         """
         given = super().estimated(parts, settings)
         if not any(np.any(np.isfinite(part.ranges) & np.isfinite(part.bearings)) for part in parts):
@@ -223,8 +223,8 @@ CALIBRATOR = LandmarkCalibrator()
 
 
 def pose_share(parts: Sequence[Sightings], settings: BearingRangeSettings) -> float:
-    """Return the fraction of the sightings' information on the pose that is left after correlated errors are accounted for. See
-    :func:`independent_share`."""
+    """Return the fraction of the sightings' information on the pose that is left after correlated errors are accounted
+    for. See :func:`independent_share`."""
 
     def residuals(moved: Array) -> Array:
         return np.concatenate([part.residuals(settings, moved) for part in parts])

@@ -1,10 +1,10 @@
 """Estimates the position of a new landmark whose sightings have a range alone or a bearing alone.
 
-No single sighting determines such a position. The sightings along a driven path do, up to ambiguities: after a straight path
-the mirror image explains ranges equally well. Candidate positions start around the robot. They are first refined with the
-odometry error as additional noise, then with the odometry error as an unknown that is marginalised. A position is accepted when
-no other position explains the sightings nearly as well. Source of several hypotheses for one range-only landmark: Blanco,
-Fernandez-Madrigal, Gonzalez, "Efficient probabilistic range-only SLAM", IROS 2008.
+No single sighting determines such a position. The sightings along a driven path do, up to ambiguities: after a straight
+path the mirror image explains ranges equally well. Candidate positions start around the robot. They are first refined
+with the odometry error as additional noise, then with the odometry error as an unknown that is marginalised. A position
+is accepted when no other position explains the sightings nearly as well. Source of several hypotheses for one
+range-only landmark: Blanco, Fernandez-Madrigal, Gonzalez, "Efficient probabilistic range-only SLAM", IROS 2008.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class PartialSighting(NamedTuple):
 class LocatedPoint(NamedTuple):
     """An estimated position of a landmark.
 
-    ``point`` (2,) [m] with ``covariance`` (2, 2): in the frame of the robot at the last sighting. ``loss``: the negative
-    log-likelihood of the sightings at that point. ``squared``: the median of their squared residuals.
+    ``point`` (2,) [m] with ``covariance`` (2, 2): in the frame of the robot at the last sighting. ``loss``: the
+    negative log-likelihood of the sightings at that point. ``squared``: the median of their squared residuals.
     """
 
     point: Array
@@ -100,8 +100,8 @@ class Candidate:
     ) -> LocatedPoint | None:
         """Return the position that explains the sightings. Returns None if no position explains them, or if several do.
 
-        ``model``: the model of the sensor. ``motion``: the odometry. ``constants`` (P,) with covariance ``uncertainty`` (P, P):
-        estimated calibration constants of the odometry.
+        ``model``: the model of the sensor. ``motion``: the odometry. ``constants`` (P,) with covariance ``uncertainty``
+        (P, P): estimated calibration constants of the odometry.
         """
         path = _PathSightings(model, self.sightings, motion, constants, uncertainty)
         if path.count < FEWEST:
@@ -154,8 +154,8 @@ class _PathSightings:
         self._common += np.einsum("iap,pq,jbq->ijab", turns, uncertainty, turns)
 
     def positions(self) -> list[LocatedPoint]:
-        """Return possible positions of the landmark, sorted by loss: the distinct local optima, and a position that is refined from
-        the mirror image of the best of them."""
+        """Return possible positions of the landmark, sorted by loss: the distinct local optima, and a position that is
+        refined from the mirror image of the best of them."""
         starts = self._starts()
         points = self._refined(starts)
         points = points[np.argsort(self._losses(points))]
@@ -179,9 +179,9 @@ class _PathSightings:
         return np.asarray(middle + 2.0 * (away @ ahead) * ahead - away)
 
     def _linearized(self, points: Array, path: Array | None = None) -> tuple[Array, Array]:
-        """Return residuals (N, K, 2) at positions (N, 2), in standard deviations of the sensor, and their Jacobians
-        (N, K, 2, 11). The columns are those of :func:`linearize_each`. ``path`` (K, 3): the poses at the sightings, by default
-        from odometry."""
+        """Return residuals (N, K, 2) at positions (N, 2), in standard deviations of the sensor, and their Jacobians (N,
+        K, 2, 11). The columns are those of :func:`linearize_each`. ``path`` (K, 3): the poses at the sightings, by
+        default from odometry."""
         count, size = self.count, len(points)
         sightings = np.repeat(points, count, axis=0), np.tile(self._ranges, size), np.tile(self._bearings, size)
         poses = np.tile(self._back if path is None else path, (size, 1))
@@ -189,8 +189,8 @@ class _PathSightings:
         return error.reshape(size, count, 2), jacobian.reshape(size, count, 2, -1)
 
     def _widened(self, points: Array) -> tuple[Array, Array]:
-        """Return residuals (N, K, 2) at positions (N, 2), and their Jacobians (N, K, 2, 2) by the position. Both are divided by
-        the standard deviation that results from sensor noise and odometry error."""
+        """Return residuals (N, K, 2) at positions (N, 2), and their Jacobians (N, K, 2, 2) by the position. Both are
+        divided by the standard deviation that results from sensor noise and odometry error."""
         error, jacobian = self._linearized(points)
         by_path = jacobian[..., :POINT] @ self._carried
         numbers = np.arange(self.count)
@@ -218,9 +218,9 @@ class _PathSightings:
     def _fused(self, point: Array) -> LocatedPoint:
         """Refine a position (2,) with the path as an unknown that is marginalised.
 
-        Residuals e in standard deviations of the sensor have the covariance R = I + J C J'. C is the covariance of the path,
-        and J is the Jacobian of e by the path. The most likely path has residuals R^-1 e, and differs from the odometry by
-        -C J' R^-1 e. Residuals are linearised on that path.
+        Residuals e in standard deviations of the sensor have the covariance R = I + J C J'. C is the covariance of the
+        path, and J is the Jacobian of e by the path. The most likely path has residuals R^-1 e, and differs from the
+        odometry by -C J' R^-1 e. Residuals are linearised on that path.
         """
         measured, weight, change = self._is_measured, np.ones(self.count), np.zeros((self.count, 3))
         row_of = np.nonzero(measured)[0]

@@ -1,14 +1,14 @@
 """Localization from identified landmarks alone, at an unknown start or after a kidnapping; and detection of a lost track.
 
-The odometry relates the sightings of the last minute to the present pose. Candidate poses are generated from few sightings: one
-landmark gives a circle around it, two landmarks give the alignment of two points. All sightings score each candidate by the
-robust likelihood. The best candidates are refined by Levenberg-Marquardt. Those that remain distinct are the hypotheses of the
-pose.
+The odometry relates the sightings of the last minute to the present pose. Candidate poses are generated from few
+sightings: one landmark gives a circle around it, two landmarks give the alignment of two points. All sightings score
+each candidate by the robust likelihood. The best candidates are refined by Levenberg-Marquardt. Those that remain
+distinct are the hypotheses of the pose.
 
 The weight of a hypothesis is its posterior probability by Laplace's method: the likelihood times the volume of the mode
-(MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6). The prior is flat, or the prior of a known
-start position. Source of hypotheses that are generated from few features and tested with the others: Jensfelt, Kristensen, IEEE
-Transactions on Robotics and Automation 17(5), 2001.
+(MacKay, "Information Theory, Inference, and Learning Algorithms", 2003, eq. 27.6). The prior is flat, or the prior of a
+known start position. Source of hypotheses that are generated from few features and tested with the others: Jensfelt,
+Kristensen, IEEE Transactions on Robotics and Automation 17(5), 2001.
 """
 
 from __future__ import annotations
@@ -177,8 +177,8 @@ class LandmarkFinder:
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return ``count`` poses (N, 3) at the last sighting, sampled from the hypotheses. Returns (0, 3) if nothing was found.
 
-        Hypotheses that are too wide to be Gaussian are replaced by samples from the likelihood of the last sighting (sensor
-        resetting: Lenser, Veloso, ICRA 2000).
+        Hypotheses that are too wide to be Gaussian are replaced by samples from the likelihood of the last sighting
+        (sensor resetting: Lenser, Veloso, ICRA 2000).
         """
         if self._window is None:
             return np.empty((0, 3))
@@ -192,11 +192,11 @@ class LandmarkFinder:
         return np.concatenate(poses)
 
     def refutes(self, pose: Array, covariance: Array) -> bool:
-        """True if the track must be wrong: an unambiguous hypothesis explains nearly all sightings, and far more than the track
-        does.
+        """True if the track must be wrong: an unambiguous hypothesis explains nearly all sightings, and far more than
+        the track does.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the last sighting. A hypothesis that is based on
-        wrongly mapped landmarks does not count, because correctly mapped landmarks contradict it.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the last sighting. A hypothesis that is based
+        on wrongly mapped landmarks does not count, because correctly mapped landmarks contradict it.
         """
         if self.best is None or self._window is None:
             return False
@@ -245,8 +245,8 @@ class LandmarkFinder:
         )
 
     def _clear(self, window: SightingWindow) -> PosePrior | None:
-        """Return the most likely hypothesis if it is unambiguous, otherwise None. The pose and covariance are refined with
-        correlated odometry errors."""
+        """Return the most likely hypothesis if it is unambiguous, otherwise None. The pose and covariance are refined
+        with correlated odometry errors."""
         if not self.hypotheses:
             return None
         best = self.hypotheses[0]
@@ -294,8 +294,8 @@ def _thinned(rows: list[Sighting]) -> list[Sighting]:
 
 
 def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
-    """Return indices of at most ``count`` of the poses (N, 3), by increasing loss (N,). A pose is left out if a better one
-    differs from it by less than ``apart`` (3,) in each component."""
+    """Return indices of at most ``count`` of the poses (N, 3), by increasing loss (N,). A pose is left out if a better
+    one differs from it by less than ``apart`` (3,) in each component."""
     kept: list[int] = []
     losses = losses.copy()
     while len(kept) < count and np.isfinite(losses).any():
@@ -324,8 +324,8 @@ class TrackMonitor:
         self.suspicious_since: float | None = None  # s, or None if the track is not suspicious
 
     def add(self, t: float, factor: BearingRangeFactor, pose: Array, covariance: Array) -> None:
-        """Record how many landmarks of ``factor``, sighted at the time ``t`` [s], contradict the predicted ``pose`` (3,) with its
-        body-frame ``covariance`` (3, 3)."""
+        """Record how many landmarks of ``factor``, sighted at the time ``t`` [s], contradict the predicted ``pose``
+        (3,) with its body-frame ``covariance`` (3, 3)."""
         beyond = factor.count_beyond(BEYOND * GATE, pose, covariance)
         while self._stamps and self._stamps[-1][0] >= t:
             self._stamps.pop()
@@ -342,14 +342,14 @@ class TrackMonitor:
         self.suspicious_since = None
 
     def _beginning(self) -> float:
-        """Return the time [s] at which the contradiction begins. It maximises the number of contradicting landmarks after it
-        and of agreeing landmarks before it."""
+        """Return the time [s] at which the contradiction begins. It maximises the number of contradicting landmarks
+        after it and of agreeing landmarks before it."""
         excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
         return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
 
     def _last(self) -> list[tuple[float, int, int]]:
-        """Return the fewest last timestamps that suffice to judge the track, or [] if there are too few. Each item has the time
-        [s], the number of contradicting landmarks, and the number of all landmarks."""
+        """Return the fewest last timestamps that suffice to judge the track, or [] if there are too few. Each item has
+        the time [s], the number of contradicting landmarks, and the number of all landmarks."""
         for i in range(len(self._stamps) - STAMPS, -1, -1):
             if self._stamps[i][0] <= self._stamps[-1][0] - MONITORED:
                 return self._stamps[i:]

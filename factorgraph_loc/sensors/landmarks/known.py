@@ -23,11 +23,11 @@ EXACT = 0.2  # a landmark is treated as exact if the sigma of its survey is belo
 class KnownLandmarks:
     """Turns measurements into factors, and counts sightings that cannot be used in ``diagnostics``.
 
-    ``use``: how the map is used. ``known`` uses mapped landmarks and ignores others. ``extended`` uses mapped landmarks and
-    estimates others. ``unknown`` estimates all landmarks and uses only the heights of the map.
+    ``use``: how the map is used. ``known`` uses mapped landmarks and ignores others. ``extended`` uses mapped landmarks
+    and estimates others. ``unknown`` estimates all landmarks and uses only the heights of the map.
     ``estimated``: indices of the sensor's constants that are estimated.
-    ``carries``: True if the estimator estimates mapped landmarks with an inexact survey. Otherwise the survey's covariance is
-    added to the noise.
+    ``carries``: True if the estimator estimates mapped landmarks with an inexact survey. Otherwise the survey's
+    covariance is added to the noise.
     ``locates``: True if the estimator can locate new landmarks from ranges alone or bearings alone.
     ``biased``: True if the ranges of each landmark have an unknown bias.
     """
@@ -61,8 +61,8 @@ class KnownLandmarks:
         self._diagnostics = diagnostics
 
     def factor(self, m: BearingRange) -> BearingRangeFactor | None:
-        """Return one factor of all mapped landmarks that are not estimated. It depends on the pose at the measurement's time.
-        Returns None if the measurement has no such landmark."""
+        """Return one factor of all mapped landmarks that are not estimated. It depends on the pose at the measurement's
+        time. Returns None if the measurement has no such landmark."""
         return self.factors(m)[0]
 
     def factors(
@@ -122,8 +122,8 @@ class KnownLandmarks:
         return factor, *single_factors
 
     def _usable(self, m: BearingRange) -> tuple[list[int], list[int], list[int], list[int]]:
-        """Return the row numbers of a measurement for each of the four groups of :meth:`factors`. Count rows that are not
-        used."""
+        """Return the row numbers of a measurement for each of the four groups of :meth:`factors`. Count rows that are
+        not used."""
         fixed, single, surveyed, unknown = list[int](), list[int](), list[int](), list[int]()
         lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
         for i, (name, no_range, no_bearing) in enumerate(lacks):

@@ -188,8 +188,8 @@ class Landmark(FileModel):
 
 
 def points_of(landmarks: Iterable[Landmark], z: float) -> Array:
-    """Return positions (K, 2) of landmarks if all have the height ``z`` [m] of the sensor. Otherwise return positions (K, 3),
-    whose last column is the height above the sensor."""
+    """Return positions (K, 2) of landmarks if all have the height ``z`` [m] of the sensor. Otherwise return positions
+    (K, 3), whose last column is the height above the sensor."""
     places = np.array([(mark.x, mark.y, mark.z - z) for mark in landmarks]).reshape(-1, 3)
     return places if places[:, 2].any() else np.ascontiguousarray(places[:, :2])
 
@@ -208,8 +208,8 @@ LANDMARKS = Table(
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """Return the section ``landmarks`` of a world file. If its ``content`` refers to a table, read the landmarks from that
-    table.
+    """Return the section ``landmarks`` of a world file. If its ``content`` refers to a table, read the landmarks from
+    that table.
 
     A mapping in ``content`` assigns the table's columns to the fields landmark, x, y, and optionally z, and sigma or both
     sigma_x and sigma_y. The larger of sigma_x and sigma_y is used. ``source``: the world file for messages. ``folder``: the

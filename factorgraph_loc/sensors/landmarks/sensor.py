@@ -56,8 +56,8 @@ MAX_PENDING = 5  # stored sightings of a new landmark until two of them agree
 
 @dataclass(frozen=True)
 class LandmarkObservation(ResidualObservation):
-    """The observation of one measurement. One term has all landmarks with a known position, each estimated landmark has its own
-    term.
+    """The observation of one measurement. One term has all landmarks with a known position, each estimated landmark has
+    its own term.
 
     ``surveyed``: True if the position of a landmark is estimated from a survey. Its correction requires several linearisations.
     """
@@ -124,8 +124,8 @@ class LandmarkObservation(ResidualObservation):
         return frozenset(map(tuple, self.measured.points.tolist()))
 
     def at_its_time(self) -> Self | None:
-        """Return the observation on the pose at the time of the measurement. Returns None if it also depends on estimated
-        blocks."""
+        """Return the observation on the pose at the time of the measurement. Returns None if it also depends on
+        estimated blocks."""
         if self.blocks:
             return None
         factor = self.measured
@@ -167,8 +167,8 @@ class NewLandmarks:
     """Stored sightings of landmarks that are not initialised yet, by the name of the landmark's block.
 
     Immutable, because filters go back to an earlier state when a measurement is late.
-    ``pending``: sightings with range and bearing, each with the landmark's position (2,) and covariance (2, 2). Two sightings
-    must agree on the position, because one may be an outlier.
+    ``pending``: sightings with range and bearing, each with the landmark's position (2,) and covariance (2, 2). Two
+    sightings must agree on the position, because one may be an outlier.
     ``partial``: sightings with a range alone or a bearing alone.
     """
 
@@ -185,8 +185,8 @@ class NewLandmarks:
     ) -> tuple[NewLandmarks, Sighted | None]:
         """Add a sighting that locates the landmark at ``point`` (2,) with ``covariance`` (2, 2).
 
-        Returns the remaining sightings, and an earlier sighting that agrees with the new one. If none agrees, the second value
-        is None, and the new sighting is stored.
+        Returns the remaining sightings, and an earlier sighting that agrees with the new one. If none agrees, the
+        second value is None, and the new sighting is stored.
         """
         waiting = self.pending.get(name, ())
         for earlier, noise, candidate in reversed(waiting):
@@ -200,9 +200,9 @@ class NewLandmarks:
 class LandmarkSensor(Sensor):
     """The sensor of identified landmarks, bound to a run. For the ``use`` of the map see :class:`KnownLandmarks`.
 
-    A landmark that the map lacks becomes a block ``bearing_range/NAME`` of the state, which all landmark sensors share. It is
-    initialised when two sightings agree on its position, or when several sightings by range alone or bearing alone determine
-    it.
+    A landmark that the map lacks becomes a block ``bearing_range/NAME`` of the state, which all landmark sensors share.
+    It is initialised when two sightings agree on its position, or when several sightings by range alone or bearing
+    alone determine it.
     """
 
     modality = "bearing_range"
@@ -283,8 +283,8 @@ class LandmarkSensor(Sensor):
         return Term(factor, (*self._shared, *biases, *((block,) if factor.free else ())), 2)
 
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """Return a new landmark, located by the sighting ``term`` at ``t`` [s], if an earlier sighting agrees with it. Otherwise
-        store the sighting and return None. ``block``: the name of the landmark's block."""
+        """Return a new landmark, located by the sighting ``term`` at ``t`` [s], if an earlier sighting agrees with it.
+        Otherwise store the sighting and return None. ``block``: the name of the landmark's block."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
         factor = replace(cast(BearingRangeFactor, term.factor), biased=False)
         point, (by_pose, *by_shared), noise = factor.locate([view.pose, *shared])
@@ -295,8 +295,8 @@ class LandmarkSensor(Sensor):
         return None if earlier is None else replace(new, sightings=(earlier, current))
 
     def _located(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """Return a new landmark if its sightings by range alone or bearing alone determine its position. Otherwise store the
-        sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's block."""
+        """Return a new landmark if its sightings by range alone or bearing alone determine its position. Otherwise
+        store the sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's block."""
         factor = cast(BearingRangeFactor, term.factor)
         (along_floor,) = on_floor(factor.model, factor.points, factor.ranges).tolist()
         sighting = PartialSighting(self._motion.state(t), along_floor, float(factor.bearings[0]))
@@ -377,8 +377,8 @@ def _rotation(heading: float) -> Array:
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:
-    """Return the landmark sensor of a run, or None if the run does not use it. The particle filter does not estimate the
-    sensor's time offset."""
+    """Return the landmark sensor of a run, or None if the run does not use it. The particle filter does not estimate
+    the sensor's time offset."""
     settings = binding.setup.rig.find(BearingRangeSettings)
     if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
         return None

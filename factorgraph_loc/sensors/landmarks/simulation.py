@@ -1,7 +1,7 @@
 """Simulates ranges and bearings of visible landmarks, and predicts their information for planning.
 
-For planning, repeated sightings from one pose are replaced by their mean with reduced noise. A landmark out of sight has no
-effect.
+For planning, repeated sightings from one pose are replaced by their mean with reduced noise. A landmark out of sight
+has no effect.
 """
 
 import math
@@ -41,8 +41,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"landmarks": the largest number of simulated sightings per second}. Raises ValueError if the world has landmarks,
-    but the rig has no landmark sensor."""
+    """Return {"landmarks": the largest number of simulated sightings per second}. Raises ValueError if the world has
+    landmarks, but the rig has no landmark sensor."""
     if settings.world.landmarks and settings.rig.find(BearingRangeSettings) is None:
         raise ValueError("the world has landmarks, expected a rig with bearing_range")
     return {"landmarks": settings.sightings.rate * settings.world.landmarks}
@@ -186,8 +186,8 @@ def _add(
 ) -> None:
     """Add to ``out[j, i]`` the log-likelihood of particle i, given the sightings that were simulated from particle j.
 
-    ``scans``, ``landmarks`` (K,): particle j and landmark of each sighting. ``measured``, ``sigmas`` (K, 2): its range and bearing,
-    and their standard deviations. ``ranges``, ``bearings`` (M, L): those of L landmarks from M particles.
+    ``scans``, ``landmarks`` (K,): particle j and landmark of each sighting. ``measured``, ``sigmas`` (K, 2): its range
+    and bearing, and their standard deviations. ``ranges``, ``bearings`` (M, L): those of L landmarks from M particles.
     """
     for n in range(len(scans)):
         j, k = scans[n], landmarks[n]

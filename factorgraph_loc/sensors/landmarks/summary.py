@@ -93,8 +93,8 @@ def summarize(log: Log) -> Summary:
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
-    """Return the landmarks whose position by sightings from reference poses differs from the map. The difference exceeds both
-    ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
+    """Return the landmarks whose position by sightings from reference poses differs from the map. The difference
+    exceeds both ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
     implied: dict[str, tuple[Array, int]] = {}
     for name, sightings in _seen_from_reference(log).items():
         passes = len(np.unique(sightings.t // PASS))
@@ -114,8 +114,8 @@ def find_suspects(log: Log) -> tuple[Suspect, ...]:
 class _Seen:
     """N sightings of one landmark, with poses from the reference.
 
-    ``t`` (N,): times [s]. ``sensors`` (N, 3): poses of the sensor in the world. ``ranges`` (N,) [m]: calibrated, along the
-    floor. ``bearings`` (N,) [rad]: calibrated, NaN if not measured.
+    ``t`` (N,): times [s]. ``sensors`` (N, 3): poses of the sensor in the world. ``ranges`` (N,) [m]: calibrated, along
+    the floor. ``bearings`` (N,) [rad]: calibrated, NaN if not measured.
     """
 
     t: Array
@@ -167,8 +167,8 @@ def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
 
 
 def _by_range(sightings: _Seen, place: Array) -> tuple[Array, float]:
-    """Return the position (2,) by robust trilateration, which starts at ``place`` (2,), and a standard deviation [m]. The
-    position's standard error is this value divided by the root of the number of independent sightings."""
+    """Return the position (2,) by robust trilateration, which starts at ``place`` (2,), and a standard deviation [m].
+    The position's standard error is this value divided by the root of the number of independent sightings."""
 
     def residual(point: Array) -> Array:
         away: Array = sightings.sensors[:, :2] - point
@@ -215,8 +215,8 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
 
 
 def _shifted(log: Log) -> list[Notice]:
-    """Return a warning if the sightings fit the reference clearly better after a time shift, or with landmarks at another
-    height. A time shift must also be better than another mounting."""
+    """Return a warning if the sightings fit the reference clearly better after a time shift, or with landmarks at
+    another height. A time shift must also be better than another mounting."""
     stream, reference = log.streams.get("bearing_range"), log.reference
     if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:
         return []
@@ -262,15 +262,15 @@ def _shifted(log: Log) -> list[Notice]:
 
 
 def _cost(errors: Array) -> float:
-    """Return the sum of the median absolute errors of ranges and bearings (the columns of ``errors`` (N, 2)). It is infinite if
-    both have too few values."""
+    """Return the sum of the median absolute errors of ranges and bearings (the columns of ``errors`` (N, 2)). It is
+    infinite if both have too few values."""
     usable = [kept for column in errors.T if len(kept := column[np.isfinite(column)]) >= FEWEST // 2]
     return sum(float(np.median(np.abs(kept))) for kept in usable) if usable else np.inf
 
 
 def check(use: Use) -> Use:
-    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate the landmarks of the log: it needs sightings with
-    range and bearing, no sighting has both, and no landmark of the map is used and sighted."""
+    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate the landmarks of the log: it needs
+    sightings with range and bearing, no sighting has both, and no landmark of the map is used and sighted."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
     if wanted == "known" or use.estimates_points or not streams:

@@ -32,8 +32,8 @@ FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the nearly flat prior: 1/m^
 class Sighting(NamedTuple):
     """One sighting of a mapped landmark.
 
-    ``odometry``: the odometry state at its time. ``point`` (2,): the landmark's position in the map [m]. ``range`` [m] and
-    ``bearing`` [rad]: NaN if not measured.
+    ``odometry``: the odometry state at its time. ``point`` (2,): the landmark's position in the map [m]. ``range`` [m]
+    and ``bearing`` [rad]: NaN if not measured.
     """
 
     odometry: ChainState
@@ -45,8 +45,8 @@ class Sighting(NamedTuple):
 class SightingWindow:
     """Constraints on the present pose by K sightings, and by the start of the run if its position is known.
 
-    ``rows``: the sightings in order of time. The present pose is the pose at the last sighting. ``now``: the odometry state
-    there. ``points`` (K, 2): positions of the sighted landmarks in the map.
+    ``rows``: the sightings in order of time. The present pose is the pose at the last sighting. ``now``: the odometry
+    state there. ``points`` (K, 2): positions of the sighted landmarks in the map.
     """
 
     def __init__(
@@ -71,8 +71,8 @@ class SightingWindow:
         return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
 
     def circles(self) -> Array:
-        """Return candidates (N, 3) of the present pose that agree with the last sighting: poses on a circle around the sighted
-        landmark."""
+        """Return candidates (N, 3) of the present pose that agree with the last sighting: poses on a circle around the
+        sighted landmark."""
         k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
@@ -95,15 +95,15 @@ class SightingWindow:
         return self._placed(k, headings, ranges, bearings)
 
     def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
-        """Return present poses (N, 3) from assumptions about sighting ``k``: ``headings`` (N,) of the robot at its time,
-        ``ranges`` (N,) and ``bearings`` (N,) of its landmark."""
+        """Return present poses (N, 3) from assumptions about sighting ``k``: ``headings`` (N,) of the robot at its
+        time, ``ranges`` (N,) and ``bearings`` (N,) of its landmark."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
         relative = se2.transform_from(turned, located(self._model, ranges, bearings))
         return se2.compose(np.column_stack((self.points[k] - relative, headings)), self._forth[k])
 
     def alignments(self) -> Array:
-        """Return candidates (N, 3) of the present pose, one per pair of landmarks sighted with range and bearing. Each one
-        aligns the observed positions of its pair with the map."""
+        """Return candidates (N, 3) of the present pose, one per pair of landmarks sighted with range and bearing. Each
+        one aligns the observed positions of its pair with the map."""
         full = [k for k in self._recent() if not self._missing[k].any()]
         pairs = np.array(list(combinations(full, 2)), dtype=int).reshape(-1, 2)
         mapped, observed = self.points[pairs], self._from_present()[pairs]
@@ -124,8 +124,8 @@ class SightingWindow:
         return np.diag(np.square((position, position, heading)))
 
     def whitener(self, noise: Array | None = None) -> Array:
-        """Return matrices (K, 2, 2) that whiten the residuals for sensor noise and odometry error, linearised at the measured
-        range and bearing. ``noise`` (3, 3): an additional body-frame covariance of the present pose."""
+        """Return matrices (K, 2, 2) that whiten the residuals for sensor noise and odometry error, linearised at the
+        measured range and bearing. ``noise`` (3, 3): an additional body-frame covariance of the present pose."""
         error = self._drift
         if noise is not None:
             error = error + self._carried @ noise @ self._carried.transpose(0, 2, 1)
@@ -142,16 +142,16 @@ class SightingWindow:
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
     def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:
-        """Return the losses (N,) of present poses (N, 3): the robust losses of the sightings, plus the loss of the known start.
-        ``noise`` (3, 3): an additional body-frame covariance of the present pose, used for the start."""
+        """Return the losses (N,) of present poses (N, 3): the robust losses of the sightings, plus the loss of the
+        known start. ``noise`` (3, 3): an additional body-frame covariance of the present pose, used for the start."""
         loss: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return loss if self._start is None else loss + self._start.loss(poses, self.now, noise)
 
     def refined(
         self, poses: Array, whitener: Array, iterations: int, noise: Array | None = None
     ) -> tuple[Array, Array]:
-        """Return present poses (N, 3) refined by Levenberg-Marquardt on :meth:`losses`, and their body-frame covariances
-        (N, 3, 3)."""
+        """Return present poses (N, 3) refined by Levenberg-Marquardt on :meth:`losses`, and their body-frame
+        covariances (N, 3, 3)."""
 
         def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
             information, gradient = self._normal_equations(poses, whitener, noise)
@@ -164,12 +164,12 @@ class SightingWindow:
         return optima.states, np.asarray(np.linalg.inv(optima.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """Refine a present pose (3,) by Gauss-Newton with correlated odometry errors. Returns it and its body-frame covariance
-        (3, 3).
+        """Refine a present pose (3,) by Gauss-Newton with correlated odometry errors. Returns it and its body-frame
+        covariance (3, 3).
 
-        The path since the sightings is marginalised. Residuals e in standard deviations of the sensor have the covariance
-        R = I + J C J'. C is the covariance of the path, and J is the Jacobian of e by the path. On the most likely path the
-        residuals are R^-1 e.
+        The path since the sightings is marginalised. Residuals e in standard deviations of the sensor have the
+        covariance R = I + J C J'. C is the covariance of the path, and J is the Jacobian of e by the path. On the most
+        likely path the residuals are R^-1 e.
         """
         covariances = self._covariance
         if self._start is not None:  # the known start is the first row; it has no robust loss
@@ -226,8 +226,8 @@ class SightingWindow:
         return error.reshape(*at.shape[:2], 2), jacobian
 
     def _normal_equations(self, poses: Array, whitener: Array, noise: Array | None) -> tuple[Array, Array]:
-        """Return the robustly weighted information (N, 3, 3) and gradient (N, 3) of :meth:`losses` at present poses (N, 3). The
-        information includes a nearly flat prior."""
+        """Return the robustly weighted information (N, 3, 3) and gradient (N, 3) of :meth:`losses` at present poses (N,
+        3). The information includes a nearly flat prior."""
         error, jacobian = self._linearized(poses)
         error, jacobian = (whitener @ error[..., None])[..., 0], whitener @ jacobian
         weight = geman_mcclure_weight(np.sum(error**2, axis=-1), self._model.robust)

@@ -125,8 +125,8 @@ POSE = ("x", "y", "heading")
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of loops of a log. Raises InputError if the time of an earlier pose is not before the timestamp of its row,
-    or if a relative pose is incomplete."""
+    """Return the stream of loops of a log. Raises InputError if the time of an earlier pose is not before the timestamp
+    of its row, or if a relative pose is incomplete."""
     (table,) = rows.values()
     columns = dict(table.numbers)
     if "before_ns" in columns:
@@ -148,8 +148,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
 
 
 def check(m: Loops, where: str) -> dict[str, Any]:
-    """Return copies of the validated fields of a pushed measurement. Raises InputError with the first invalid field. ``where``:
-    the measurement's name in messages."""
+    """Return copies of the validated fields of a pushed measurement. Raises InputError with the first invalid field.
+    ``where``: the measurement's name in messages."""
     count = numbers(where, "age", m.age).size
     values = {name: within(where, LOOPS[name], getattr(m, name), (count,)) for name in ("age", *POSE, "score")}
     known = np.isfinite([values[name] for name in POSE])

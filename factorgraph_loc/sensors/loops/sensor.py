@@ -18,8 +18,8 @@ LEAST_SCORE = 0.01  # smaller scores are replaced by this
 
 
 class LoopSensor(Sensor):
-    """Turns each loop closure into a robust factor on two poses. A loop is counted as ignored if the estimator does not keep
-    its earlier pose. Filters keep no earlier poses."""
+    """Turns each loop closure into a robust factor on two poses. A loop is counted as ignored if the estimator does not
+    keep its earlier pose. Filters keep no earlier poses."""
 
     modality = "loops"
     links = True

@@ -1,9 +1,9 @@
 """Calibration of wheel odometry: its constants and its noise are estimated from the motion of a reference over windows of time.
 
-The noise grows with distance, rotation and time (:class:`factors.odometry.model.Growth`). The covariance of a relative motion
-is linear in the variances per unit of distance, rotation and time. They are estimated as non-negative variance components
-(Searle, Casella, McCulloch, "Variance Components", 1992, chapter 6). Windows of several lengths separate errors of the
-odometry, which grow with time, from errors of the reference, which do not.
+The noise grows with distance, rotation and time (:class:`factors.odometry.model.Growth`). The covariance of a relative
+motion is linear in the variances per unit of distance, rotation and time. They are estimated as non-negative variance
+components (Searle, Casella, McCulloch, "Variance Components", 1992, chapter 6). Windows of several lengths separate
+errors of the odometry, which grow with time, from errors of the reference, which do not.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ class Windows:
         return chain.states(self.begin), chain.states(self.end)
 
     def errors(self, model: OdometryModel) -> Array:
-        """Return the errors (M, 3) of the odometry over each window, as body-frame perturbations at its end [m, m, rad]. The motion
-        of the odometry, composed with the perturbation, equals the motion of the reference."""
+        """Return the errors (M, 3) of the odometry over each window, as body-frame perturbations at its end [m, m,
+        rad]. The motion of the odometry, composed with the perturbation, equals the motion of the reference."""
         start, end = self.states(model)
         odometry = se2.between(start[:, 1:4], end[:, 1:4])
         return se2.log(se2.between(odometry, self.motion))
@@ -99,8 +99,8 @@ class Windows:
 
 
 def cut(log: Log, length: float) -> Windows:
-    """Cut a log into consecutive windows of ``length`` seconds. Windows without reference poses at both ends, or with gaps in
-    the odometry, are omitted."""
+    """Cut a log into consecutive windows of ``length`` seconds. Windows without reference poses at both ends, or with
+    gaps in the odometry, are omitted."""
     assert log.reference is not None
     first, last = overlap(log)
     edges = np.arange(first + LEAD, last, length)
@@ -118,8 +118,8 @@ class NoiseFit:
     """The estimated noise of an odometry.
 
     ``growth``: the noise by the name of the error (along, lateral, heading). ``outliers``: fraction of windows that are
-    outliers. ``widened``: a factor that is already included in ``growth``. It accounts for correlated errors of wheels, which
-    grow faster than a random walk. ``floored``: names of the errors whose noise was raised to its lower bound.
+    outliers. ``widened``: a factor that is already included in ``growth``. It accounts for correlated errors of wheels,
+    which grow faster than a random walk. ``floored``: names of the errors whose noise was raised to its lower bound.
     """
 
     growth: Mapping[str, Growth]
@@ -129,8 +129,8 @@ class NoiseFit:
 
 
 def with_noise(model: OdometryModel, sigmas: Array) -> OdometryModel:
-    """Return the model with the noise ``sigmas`` (3, 3): rows are longitudinal, lateral and heading errors, columns are per
-    root of distance, rotation and time."""
+    """Return the model with the noise ``sigmas`` (3, 3): rows are longitudinal, lateral and heading errors, columns are
+    per root of distance, rotation and time."""
     along, lateral, heading = (Growth(*row) for row in sigmas.tolist())
     return replace(model, along=along, lateral=lateral, heading=heading)
 
@@ -160,8 +160,8 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
 
 
 def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
-    """Return the ratio of observed to modelled errors over windows of :data:`BLACKOUT` seconds. It is at least 1, and 1 if
-    there are too few windows."""
+    """Return the ratio of observed to modelled errors over windows of :data:`BLACKOUT` seconds. It is at least 1, and 1
+    if there are too few windows."""
     windows = [cut(log, BLACKOUT) for log in logs]
     residuals = np.concatenate([part.errors(model) for part in windows])
     if len(residuals) < MIN_BLACKOUTS:
@@ -172,9 +172,9 @@ def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
 
 
 def _bases(windows: Windows, model: OdometryModel) -> Array:
-    """Return covariances (M, 11, 3, 3) of the windows' errors for unit values of 11 variances. These are the variances of
-    longitudinal, lateral and heading errors per distance, rotation and time, then those of position and heading of the
-    reference."""
+    """Return covariances (M, 11, 3, 3) of the windows' errors for unit values of 11 variances. These are the variances
+    of longitudinal, lateral and heading errors per distance, rotation and time, then those of position and heading of
+    the reference."""
     start, end = windows.states(model)
     drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion
     drivers[:, 2] -= end[:, 7] - start[:, 7]
@@ -195,8 +195,8 @@ def _bases(windows: Windows, model: OdometryModel) -> Array:
 
 
 def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, Array]:
-    """Return squared Mahalanobis distances (M,) of ``residuals`` (M, 3), and log-determinants (M,) of their covariances.
-    ``bases`` (M, 11, 3, 3): covariances for unit values of the ``variances`` (11,)."""
+    """Return squared Mahalanobis distances (M,) of ``residuals`` (M, 3), and log-determinants (M,) of their
+    covariances. ``bases`` (M, 11, 3, 3): covariances for unit values of the ``variances`` (11,)."""
     floor = np.diag((MINIMUM_POSITION_VARIANCE, MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE))
     covariance = np.tensordot(bases, variances, (1, 0)) + floor
     solved = np.linalg.solve(covariance, residuals[..., None])[..., 0]
@@ -204,8 +204,8 @@ def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, A
 
 
 def _maximise(bases: Array, residuals: Array, weights: Array, start: Array) -> Array:
-    """Return the variances (11,) that maximise the Gaussian likelihood of ``residuals`` (M, 3) with ``weights`` (M,), starting
-    from ``start`` (11,). The optimisation is in the logarithms of the variances."""
+    """Return the variances (11,) that maximise the Gaussian likelihood of ``residuals`` (M, 3) with ``weights`` (M,),
+    starting from ``start`` (11,). The optimisation is in the logarithms of the variances."""
 
     def cost(logarithms: Array) -> float:
         squared, log_determinant = _squared(bases, residuals, np.exp(logarithms))
@@ -240,8 +240,8 @@ class OdometryCalibrator(ConstantsCalibrator):
         return windows
 
     def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
-        """Return the constants to estimate, with priors. Delay, lag and slowdown only exist for commanded velocities. The priors
-        of biases per time are narrower for wheels with encoders, which have hardly any such bias."""
+        """Return the constants to estimate, with priors. Delay, lag and slowdown only exist for commanded velocities.
+        The priors of biases per time are narrower for wheels with encoders, which have hardly any such bias."""
         commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
         by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s; prior sigmas
         priors = {
@@ -261,8 +261,8 @@ class OdometryCalibrator(ConstantsCalibrator):
     ) -> tuple[Sequence[Windows], OdometrySettings]:
         """Return the windows with robust standard deviations of their errors, separately for windows in motion and at rest.
 
-        All windows in motion have equal standard deviations. The standard deviations of the noise model are not used, because they
-        would give windows with little motion too much weight.
+        All windows in motion have equal standard deviations. The standard deviations of the noise model are not used,
+        because they would give windows with little motion too much weight.
         """
         errors, moves = [], []
         for part in parts:

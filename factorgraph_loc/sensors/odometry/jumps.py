@@ -1,5 +1,5 @@
-"""Finds and removes jumps of odometry: single rows with a speed or turn rate that no robot can reach between its neighbouring
-rows.
+"""Finds and removes jumps of odometry: single rows with a speed or turn rate that no robot can reach between its
+neighbouring rows.
 
 The usual cause is an angle that wraps inside the robot's software.
 """
@@ -27,8 +27,8 @@ M = TypeVar("M", bound=VelocityStream | IncrementStream | YawRateStream)
 class Jump(NamedTuple):
     """A jump in one row of odometry.
 
-    ``row``: the number of the row, from 0. ``what``: "speed" or "turn rate". ``unit``: the unit of the rates. ``rate``: the
-    speed or turn rate of the row. ``before``, ``after``: the rates of the previous row and of the next row.
+    ``row``: the number of the row, from 0. ``what``: "speed" or "turn rate". ``unit``: the unit of the rates. ``rate``:
+    the speed or turn rate of the row. ``before``, ``after``: the rates of the previous row and of the next row.
     """
 
     row: int
@@ -40,8 +40,8 @@ class Jump(NamedTuple):
 
 
 def jumps(stream: Motion) -> list[Jump]:
-    """Return the jumps of a stream of odometry or of a gyro in order of its rows. In a jump the speed or turn rate differs from
-    that of the two rows before and after by more than a robot can accelerate.
+    """Return the jumps of a stream of odometry or of a gyro in order of its rows. In a jump the speed or turn rate
+    differs from that of the two rows before and after by more than a robot can accelerate.
     """
     if len(stream.t) < len(AROUND) + 1:
         return []
@@ -63,16 +63,16 @@ def jumps(stream: Motion) -> list[Jump]:
 
 
 def _outliers(rates: Array, least: float) -> Integers:
-    """Return the indices of ``rates`` (N,) that differ from the median of their neighbours by more than ``least``, and that are
-    more than FACTOR times as large as this median."""
+    """Return the indices of ``rates`` (N,) that differ from the median of their neighbours by more than ``least``, and
+    that are more than FACTOR times as large as this median."""
     padded = np.pad(rates, 2, mode="reflect")
     usual = np.median([padded[2 + k : len(padded) - 2 + k] for k in AROUND], axis=0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 
 
 def jump_warning(kind: str, found: list[Jump], stream: Motion, end: str) -> Notice:
-    """Return a warning about the jumps ``found`` in a stream. ``kind``: the kind of the warning. ``end``: text that is appended
-    to it."""
+    """Return a warning about the jumps ``found`` in a stream. ``kind``: the kind of the warning. ``end``: text that is
+    appended to it."""
     first = found[0]
     sentence = (
         "the {what} of the {source} jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {before:.2f} and {after:.2f} "

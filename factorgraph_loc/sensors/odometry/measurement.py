@@ -97,8 +97,8 @@ class VelocityStream(Stream):
 
 @dataclass(frozen=True)
 class IncrementStream(Stream):
-    """All increments of a log: ``dx``, ``dy`` [m] and ``dtheta`` [rad], each (N,): motion since the previous row, in the robot
-    frame at the previous row.
+    """All increments of a log: ``dx``, ``dy`` [m] and ``dtheta`` [rad], each (N,): motion since the previous row, in
+    the robot frame at the previous row.
 
     ``unknown`` (N,) [s]: the part of the time since the previous row in which the motion is unknown, by default 0.
     """
@@ -201,8 +201,8 @@ WHEELS = Table(
 def since_skipped(t_ns: Integers, resumed: NDArray[np.bool_]) -> Array:
     """Return the times (N,) [s] in which the motion of increments at N timestamps [ns] is unknown, because rows were skipped.
 
-    ``resumed`` (N,): True for each row that follows a skipped row. Its time is that since the row before; the time of other
-    rows is 0.
+    ``resumed`` (N,): True for each row that follows a skipped row. Its time is that since the row before; the time of
+    other rows is 0.
     """
     return np.asarray(resumed * np.maximum(np.diff(t_ns, prepend=t_ns[:1]), 0) / 1e9)
 
@@ -216,8 +216,8 @@ def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of velocities or increments of a log. Increments with equal timestamps are composed. Of velocities with
-    equal timestamps the last is kept."""
+    """Return the stream of velocities or increments of a log. Increments with equal timestamps are composed. Of
+    velocities with equal timestamps the last is kept."""
     table = rows["odometry"]
     if "dx" not in table.numbers:
         return stream_of(VELOCITIES, table, reading.t0_ns, reading.warnings)

@@ -48,8 +48,8 @@ class OdometryUncertainty(FileModel):
 
 
 class DifferentialDrive(FileModel):
-    """Geometry of two driven wheels, for logs that contain rotations or distances of the wheels. It converts them to odometry,
-    which ``scale_distance`` and ``scale_rotation`` then correct."""
+    """Geometry of two driven wheels, for logs that contain rotations or distances of the wheels. It converts them to
+    odometry, which ``scale_distance`` and ``scale_rotation`` then correct."""
 
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
     """radius of the wheels; not needed if the log contains distances of the wheels"""
@@ -57,8 +57,8 @@ class DifferentialDrive(FileModel):
     """distance between the wheels"""
 
     def corrected(self, scale_distance: float, scale_rotation: float) -> tuple[float | None, float]:
-        """Return radius (or None) and track width [m] after correction. ``scale_distance``, ``scale_rotation``: the scales of the
-        odometry, as in :class:`OdometrySettings`."""
+        """Return radius (or None) and track width [m] after correction. ``scale_distance``, ``scale_rotation``: the
+        scales of the odometry, as in :class:`OdometrySettings`."""
         radius = None if self.radius is None else self.radius * scale_distance
         return radius, self.track * scale_distance / scale_rotation
 
@@ -100,8 +100,8 @@ class OdometrySettings(SensorSettings):
 
 
 class ImuSettings(SensorSettings):
-    """Settings of a gyro. Its turn rate replaces the rotation of the wheels if an estimator uses the sensor ``imu``. A rig
-    without this section has the defaults."""
+    """Settings of a gyro. Its turn rate replaces the rotation of the wheels if an estimator uses the sensor ``imu``. A
+    rig without this section has the defaults."""
 
     bias: Rate = 0.0
     """turn rate reported at rest"""

@@ -62,8 +62,8 @@ def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
 
 
 def _grid(stamps: Array) -> Array:
-    """Return times (N,) at 10 Hz from the first to the last of ``stamps``. Long gaps are omitted, because a clock may jump by
-    days."""
+    """Return times (N,) at 10 Hz from the first to the last of ``stamps``. Long gaps are omitted, because a clock may
+    jump by days."""
     long = np.flatnonzero(np.diff(stamps) > TICK_GAP)
     begins, ends = stamps[np.append(0, long + 1)], stamps[np.append(long, -1)]
     first = np.ceil((begins - stamps[0]) * RATE - 1e-6).astype(int)

@@ -34,8 +34,8 @@ COVERED = 0.9  # a reference should cover at least this fraction of a log's time
 
 @dataclass(frozen=True)
 class RateMatch:
-    """The comparison of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``: values of the
-    second signal divided by values of the first signal."""
+    """The comparison of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``:
+    values of the second signal divided by values of the first signal."""
 
     shift: float
     slope: float
@@ -66,8 +66,8 @@ def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
     """Compare reference and odometry. Returns ratios and warnings.
 
     The ratios ``travels`` and ``turns`` are distance and rotation of the reference divided by those of the odometry, as
-    corrected by the rig. They are least-squares estimates over time intervals of :data:`CHORD` seconds. A ratio is missing
-    without motion. A warning states that the reference stands still while the odometry drives.
+    corrected by the rig. They are least-squares estimates over time intervals of :data:`CHORD` seconds. A ratio is
+    missing without motion. A warning states that the reference stands still while the odometry drives.
     """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
@@ -105,8 +105,8 @@ def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
 
 
 def _standstill(t: Array, ours: Array, theirs: Array) -> list[Notice]:
-    """Return a warning if the reference stands still while the odometry drives. ``ours``, ``theirs`` (N, 2): positions [m] by
-    odometry and reference at times ``t`` (N,) [s]."""
+    """Return a warning if the reference stands still while the odometry drives. ``ours``, ``theirs`` (N, 2): positions
+    [m] by odometry and reference at times ``t`` (N,) [s]."""
     steps = round(STILL / (CHORD / 4.0))
     stuck = np.flatnonzero((_chords(theirs, steps) < STANDS) & (_chords(ours, steps) > DRIVES))
     if not len(stuck):
@@ -122,8 +122,8 @@ def _chords(places: Array, steps: int) -> Array:
 
 
 def motion_problems(log: Log) -> list[Notice]:
-    """Return warnings if the gyro or the reference contradicts the odometry in time, sign or unit. Only the longest part of the
-    log without a long gap is compared."""
+    """Return warnings if the gyro or the reference contradicts the odometry in time, sign or unit. Only the longest
+    part of the log without a long gap is compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return []
@@ -164,8 +164,8 @@ def _longest(t: Array) -> tuple[float, float]:
 def match(rates: Array, delayed: Array) -> RateMatch | None:
     """Estimate delay and slope of ``delayed`` (N,) relative to ``rates`` (N,), both sampled every ``STEP`` seconds.
 
-    Returns None if the signals are uncorrelated. The slope is negative if the signs differ. The shift is zero if it hardly
-    improves the correlation, or if it is not observable because the rates are constant.
+    Returns None if the signals are uncorrelated. The slope is negative if the signs differ. The shift is zero if it
+    hardly improves the correlation, or if it is not observable because the rates are constant.
     """
     if np.count_nonzero(np.isfinite(rates) & np.isfinite(delayed)) < FEWEST:
         return None
@@ -193,8 +193,8 @@ def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]
 
 
 def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
-    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``found``: its comparison with the odometry.
-    ``sensor``: the section of the rig whose time_offset corrects the clock."""
+    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``found``: its comparison with the
+    odometry. ``sensor``: the section of the rig whose time_offset corrects the clock."""
     if found is None:
         return []
     lines = []
@@ -214,8 +214,8 @@ def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
 
 
 def _rates(values: Array, window: float) -> Array:
-    """Return the rates of change (N,) of values (N,), averaged over a ``window`` [s] around each time. They are NaN at the
-    ends."""
+    """Return the rates of change (N,) of values (N,), averaged over a ``window`` [s] around each time. They are NaN at
+    the ends."""
     half = max(1, round(window / STEP / 2.0))
     out = np.full(len(values), np.nan)
     if len(values) > 2 * half:

@@ -110,8 +110,8 @@ class PositionFinder:
         self._beyond.clear()
 
     def _add(self, odometry: ChainState, factor: PositionFactor) -> None:
-        """Store a position: its ``factor``, and the ``odometry`` state at its time. A late position is skipped. Of positions that
-        are closer in time than INTERVAL, only the last is kept."""
+        """Store a position: its ``factor``, and the ``odometry`` state at its time. A late position is skipped. Of
+        positions that are closer in time than INTERVAL, only the last is kept."""
         self._robust = factor.robust
         if self._rows and odometry.t <= self._rows[-1].odometry.t:
             return
@@ -122,8 +122,8 @@ class PositionFinder:
             self._rows.popleft()
 
     def _align(self, now: ChainState) -> None:
-        """Estimate the pose at the odometry state ``now``: align the path of the odometry with the positions, by least squares
-        with a robust loss that narrows from iteration to iteration."""
+        """Estimate the pose at the odometry state ``now``: align the path of the odometry with the positions, by least
+        squares with a robust loss that narrows from iteration to iteration."""
         rows = list(self._rows)
         if self.start is not None:
             known = self.start.prior

@@ -75,8 +75,8 @@ PLAUSIBLE = (1e-6, 2500.0)
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A measured position at the time ``t`` [s]: ``x``, ``y`` [m] in the world. ``var_x``, ``cov_xy``, ``var_y`` [m^2]: the
-    elements of its covariance, NaN if unknown."""
+    """A measured position at the time ``t`` [s]: ``x``, ``y`` [m] in the world. ``var_x``, ``cov_xy``, ``var_y`` [m^2]:
+    the elements of its covariance, NaN if unknown."""
 
     sensor: ClassVar[str] = "position"
     modality: ClassVar[str] = "position"
@@ -104,8 +104,8 @@ class PositionStream(Stream):
 
 
 def are_plausible(var_x: Any, cov_xy: Any, var_y: Any) -> Any:
-    """True for covariances that are possible, and False for placeholders and NaN. The elements [m^2] are numbers or arrays
-    (N,)."""
+    """True for covariances that are possible, and False for placeholders and NaN. The elements [m^2] are numbers or
+    arrays (N,)."""
     low, high = PLAUSIBLE
     ranges = (low <= var_x) & (var_x <= high) & (low <= var_y) & (var_y <= high)
     return ranges & (np.abs(cov_xy) < np.sqrt(np.abs(var_x)) * np.sqrt(np.abs(var_y)))
@@ -124,8 +124,8 @@ class PositionSettings(SensorSettings):
     """scale of the Geman-McClure loss, in standard deviations"""
 
     def covariance(self, m: Position) -> Array:
-        """Return the covariance (2, 2) [m^2] of a measured position: the covariance in the measurement if it is plausible,
-        otherwise the square of the setting ``sigma`` for x and y."""
+        """Return the covariance (2, 2) [m^2] of a measured position: the covariance in the measurement if it is
+        plausible, otherwise the square of the setting ``sigma`` for x and y."""
         if are_plausible(m.var_x, m.cov_xy, m.var_y):
             return np.array(((m.var_x, m.cov_xy), (m.cov_xy, m.var_y)))
         return self.sigma**2 * np.eye(2)

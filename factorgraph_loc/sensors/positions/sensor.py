@@ -32,8 +32,8 @@ class PositionObservation(ResidualObservation):
 
 
 class PositionSensor(Sensor):
-    """The position sensor of a run. A position that equals the previous one in all digits is counted as ignored, because it has
-    no new information: the system repeats its last result."""
+    """The position sensor of a run. A position that equals the previous one in all digits is counted as ignored,
+    because it has no new information: the system repeats its last result."""
 
     modality = "position"
 
@@ -45,8 +45,8 @@ class PositionSensor(Sensor):
         self.finder = self._finder = PositionFinder(self.observation, binding.motion)
 
     def observation(self, m: Position, offset: Increment | None = None) -> PositionObservation:
-        """Return the observation of a measurement. ``offset``: the motion from the pose that the observation depends on to the
-        measurement, None if the times are equal."""
+        """Return the observation of a measurement. ``offset``: the motion from the pose that the observation depends on
+        to the measurement, None if the times are equal."""
         position, covariance = np.array((m.x, m.y)), self._settings.covariance(m)
         factor = PositionFactor(position, covariance, self._arm, self._settings.robust, offset)
         return PositionObservation(m.t, (Term(factor, (), 2),))

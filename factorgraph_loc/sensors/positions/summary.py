@@ -18,8 +18,8 @@ DRIVEN = 1.0  # m; time spans in which the odometry travels less are not compare
 
 
 def summarize(log: Log) -> Summary:
-    """Return the number of positions and their median error against the reference, with warnings about their unit, their
-    covariances and repeated positions."""
+    """Return the number of positions and their median error against the reference, with warnings about their unit,
+    their covariances and repeated positions."""
     stream, settings = log.streams.get("position"), log.rig.find(PositionSettings)
     if not isinstance(stream, PositionStream) or not len(stream.t):
         return Summary()

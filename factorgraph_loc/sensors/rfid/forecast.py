@@ -1,10 +1,10 @@
 """Predicts the information of RFID antennas along candidate paths, for planning.
 
-Reads are simulated, and their likelihood is evaluated for particles. With the probability q of a read, the log-likelihood is
-the sum of log(1 - q) over all tags in range plus the sum of logit(q) over the reads. The first sum comes from a table of the
-robot: for each position of a tag in the robot frame it has the sum over all antennas. The second sum needs each antenna, but
-reads are few. Both sums are relative to a tag out of range, which contributes nothing. Walls, and false reads of tags out of
-range, are not simulated.
+Reads are simulated, and their likelihood is evaluated for particles. With the probability q of a read, the
+log-likelihood is the sum of log(1 - q) over all tags in range plus the sum of logit(q) over the reads. The first sum
+comes from a table of the robot: for each position of a tag in the robot frame it has the sum over all antennas. The
+second sum needs each antenna, but reads are few. Both sums are relative to a tag out of range, which contributes
+nothing. Walls, and false reads of tags out of range, are not simulated.
 """
 
 import math
@@ -36,8 +36,8 @@ MOST_LOOKS = 1 << 16  # largest number of measurements of a path; measurement k 
 class ScanTables(NamedTuple):
     """Tables of the response of A antennas to T tags, for simulated scans, made of :class:`~factors.rfid.places.RobotTables`.
 
-    A table has C = H F S S cells: H heights, F facings (the last for an unknown one), and S x S positions in the robot frame.
-    ``read`` (C, A): probability q of a read. ``gain`` (A, C): log(q / (1 - q)).
+    A table has C = H F S S cells: H heights, F facings (the last for an unknown one), and S x S positions in the robot
+    frame. ``read`` (C, A): probability q of a read. ``gain`` (A, C): log(q / (1 - q)).
     ``missed`` (C,): sum over antennas of log(1 - q), minus its value for a tag out of range.
     ``silent`` (C,): sum over antennas of log(1 - q), 0 out of range.
     ``size``: S. ``layers``: F. ``cell``: size of a cell [m].
@@ -70,8 +70,8 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
 
 @compiled
 def _uniform(seed: np.uint64, number: int) -> float:
-    """Return a uniform random number that only depends on ``seed`` and its index ``number``, so that it is the same for all
-    candidate paths (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
+    """Return a uniform random number that only depends on ``seed`` and its index ``number``, so that it is the same for
+    all candidate paths (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
     z = seed + np.uint64(number + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -81,8 +81,8 @@ def _uniform(seed: np.uint64, number: int) -> float:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
-    """Write the table cell of tag ``t`` at each of the robot's ``poses`` (M, 3) to ``out`` (M,). ``turns`` (2, M): cosine and
-    sine of the headings."""
+    """Write the table cell of tag ``t`` at each of the robot's ``poses`` (M, 3) to ``out`` (M,). ``turns`` (2, M):
+    cosine and sine of the headings."""
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
@@ -114,8 +114,8 @@ def log_weights(
     tempering: float,
     out: Array32,
 ) -> None:
-    """Simulate scans from the first J = ``scans`` particles on one path. Write to ``out[j, m]`` the tempered log-likelihood of
-    particle m, given the scans from particle j.
+    """Simulate scans from the first J = ``scans`` particles on one path. Write to ``out[j, m]`` the tempered
+    log-likelihood of particle m, given the scans from particle j.
 
     ``poses`` (S, M, 3): poses of M particles at S stops. ``rounds`` (S,): inventory rounds at each stop. ``stops`` (M,): number
     of stops of each particle. ``out`` (J, M). ``seed``: determines the random reads. ``tempering``: exponent of the likelihood.
@@ -149,8 +149,8 @@ def log_weights(
 def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
-    """Draw the random reads of each scan, and add their log-likelihoods to ``out``. ``cells``: the table cell of each tag and pose.
-    The other arguments are those of :func:`log_weights`."""
+    """Draw the random reads of each scan, and add their log-likelihoods to ``out``. ``cells``: the table cell of each
+    tag and pose. The other arguments are those of :func:`log_weights`."""
     steps, tags, count = cells.shape
     antennas = tables.read.shape[1]
     gain = tables.gain
@@ -182,8 +182,8 @@ def _add_reads(
 
 @compiled
 def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
-    """Draw the number of ``count`` rounds that read a tag with probability ``q``, by inversion of ``uniform``. Also returns
-    what is left of ``uniform``, which is again uniform in 0 to 1."""
+    """Draw the number of ``count`` rounds that read a tag with probability ``q``, by inversion of ``uniform``. Also
+    returns what is left of ``uniform``, which is again uniform in 0 to 1."""
     p = (1.0 - q) ** count
     k = 0
     while uniform >= p and k < count:
@@ -211,8 +211,8 @@ class RfidForecast:
         return make_tables(self.likelihood)
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Return the expected information (N, 3, 3) at ``poses`` (N, 3). It is proportional to the number of rounds on the path
-        lengths ``ways`` (N,) [m]."""
+        """Return the expected information (N, 3, 3) at ``poses`` (N, 3). It is proportional to the number of rounds on
+        the path lengths ``ways`` (N,) [m]."""
         count = len(self.likelihood.model.antennas)
         hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
         one_round = TagReadCounts(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
@@ -220,8 +220,8 @@ class RfidForecast:
         return np.asarray((self.rounds_per_metre * ways)[:, None, None] * score)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Add log-likelihoods of simulated scans to ``out``. The rounds of the path are distributed evenly over the poses. See
-        :class:`~factorgraph_loc.sensors.interfaces.Forecast`."""
+        """Add log-likelihoods of simulated scans to ``out``. The rounds of the path are distributed evenly over the
+        poses. See :class:`~factorgraph_loc.sensors.interfaces.Forecast`."""
         steps, total = len(poses), round(metres * self.rounds_per_metre)
         rounds = np.diff(np.arange(steps + 1) * total // steps).astype(np.int64)
         added = np.empty_like(out)
@@ -231,8 +231,8 @@ class RfidForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> RfidForecast | None:
-    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: those of the simulation, for the rate of
-    rounds. Returns None without antennas or tags."""
+    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: those of the simulation, for the
+    rate of rounds. Returns None without antennas or tags."""
     if rig.find(RfidSettings) is None or not world.tags:
         return None
     likelihood = RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags)

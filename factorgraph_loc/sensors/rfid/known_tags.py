@@ -40,11 +40,11 @@ EXACT = 0.2  # a survey is treated as exact if its sigma is below this fraction 
 
 
 def trust(sigmas: Array) -> float:
-    """Return the exponent, at most 1, of the likelihood of tags whose surveyed positions have standard deviations ``sigmas``
-    (T,) [m].
+    """Return the exponent, at most 1, of the likelihood of tags whose surveyed positions have standard deviations
+    ``sigmas`` (T,) [m].
 
-    The survey error of a tag is the same in all its reads, so it does not average out. Driving past a tag determines the pose
-    with the variance :data:`PASS_SIGMA` squared. With an inexact survey the variance is the sum of both.
+    The survey error of a tag is the same in all its reads, so it does not average out. Driving past a tag determines
+    the pose with the variance :data:`PASS_SIGMA` squared. With an inexact survey the variance is the sum of both.
     """
     counted = np.where(sigmas > EXACT * PASS_SIGMA, sigmas, 0.0)
     return float(np.mean(1.0 / (1.0 + (counted / PASS_SIGMA) ** 2))) if len(sigmas) else 1.0
@@ -53,8 +53,8 @@ def trust(sigmas: Array) -> float:
 @dataclass(frozen=True, eq=False)
 class TagMap:
     """The T tags of a map. ``names``: their EPCs. ``tags``: positions and facings in the world frame, after the survey
-    transform. ``index``: the index of each EPC. ``sigmas`` (T,): standard deviations [m] of the surveyed positions along an
-    axis."""
+    transform. ``index``: the index of each EPC. ``sigmas`` (T,): standard deviations [m] of the surveyed positions
+    along an axis."""
 
     names: tuple[str, ...]
     tags: TagArray
@@ -63,8 +63,8 @@ class TagMap:
 
 
 def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
-    """Return the tags of a map, or only the tags with an EPC in ``names``. ``survey``: the transform from the survey to the
-    world."""
+    """Return the tags of a map, or only the tags with an EPC in ``names``. ``survey``: the transform from the survey to
+    the world."""
     chosen = {name: tag for name, tag in world.tags.items() if names is None or name in names}
     points = np.array([(tag.x, tag.y, tag.z) for tag in chosen.values()]).reshape(-1, 3)
     facing = np.array([np.nan if tag.facing is None else tag.facing for tag in chosen.values()])
@@ -80,8 +80,8 @@ MARGIN_OF_TAGS = 3.0  # m; largest distance of the robot from the bounding box o
 
 
 def extent(world: World, tags: TagArray) -> Array:
-    """Return the area where the robot may be, as lower and upper corner (2, 2) [m]: the bounding box of walls and tags with a
-    margin. Both corners are zero without walls and tags."""
+    """Return the area where the robot may be, as lower and upper corner (2, 2) [m]: the bounding box of walls and tags
+    with a margin. Both corners are zero without walls and tags."""
     ends = np.array(world.walls).reshape(-1, 2)
     margin = MARGIN if len(ends) else MARGIN_OF_TAGS
     points = np.concatenate((ends, tags.points[:, :2])) if len(tags.points) else ends
@@ -100,8 +100,8 @@ class TagEvidence:
     """The evidence of a scan on the states of tags: as surveyed, weak, moved or dead.
 
     ``tags`` (U,): indices in the map. ``log_likelihoods`` (U, S): log-likelihoods of the scan's reads and misses for S
-    hypotheses of each tag's state, see :meth:`~factors.rfid.tag_states.TagStates.expect`. ``is_read`` (U,): True for tags that
-    the scan read.
+    hypotheses of each tag's state, see :meth:`~factors.rfid.tag_states.TagStates.expect`. ``is_read`` (U,): True for
+    tags that the scan read.
     """
 
     tags: Integers
@@ -146,11 +146,11 @@ class KnownTags:
             self.likelihood = self.likelihood.tempered(new)
 
     def read_counts(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
-        """Return reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time. Returns
-        None if the map has no tags or no antenna is known.
+        """Return reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time.
+        Returns None if the map has no tags or no antenna is known.
 
-        ``twist`` (3,): velocity of the robot. ``count``: False if the scan will be processed again. Ignored reads are not
-        counted then.
+        ``twist`` (3,): velocity of the robot. ``count``: False if the scan will be processed again. Ignored reads are
+        not counted then.
         """
         diagnostics = self._diagnostics if count else Diagnostics()
         if self._excluded:
@@ -193,8 +193,8 @@ class KnownTags:
     def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
         """Return the evidence of reads and misses ``counts`` on the states of tags in range.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the predicted pose of the robot. ``parameters`` (Q,): estimated
-        parameters of the likelihood.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the predicted pose of the robot. ``parameters`` (Q,):
+        estimated parameters of the likelihood.
         """
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
@@ -216,8 +216,8 @@ class KnownTags:
         )
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
-        """Update the states of tags by the evidence of a scan at ``t`` [s]. Misses are used at once. Reads are used after
-        :data:`CONFIRMED` seconds."""
+        """Update the states of tags by the evidence of a scan at ``t`` [s]. Misses are used at once. Reads are used
+        after :data:`CONFIRMED` seconds."""
         is_read, tags, log_likelihoods = evidence.is_read, evidence.tags, evidence.log_likelihoods
         self.states.learn(t, tags[~is_read], log_likelihoods[~is_read])
         self._waiting.append((t, tags[is_read], log_likelihoods[is_read]))
@@ -242,8 +242,8 @@ class KnownTags:
             self._diagnostics.doubted[f"{state}_tags"] = dict(zip(names, tags.values(), strict=True))
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
-        """Return three lists: the row in the read counts of each active antenna in ``names``, and the antenna index and the
-        number of rounds of each row. The row is -1 for an unknown or dead antenna.
+        """Return three lists: the row in the read counts of each active antenna in ``names``, and the antenna index and
+        the number of rounds of each row. The row is -1 for an unknown or dead antenna.
 
         The result is cached, because consecutive scans have the same antennas.
         """
@@ -257,8 +257,8 @@ class KnownTags:
         return self._rounds[names]
 
     def places(self, m: RfidScan) -> tuple[Integers, Integers]:
-        """Return the antenna index and the tag index of each read of a scan. An index is -1 if the rig or the map lacks the
-        element. A tag that is probably dead, weak or moved also has -1."""
+        """Return the antenna index and the tag index of each read of a scan. An index is -1 if the rig or the map lacks
+        the element. A tag that is probably dead, weak or moved also has -1."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
         tags[(tags >= 0) & (self.states.odds[tags] > 0.0)] = -1
@@ -322,8 +322,8 @@ class TagSignals:
         return np.array([row[0] for row in self._of_window()])
 
     def phases(self, offsets: Array, pose: Array) -> RfidFactor | None:
-        """Return the phases of the current window as a factor on the robot's pose. Returns None if too few reads are near their
-        tags.
+        """Return the phases of the current window as a factor on the robot's pose. Returns None if too few reads are
+        near their tags.
 
         ``pose`` (3,): the predicted pose. ``offsets`` (R, 3): the robot's poses at the reads, relative to that pose.
         """

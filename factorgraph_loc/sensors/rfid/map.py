@@ -56,8 +56,8 @@ class TagsFile(ColumnMapping):
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """Return the section ``tags`` of a world file. If its ``content`` names a native table, or maps a foreign table, read the
-    tags from that table in ``folder``. ``source``: the world file for messages."""
+    """Return the section ``tags`` of a world file. If its ``content`` names a native table, or maps a foreign table,
+    read the tags from that table in ``folder``. ``source``: the world file for messages."""
     if isinstance(content, str):
         return read_tags(inside(folder, content, source))
     if isinstance(content, dict) and isinstance(content.get("file"), str):
@@ -67,8 +67,8 @@ def read_layer(content: Any, source: object, folder: Path) -> Any:
 
 
 def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
-    """Write tags as a table next to the world file ``base``, and return the name of the table. Returns None and writes nothing
-    if there are no tags, or if a tag has a covariance, which has no column."""
+    """Write tags as a table next to the world file ``base``, and return the name of the table. Returns None and writes
+    nothing if there are no tags, or if a tag has a covariance, which has no column."""
     if not tags or any(tag.covariance is not None for tag in tags.values()):
         return None
     write_tags(tags, base.with_name(base.name + TAGS_SUFFIX))
@@ -78,8 +78,8 @@ def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
 def read_tags(path: Path, mapping: TagsFile | None = None) -> dict[str, Tag]:
     """Read tags from a native table ``NAME.tags.csv``, or from a foreign table by a ``mapping``.
 
-    A native table has the columns epc, x, y, z, facing (may be empty) and optionally sigma. Raises InputError with file, row
-    and field for an invalid value or a duplicate EPC.
+    A native table has the columns epc, x, y, z, facing (may be empty) and optionally sigma. Raises InputError with
+    file, row and field for an invalid value or a duplicate EPC.
     """
     if mapping is None:
         cells, _ = read_cells(path, (TAGS,))

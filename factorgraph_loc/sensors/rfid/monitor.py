@@ -29,8 +29,8 @@ SILENT = 8.0  # log odds above which missing reads are attributed to a failure i
 
 
 class SilenceMonitor:
-    """Detects that no tag is read although reads are expected, because the reader or the tags have failed. Misses are then
-    without information, and would shift the estimate to an area without tags."""
+    """Detects that no tag is read although reads are expected, because the reader or the tags have failed. Misses are
+    then without information, and would shift the estimate to an area without tags."""
 
     REJECTED = "rfid: no tag read where some should be"
 
@@ -39,8 +39,8 @@ class SilenceMonitor:
         self.lasts = False  # True if the reader or the tags had failed at the last scan
 
     def add(self, reads: int, evidence: float) -> bool:
-        """Add a scan: its number of ``reads``, and its log-probability ``evidence`` at the predicted pose. Returns True during
-        a failure."""
+        """Add a scan: its number of ``reads``, and its log-probability ``evidence`` at the predicted pose. Returns True
+        during a failure."""
         self._evidence = 0.0 if reads else self._evidence + evidence
         self.lasts = self._evidence < -SILENT
         return self.lasts
@@ -49,8 +49,8 @@ class SilenceMonitor:
 class ScanMonitor:
     """Detects that scans are much less likely than expected on a correct track.
 
-    This is only a suspicion, because dead tags and a wrong map have the same effect. A search decides if there is a better
-    pose.
+    This is only a suspicion, because dead tags and a wrong map have the same effect. A search decides if there is a
+    better pose.
     """
 
     def __init__(self) -> None:
@@ -61,8 +61,8 @@ class ScanMonitor:
     def add(self, t: float, surprise: float, variance: float) -> None:
         """Add a scan at ``t`` [s]. Scans after ``t`` are discarded.
 
-        ``surprise``: its negative log-likelihood at the predicted pose minus the expected value. ``variance``: the variance of
-        ``surprise``.
+        ``surprise``: its negative log-likelihood at the predicted pose minus the expected value. ``variance``: the
+        variance of ``surprise``.
         """
         while self._scans and self._scans[-1][0] >= t:
             self._scans.pop()
@@ -77,8 +77,8 @@ class ScanMonitor:
             self.suspicious_since = None
 
     def accept(self) -> None:
-        """End the suspicion, because the track is correct and the model or the map is wrong. Later scans are expected to be as
-        unlikely as the last ones."""
+        """End the suspicion, because the track is correct and the model or the map is wrong. Later scans are expected
+        to be as unlikely as the last ones."""
         excess, _, count = self._sums()
         self._usual = excess / max(count, 1)
         self.suspicious_since = None
@@ -89,8 +89,8 @@ class ScanMonitor:
         self.suspicious_since = None
 
     def _sums(self) -> tuple[float, float, int]:
-        """Return sums over the scans of the last DURATION seconds: of ``surprise``, of ``variance`` (see :meth:`add`), and the
-        number of these scans."""
+        """Return sums over the scans of the last DURATION seconds: of ``surprise``, of ``variance`` (see :meth:`add`),
+        and the number of these scans."""
         excess, variance, count = 0.0, 0.0, 0
         for t, surprise, own in reversed(self._scans):
             if t <= self._scans[-1][0] - DURATION:
@@ -110,8 +110,8 @@ class ScanMonitor:
 
 
 class BurstMonitor:
-    """Estimates the overdispersion of reads: the number of correlated rounds that have the information of one independent
-    round.
+    """Estimates the overdispersion of reads: the number of correlated rounds that have the information of one
+    independent round.
 
     Reads and misses are correlated, for example behind a person. The number of reads in a block of time then varies more around
     its expectation than the number of independent reads. The overdispersion is the ratio of the two variances (McCullagh and
@@ -133,8 +133,8 @@ class BurstMonitor:
         return ratio if ratio > INDEPENDENT else 1.0
 
     def add(self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
-        """Add a scan, unless a scan of this time or later was added. ``measured``: its reads. ``reads``: observed and expected
-        reads of C tags. ``counts`` (C,): True for tags that are counted."""
+        """Add a scan, unless a scan of this time or later was added. ``measured``: its reads. ``reads``: observed and
+        expected reads of C tags. ``counts`` (C,): True for tags that are counted."""
         if t <= self._last:
             return
         self._last = t
@@ -212,8 +212,8 @@ class ReadGroups:
         _add(self.sums, antennas, rounds, reads.hits, reads.p, reads.distance, counts)
 
     def large(self, fewest: float = FEWEST) -> Integers:
-        """Return the indices of groups with at least ``fewest`` predicted reads. Antennas are only included if there are
-        several."""
+        """Return the indices of groups with at least ``fewest`` predicted reads. Antennas are only included if there
+        are several."""
         count = len(self.sums[1]) if len(self.antennas) > 1 else BANDS
         return np.flatnonzero(self.sums[1, :count] >= fewest)
 
@@ -223,8 +223,8 @@ class ReadGroups:
         return [(bands + [f"antenna {name}" for name in self.antennas])[g] for g in groups.tolist()]
 
     def shares(self, groups: Integers) -> str:
-        """Return a text with the ratios of observed to predicted reads of groups. Groups with the largest errors, in standard
-        deviations, come first."""
+        """Return a text with the ratios of observed to predicted reads of groups. Groups with the largest errors, in
+        standard deviations, come first."""
         observed, predicted, variance = self.sums[:, groups]
         worst = np.argsort(-np.abs(observed - predicted) / np.sqrt(variance), kind="stable")[:SHOWN]
         names = self.names(groups[worst])
@@ -234,9 +234,9 @@ class ReadGroups:
 class ConsistencyMonitor:
     """Tests if recent reads agree with the detection models. ``doubted``: True while they do not.
 
-    Observed and predicted reads are compared by bands of distance, and by antennas, with a chi-square test each. Groups with
-    few predicted reads are merged, far bands with nearer ones. The model is doubted if a test fails, and if the errors exceed
-    the fraction :data:`DIFFERENT` of the predicted reads.
+    Observed and predicted reads are compared by bands of distance, and by antennas, with a chi-square test each. Groups
+    with few predicted reads are merged, far bands with nearer ones. The model is doubted if a test fails, and if the
+    errors exceed the fraction :data:`DIFFERENT` of the predicted reads.
     """
 
     def __init__(self, antennas: Sequence[str]) -> None:
@@ -247,9 +247,9 @@ class ConsistencyMonitor:
     def add(
         self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], overdispersion: float
     ) -> None:
-        """Add a scan, unless a scan of this time or later was added. ``measured``: its reads. ``reads``: observed and expected
-        reads. ``counts`` (K, C): True for reads that are counted. ``overdispersion``: the number of correlated rounds that
-        count as one."""
+        """Add a scan, unless a scan of this time or later was added. ``measured``: its reads. ``reads``: observed and
+        expected reads. ``counts`` (K, C): True for reads that are counted. ``overdispersion``: the number of correlated
+        rounds that count as one."""
         if t <= self._last:
             return
         forgotten = math.exp((self._last - t) / WINDOW)
@@ -302,8 +302,8 @@ def _add(
     distance: Array,
     counts: NDArray[np.bool_],
 ) -> None:
-    """Add reads of C tags by K ``antennas`` to the ``sums`` of :class:`ReadGroups`. ``hits``, ``p``, ``distance``, ``counts``
-    (K, C)."""
+    """Add reads of C tags by K ``antennas`` to the ``sums`` of :class:`ReadGroups`. ``hits``, ``p``, ``distance``,
+    ``counts`` (K, C)."""
     for k in range(len(antennas)):
         for c in range(p.shape[1]):
             if counts[k, c]:

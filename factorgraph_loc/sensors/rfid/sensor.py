@@ -43,8 +43,8 @@ SILENT = "no tag is read where some should be"
 class TagObservation:
     """An observation of RFID reads: of reads and misses, of signal strengths, or of phases.
 
-    ``factor``: the likelihood, which depends on the pose and on estimated parameters of the detection models. ``found``: number
-    of reads. ``blocks``: the name of the block of the estimated parameters, or ().
+    ``factor``: the likelihood, which depends on the pose and on estimated parameters of the detection models.
+    ``found``: number of reads. ``blocks``: the name of the block of the estimated parameters, or ().
     """
 
     t: float
@@ -92,8 +92,8 @@ class TagObservation:
         columns: Mapping[str, slice],
         iterations: int = 1,
     ) -> Correction:
-        """Correct the pose and the estimated parameters by Fisher scoring. Other components of the state are corrected through
-        their correlation."""
+        """Correct the pose and the estimated parameters by Fisher scoring. Other components of the state are corrected
+        through their correlation."""
         at, prior = [0, 1, 2], NO_VALUES
         for name in self.blocks:  # there is at most one block
             at, prior = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
@@ -119,9 +119,9 @@ class TagObservation:
 class TagSensor(Sensor):
     """The RFID sensor, bound to a run.
 
-    Each scan yields an observation of reads and misses, and one of signal strengths. Once per second, the recent phases yield
-    another one. Missing reads by a failure of the reader (:class:`.SilenceMonitor`) are no evidence. A search for the pose only
-    uses reads and misses, because strength and phase have multimodal likelihoods.
+    Each scan yields an observation of reads and misses, and one of signal strengths. Once per second, the recent phases
+    yield another one. Missing reads by a failure of the reader (:class:`.SilenceMonitor`) are no evidence. A search for
+    the pose only uses reads and misses, because strength and phase have multimodal likelihoods.
     """
 
     modality = "rfid"
@@ -201,8 +201,8 @@ class TagSensor(Sensor):
         return True
 
     def _count(self, observation: TagObservation, view: View) -> None:
-        """Compare reads and misses with their expectation. Adapt the tempering to their correlation, exclude dead antennas, and
-        report models that contradict the reads."""
+        """Compare reads and misses with their expectation. Adapt the tempering to their correlation, exclude dead
+        antennas, and report models that contradict the reads."""
         assert isinstance(observation.factor.reads, TagReadCounts)
         t, measured, states = observation.t, observation.factor.reads, self.tags.states
         reads = self.tags.likelihood.expected(view.pose, measured, self._estimated(view))
@@ -237,8 +237,8 @@ class TagSensor(Sensor):
         return out
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
-        """False if the reader or the tags have failed at the scan of this ``observation``. ``evidence``: log-probability of the
-        scan at the predicted pose."""
+        """False if the reader or the tags have failed at the scan of this ``observation``. ``evidence``:
+        log-probability of the scan at the predicted pose."""
         # a scan without reads that is processed again after a late measurement counts only once
         if observation.found or observation.t > self._heard:
             lasted = self._silence.lasts
@@ -289,9 +289,9 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return the factor without tags that are clearly dead, weak or moved. The probability that another tag is dead, weak or
-        moved remains that from before the scan, because a scan must not be used twice. Returns None for phases if ``width`` is
-        above 1, because phases have local optima centimetres apart."""
+        """Return the factor without tags that are clearly dead, weak or moved. The probability that another tag is
+        dead, weak or moved remains that from before the scan, because a scan must not be used twice. Returns None for
+        phases if ``width`` is above 1, because phases have local optima centimetres apart."""
         factor = cast(RfidFactor, factor)
         if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None
@@ -312,8 +312,8 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength or phase,
-    but the rig has no model of it."""
+    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength
+    or phase, but the rig has no model of it."""
     settings, sensors = binding.setup.rig.rfid, binding.setup.sensors
     signals = [signal for signal in ("rssi", "phase") if signal in sensors]
     for signal in signals:

@@ -27,8 +27,8 @@ Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
 class PriorSettings(FileModel):
-    """Standard deviations of the parameters of a detection model before a run (:mod:`factors.rfid.parameters`). Every estimator
-    that uses tags estimates a parameter if its value is above 0."""
+    """Standard deviations of the parameters of a detection model before a run (:mod:`factors.rfid.parameters`). Every
+    estimator that uses tags estimates a parameter if its value is above 0."""
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
     """standard deviation of the logarithm of the model's range"""
@@ -37,9 +37,9 @@ class PriorSettings(FileModel):
 
 
 class RfidUncertainty(FileModel):
-    """Standard deviations of mounting and clock before a run. A constant is estimated if its value is above 0. Defaults are
-    proportional to the largest `prior.range_scale` of the models, because a calibration of the models also calibrates the
-    mounting."""
+    """Standard deviations of mounting and clock before a run. A constant is estimated if its value is above 0. Defaults
+    are proportional to the largest `prior.range_scale` of the models, because a calibration of the models also
+    calibrates the mounting."""
 
     yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
     """standard deviation of a yaw that all antennas share; by default 0.35 times range_scale"""
@@ -134,8 +134,8 @@ class RssiSettings(FileModel):
     """A model of the signal strength of reads. See :class:`factors.rfid.signals.RssiModel`."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
-    """coefficients of the RSSI [dBm] for the features 1, -10 log10 of the distance, w, w^2, c and c^2; w is 1 minus the cosine
-    of the bearing, c is the cosine of the facing"""
+    """coefficients of the RSSI [dBm] for the features 1, -10 log10 of the distance, w, w^2, c and c^2; w is 1 minus the
+    cosine of the bearing, c is the cosine of the facing"""
     sigma: Annotated[float, Field(ge=0.01, le=30.0), InUnit("dB")]
     """scale of the Student-t noise"""
     dof: Annotated[float, Field(ge=0.1, le=1000.0)]
@@ -149,8 +149,8 @@ class RssiSettings(FileModel):
 
 
 class PhaseSettings(FileModel):
-    """A model of the phase of reads in windows of time. See :class:`factors.rfid.signals.PhaseModel`. Windows may overlap, so
-    reads have the weight ``step`` / ``window``."""
+    """A model of the phase of reads in windows of time. See :class:`factors.rfid.signals.PhaseModel`. Windows may
+    overlap, so reads have the weight ``step`` / ``window``."""
 
     kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
     """concentration of the phases (parameter of the von Mises distribution)"""
@@ -276,8 +276,8 @@ class RfidSettings(SensorSettings):
         return {name: share * largest for name, share in BY_RANGE.items()} | given
 
     def parameter_names(self) -> dict[str, tuple[str, ...]]:
-        """Return the names of the parameters of each detection model that an antenna uses. If antennas use several models,
-        names have the prefix ``MODEL.``."""
+        """Return the names of the parameters of each detection model that an antenna uses. If antennas use several
+        models, names have the prefix ``MODEL.``."""
         used = {antenna.model for antenna in self.all_antennas().values()}
         prefixes = {model: "" if len(used) == 1 else f"{model}." for model in self.models if model in used}
         return {model: tuple(prefix + name for name in OF_MODEL) for model, prefix in prefixes.items()}
@@ -326,8 +326,8 @@ LARGEST = 20.0  # largest logit of a knot; the probability is then 0 or 1 to nin
 
 
 def read_grid(path: str | Path) -> GridModel:
-    """Read a detection grid from an .npz file. Infinite logits are clipped. Raises InputError with the array that is missing,
-    or whose shape or values are invalid."""
+    """Read a detection grid from an .npz file. Infinite logits are clipped. Raises InputError with the array that is
+    missing, or whose shape or values are invalid."""
     arrays = _read_arrays(Path(path))
     logits, origin, heights = arrays["logits"], arrays["origin"], np.atleast_1d(arrays["heights"])
     if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):

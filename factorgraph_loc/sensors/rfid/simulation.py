@@ -109,8 +109,8 @@ Hits = NDArray[np.bool_]
 
 
 def read_probabilities(likelihood: RfidLikelihood, poses: Array) -> Array:
-    """Return the probabilities (N, A, T) that one round of each of A antennas at ``poses`` (N, 3) reads each of T tags. They
-    include the probability of false reads."""
+    """Return the probabilities (N, A, T) that one round of each of A antennas at ``poses`` (N, 3) reads each of T tags.
+    They include the probability of false reads."""
     antennas = range(len(likelihood.model.antennas))
     return np.stack([likelihood.probabilities(poses, a) for a in antennas], axis=1)
 
@@ -130,11 +130,11 @@ def draw_reads(
 ) -> Hits:
     """Draw the reads of A antennas and T tags in rounds at ``times`` (N,). Returns a mask (N, A, T) that is True for reads.
 
-    ``probabilities`` (N, A, T): the probability of a read without faults. ``faults``: faults of the map and of the clock are not
-    simulated here, all others are.
-    ``dead``: indices of tags that are never read. In a fade a tag has only false reads. Outside of fades the probability is
-    higher, so that its mean is that of ``probabilities``. This is possible if the rig's ``miss`` is at least the fraction of
-    time in fades.
+    ``probabilities`` (N, A, T): the probability of a read without faults. ``faults``: faults of the map and of the
+    clock are not simulated here, all others are.
+    ``dead``: indices of tags that are never read. In a fade a tag has only false reads. Outside of fades the
+    probability is higher, so that its mean is that of ``probabilities``. This is possible if the rig's ``miss`` is at
+    least the fraction of time in fades.
     """
     shape = probabilities.shape
     share = faults.fading.share
@@ -160,8 +160,8 @@ def rfid_stream(
 ) -> RfidStream:
     """Return the stream of the reads ``hits`` (N, A, T), a mask, of antennas ``names`` (A) and tags ``epcs`` (T).
 
-    All antennas end a round at each of ``times`` (N,) [s], which are also the times of the reads. ``signals``: values (N, A, T)
-    of rssi, phase and frequency, if they are simulated.
+    All antennas end a round at each of ``times`` (N,) [s], which are also the times of the reads. ``signals``: values
+    (N, A, T) of rssi, phase and frequency, if they are simulated.
     """
     listened = np.ones(hits.shape[:2], dtype=bool)
     stop = faults.antenna_stop
@@ -190,8 +190,8 @@ def rfid_stream(
 def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.Generator) -> Hits:
     """Simulate fades at ``times`` (N,). Returns a mask (N, A, T) that is True while a tag is in a fade for an antenna.
 
-    ``shape``: (A, T). Each pair has a stationary Markov chain of two states (Gilbert, Bell System Technical Journal 39, 1960).
-    Fades end with the rate 1 / ``duration``, and begin with the rate that results in the fraction ``share``.
+    ``shape``: (A, T). Each pair has a stationary Markov chain of two states (Gilbert, Bell System Technical Journal 39,
+    1960). Fades end with the rate 1 / ``duration``, and begin with the rate that results in the fraction ``share``.
     """
     out = np.empty((len(times), *shape), dtype=bool)
     rate = 1.0 / (fading.duration * (1.0 - fading.share))
@@ -206,8 +206,8 @@ def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.
 
 
 def _false(count: int, share: float, shape: tuple[int, ...], rng: np.random.Generator) -> Hits:
-    """Return random false reads as a mask of this ``shape`` (N, A, T). Their expected fraction of all reads is ``share``, if
-    there are ``count`` true reads."""
+    """Return random false reads as a mask of this ``shape`` (N, A, T). Their expected fraction of all reads is
+    ``share``, if there are ``count`` true reads."""
     out = np.zeros(shape, dtype=bool)
     size = out.size
     extra = min(rng.poisson(count * share / (1.0 - share)), size)
@@ -223,8 +223,8 @@ def strengths(
     settings: SimulatedRssiSettings,
     rng: np.random.Generator,
 ) -> Array:
-    """Simulate the RSSI (N, A, T) [dBm] of the reads ``hits`` (N, A, T), a mask, at robot ``poses`` (N, 3). It is NaN without a
-    read. The model is that of :mod:`factors.rfid.signals`."""
+    """Simulate the RSSI (N, A, T) [dBm] of the reads ``hits`` (N, A, T), a mask, at robot ``poses`` (N, 3). It is NaN
+    without a read. The model is that of :mod:`factors.rfid.signals`."""
     n, a, tag = np.nonzero(hits)
     reads = RssiReads(poses[n], a, tag, np.full(len(n), np.nan))
     features = strength_features(rfid.model().antennas, tags, np.zeros(3), reads)
@@ -238,8 +238,8 @@ def phases(
 ) -> Array:
     """Simulate the phase (N, A, T) in [0, 2 pi) of a read of each tag by each antenna at robot ``poses`` (N, 3).
 
-    The phase is ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4), with frequency f, distance d and speed of
-    light c. The offset is random for each antenna and tag. Noise is added, and pi for a fraction of the reads.
+    The phase is ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4), with frequency f, distance d and
+    speed of light c. The offset is random for each antenna and tag. Noise is added, and pi for a fraction of the reads.
     """
     at = np.array([(antenna.x, antenna.y, antenna.z) for antenna in rfid.all_antennas().values()])
     planar = se2.transform_from(poses[:, None], at[None, :, :2])[:, :, None] - tags.points[:, :2]
@@ -253,8 +253,8 @@ def phases(
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the reads of a simulated drive with all faults, the surveyed map, and metadata that lists dead and misplaced
-    tags."""
+    """Return the reads of a simulated drive with all faults, the surveyed map, and metadata that lists dead and
+    misplaced tags."""
     settings, rfid, rng = ride.settings, ride.rig.of(RfidSettings), ride.rng("reads")
     tags = tag_map(ride.world, ride.rig.of(SurveySettings))
     times = ride.times(settings.rounds_per_second)
@@ -280,8 +280,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"tags": the number of simulated chances to read a tag per second}. Raises ValueError if the rig has no RFID
-    reader, or if a fault names an unknown antenna."""
+    """Return {"tags": the number of simulated chances to read a tag per second}. Raises ValueError if the rig has no
+    RFID reader, or if a fault names an unknown antenna."""
     if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no rfid, expected antennas")
     stop, names = settings.faults.antenna_stop, list(settings.rig.of(RfidSettings).all_antennas())

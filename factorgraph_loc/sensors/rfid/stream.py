@@ -73,11 +73,11 @@ READS = Table(
 class RfidScan:
     """Inventory rounds of A antennas that ended at the time ``t`` [s], with R tag reads.
 
-    ``antennas``: the names of the active antennas. A name occurs twice for an antenna with two rounds. All active antennas have
-    missed the tags of the map that were not read.
-    ``antenna`` (R,): index of each read's antenna in ``antennas``. ``tags``: R EPCs. ``age`` (R,): time [s] from the read to
-    ``t``. ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, ``frequency`` (R,) of the carrier [Hz]: NaN if
-    unknown.
+    ``antennas``: the names of the active antennas. A name occurs twice for an antenna with two rounds. All active
+    antennas have missed the tags of the map that were not read.
+    ``antenna`` (R,): index of each read's antenna in ``antennas``. ``tags``: R EPCs. ``age`` (R,): time [s] from the
+    read to ``t``. ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, ``frequency`` (R,) of the carrier
+    [Hz]: NaN if unknown.
     """
 
     sensor: ClassVar[str] = "rfid"
@@ -103,9 +103,9 @@ class RfidScan:
 class RfidStream(Stream):
     """All reads of a log, one per row. A round without reads has one row with an empty EPC. Rows of one timestamp form a scan.
 
-    ``t`` (N,): end of the inventory round [s]. ``round`` (N,): number of the round, unique within a timestamp. ``antenna``,
-    ``epc``: N names. ``age`` (N,): time [s] from the read to ``t``. ``rssi`` (N,) [dBm], ``phase`` (N,) [rad], ``frequency``
-    (N,) [Hz]: NaN if unknown.
+    ``t`` (N,): end of the inventory round [s]. ``round`` (N,): number of the round, unique within a timestamp.
+    ``antenna``, ``epc``: N names. ``age`` (N,): time [s] from the read to ``t``. ``rssi`` (N,) [dBm], ``phase`` (N,)
+    [rad], ``frequency`` (N,) [Hz]: NaN if unknown.
     """
 
     kind: ClassVar[type[Any]] = RfidScan
@@ -178,8 +178,8 @@ class RfidRead:
 
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
-    """Return a scan of rounds of ``antennas`` that ended at ``t`` [s]. Raises InputError if a read is invalid, or if its
-    antenna or its round is not in the scan."""
+    """Return a scan of rounds of ``antennas`` that ended at ``t`` [s]. Raises InputError if a read is invalid, or if
+    its antenna or its round is not in the scan."""
     t = values.seconds_of("RfidScan", t)
     where = f"RfidScan at {t:.3f} s"
     antenna_names = values.names(where, "antennas", values.items_of(where, "antennas", antennas))
@@ -204,8 +204,8 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
 def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
     """Return the index (R,) of the round of each read. ``times``: times of the reads [s]. ``names``: the antenna of each round.
 
-    A read without a given round belongs to the first round of its antenna that has no read of the tag yet, in order of time. If
-    all rounds of the antenna have one, it belongs to the last round.
+    A read without a given round belongs to the first round of its antenna that has no read of the tag yet, in order of
+    time. If all rounds of the antenna have one, it belongs to the last round.
     """
     own = {name: [k for k, other in enumerate(names) if other == name] for name in names}
     out = np.full(len(reads), -1, dtype=np.int64)
@@ -229,8 +229,8 @@ def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: S
 
 
 def check(m: RfidScan, where: str) -> dict[str, Any]:
-    """Return the validated fields of a scan. Raises InputError with the first invalid field. ``where``: the scan's name in
-    messages."""
+    """Return the validated fields of a scan. Raises InputError with the first invalid field. ``where``: the scan's name
+    in messages."""
     tags, antennas = values.names(where, "tags", m.tags), values.names(where, "antennas", m.antennas)
     antenna = values.integers(where, PLACE, m.antenna, len(tags))
     if np.any((antenna < 0) | (antenna >= len(antennas))):
@@ -246,9 +246,9 @@ def along_reference(
 ) -> tuple[RfidStream, Integers, Array, Array, Integers, Integers]:
     """Return the R reads of known tags by known antennas within the reference of a log.
 
-    ``tags``, ``antennas``: the index of each EPC and of each antenna name. Returns the stream, the row indices (R,) of the
-    reads, their times (R,) [s], the robot's poses (R, 3), the antenna indices (R,), and the tag indices (R,). Raises InputError
-    if the log has no reference or no reads.
+    ``tags``, ``antennas``: the index of each EPC and of each antenna name. Returns the stream, the row indices (R,) of
+    the reads, their times (R,) [s], the robot's poses (R, 3), the antenna indices (R,), and the tag indices (R,).
+    Raises InputError if the log has no reference or no reads.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference trajectory, expected one for calibration")
@@ -269,8 +269,8 @@ def phase_reads(
     """Return the reads with a phase along the reference of a log, in windows of ``window`` seconds, numbered from
     ``first_window``.
 
-    The poses of the reads are in the world frame. ``tags``, ``antennas``: the index of each EPC and of each antenna name.
-    Raises InputError like :func:`along_reference`.
+    The poses of the reads are in the world frame. ``tags``, ``antennas``: the index of each EPC and of each antenna
+    name. Raises InputError like :func:`along_reference`.
     """
     stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
     windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)

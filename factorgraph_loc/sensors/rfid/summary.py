@@ -42,8 +42,8 @@ UNKNOWN_ANTENNA = "antenna {antenna} is not on the rig: {reads} reads, {rounds} 
 class AntennaSummary:
     """A summary of one antenna in a log.
 
-    ``reads``, ``rounds``: their numbers. ``rate``: rounds per second. ``silent``: number of rounds without reads. ``last``,
-    ``last_read``: timestamps [s] of the last round and of the last read, which is None without reads.
+    ``reads``, ``rounds``: their numbers. ``rate``: rounds per second. ``silent``: number of rounds without reads.
+    ``last``, ``last_read``: timestamps [s] of the last round and of the last read, which is None without reads.
     """
 
     reads: int
@@ -58,9 +58,9 @@ class AntennaSummary:
 class RfidSummary:
     """A summary of all reads of a log. ``reads``, ``scans``, ``rounds``: their numbers. ``antennas``: a summary of each by name.
 
-    ``known``: number of tags of the map that are read. ``unread``: tags of the map that are never read. ``unknown``: number of
-    reads of each EPC that the map lacks. ``late``: number of rounds with an earlier timestamp than a previous one, and the
-    largest step back [s].
+    ``known``: number of tags of the map that are read. ``unread``: tags of the map that are never read. ``unknown``:
+    number of reads of each EPC that the map lacks. ``late``: number of rounds with an earlier timestamp than a previous
+    one, and the largest step back [s].
     """
 
     reads: int
@@ -255,8 +255,8 @@ def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
 
 
 def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings about estimated yaws of antennas and a time offset that clearly differ from the rig, with the settings
-    that correct them."""
+    """Yield warnings about estimated yaws of antennas and a time offset that clearly differ from the rig, with the
+    settings that correct them."""
     common, turned = learnt.values.get("rfid.yaw", (0.0, 0.0)), dict[str, float]()
     for name in settings.all_antennas():
         own = learnt.values.get(f"rfid.antennas.{name}.yaw", (0.0, 0.0))
@@ -287,8 +287,8 @@ TOGETHER = 2.0  # a warning is given if the overdispersion exceeds this multiple
 class _Trials:
     """M trials: in each, one antenna could read one tag in one round.
 
-    ``p`` (M,): predicted probability of a read. ``hit`` (M,): 1 for a read, otherwise 0. ``antenna``, ``tag`` (M,): indices.
-    ``block`` (M,): number of the block of time. ``distance`` (M,): distance of antenna and tag [m].
+    ``p`` (M,): predicted probability of a read. ``hit`` (M,): 1 for a read, otherwise 0. ``antenna``, ``tag`` (M,):
+    indices. ``block`` (M,): number of the block of time. ``distance`` (M,): distance of antenna and tag [m].
     """
 
     p: Array
@@ -300,11 +300,11 @@ class _Trials:
 
 
 def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Review:
-    """Compare the reads of a run with its estimated detection models, along its ``final`` trajectory. Returns the reliability and
-    warnings. ``diagnostics``: those of the final trajectory. ``learnt``: the estimated parameters.
+    """Compare the reads of a run with its estimated detection models, along its ``final`` trajectory. Returns the
+    reliability and warnings. ``diagnostics``: those of the final trajectory. ``learnt``: the estimated parameters.
 
-    The result is empty without reads, antennas or covariances. Tags that are probably dead, and times without reads, are
-    omitted. Tags that seem to have moved are not omitted, because a wrong model has the same effect on many tags.
+    The result is empty without reads, antennas or covariances. Tags that are probably dead, and times without reads,
+    are omitted. Tags that seem to have moved are not omitted, because a wrong model has the same effect on many tags.
     """
     log, settings = use.log, use.log.rig.find(RfidSettings)
     stream = log.streams.get("rfid")
@@ -345,9 +345,9 @@ def _observed(
 
 
 def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -> Review:
-    """Count observed and predicted reads of ``trials`` by bands of distance and by ``antennas``. Returns the reliability and
-    warnings. The result is empty if there are too few predicted reads. ``log``: the name of the log. ``tempering``: the rig's
-    exponent of the likelihood."""
+    """Count observed and predicted reads of ``trials`` by bands of distance and by ``antennas``. Returns the
+    reliability and warnings. The result is empty if there are too few predicted reads. ``log``: the name of the log.
+    ``tempering``: the rig's exponent of the likelihood."""
     if trials.p.sum() < FEWEST:
         return Review()
     groups = ReadGroups(antennas)
@@ -378,8 +378,8 @@ def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -
 
 
 def _overdispersion(trials: _Trials, band: Integers) -> float:
-    """Return the overdispersion (:func:`.overdispersion`) of trials, after the probabilities are scaled to the observed reads
-    in each band of distance. ``band`` (M,): number of each trial's band."""
+    """Return the overdispersion (:func:`.overdispersion`) of trials, after the probabilities are scaled to the observed
+    reads in each band of distance. ``band`` (M,): number of each trial's band."""
     share = np.ones(int(band.max(initial=0)) + 1)
     predicted, observed = np.bincount(band, trials.p), np.bincount(band, trials.hit)
     np.divide(observed, predicted, out=share, where=predicted > 0.0)

@@ -1,9 +1,9 @@
-"""Reads and writes the RFID tables of the native format: ``rfid.csv`` with a row per read, ``inventories.csv`` with a row per
-round.
+"""Reads and writes the RFID tables of the native format: ``rfid.csv`` with a row per read, ``inventories.csv`` with a
+row per round.
 
-A read belongs to the round that it names, or to the round of its antenna that contains its timestamp. Without inventories,
-rounds are derived from the gaps between reads, and rounds without reads are unknown. Misses are as informative as reads, so
-each read must be assigned to the correct round.
+A read belongs to the round that it names, or to the round of its antenna that contains its timestamp. Without
+inventories, rounds are derived from the gaps between reads, and rounds without reads are unknown. Misses are as
+informative as reads, so each read must be assigned to the correct round.
 """
 
 from collections.abc import Mapping, Sequence
@@ -124,8 +124,8 @@ def read_rounds(
 ) -> ReadsByRound:
     """Return the reads in their rounds. Without ``inventories``, a ``gap`` [s] between reads separates rounds.
 
-    Reads outside of every inventory are skipped with a warning. Raises InputError with file, row and field for an invalid
-    value.
+    Reads outside of every inventory are skipped with a warning. Raises InputError with file, row and field for an
+    invalid value.
     """
     if inventories is not None:
         return _from_inventories(reads, inventories, warnings)
@@ -174,8 +174,8 @@ def _require_all(inventories: TableRows) -> None:
 
 
 def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
-    """Return the round index (N,) of each read from its column ``inventory``, a row number from 1 of the table of inventories.
-    Raises InputError if the row does not exist, has another antenna, or ends before the read."""
+    """Return the round index (N,) of each read from its column ``inventory``, a row number from 1 of the table of
+    inventories. Raises InputError if the row does not exist, has another antenna, or ends before the read."""
     named = reads.numbers["inventory"]
     with np.errstate(invalid="ignore"):
         bad = ~((named >= 1.0) & (named <= len(end_ns)) & (named == np.floor(named)))
@@ -192,8 +192,8 @@ def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Int
 
 
 def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> ReadsByRound:
-    """Return the selected ``rows`` of a table of reads with their round indices ``number``. ``end_ns`` (R,), ``antenna`` (R): end
-    [ns] and antenna of each round."""
+    """Return the selected ``rows`` of a table of reads with their round indices ``number``. ``end_ns`` (R,),
+    ``antenna`` (R): end [ns] and antenna of each round."""
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in SIGNALS)
@@ -201,8 +201,8 @@ def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers
 
 
 def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of both tables, in the order of the rounds. The written duration of a round is the time from its first
-    read to its end."""
+    """Return the columns of both tables, in the order of the rounds. The written duration of a round is the time from
+    its first read to its end."""
     number, first = stream.number, stream.first_rows
     end_ns = checks.absolute(stream.t, writing.t0_ns)
     age_ns = np.rint(stream.age * 1e9).astype(np.int64)

@@ -36,8 +36,8 @@ class RfidCalibrator(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return survey, mounting and models. With smoothed trajectories the survey is not estimated. Raises InputError if the
-        rig has no antennas or a log is too short."""
+        """Return survey, mounting and models. With smoothed trajectories the survey is not estimated. Raises InputError
+        if the rig has no antennas or a log is too short."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()
@@ -76,8 +76,8 @@ CALIBRATOR = RfidCalibrator()
 
 
 def field_figure(fit: RfidFit) -> Picture:
-    """Plot the probability of a read around the antenna: as observed, and by each detection model. A model with facing has a
-    plot for tags that face towards, across and away from the antenna."""
+    """Plot the probability of a read around the antenna: as observed, and by each detection model. A model with facing
+    has a plot for tags that face towards, across and away from the antenna."""
     facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in fit.models) else (0.0,)
     figure, axes = grid(len(fit.models), 1 + len(facings), 5.0 * len(fit.models))
     axis = np.arange(-VIEW, VIEW + 1e-9, STEP)

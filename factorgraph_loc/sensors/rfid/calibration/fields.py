@@ -37,9 +37,9 @@ MODEL_PAIRS = 40000  # number of pairs that is sufficient for a parametric model
 def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, floor: Floor) -> GridModel:
     """Fit a detection grid to the reads and misses of ``pairs``. Without data it equals the ``parametric`` model.
 
-    ``smoothness``: weight of squared second differences of logits. ``floor``: probabilities of false reads and misses. The grid
-    has an axis for height if the heights of ``pairs`` differ, and one for facing if the parametric model has it. The fitted
-    difference to the parametric model does not depend on the facing.
+    ``smoothness``: weight of squared second differences of logits. ``floor``: probabilities of false reads and misses.
+    The grid has an axis for height if the heights of ``pairs`` differ, and one for facing if the parametric model has
+    it. The fitted difference to the parametric model does not depend on the facing.
     """
     base = bake(parametric, EXTENT, CELL, _heights(pairs), FACINGS if parametric.uses_facing else 1)
     shape = (base.logits.shape[0], 1, *base.logits.shape[2:])
@@ -71,8 +71,8 @@ def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, flo
 
 
 def _heights(pairs: TagPairs) -> list[float]:
-    """Return the knots of a grid in height [m]: evenly spaced multiples of HEIGHT_STEP that cover nearly all ``pairs``, or a
-    single one if their heights are nearly equal."""
+    """Return the knots of a grid in height [m]: evenly spaced multiples of HEIGHT_STEP that cover nearly all ``pairs``,
+    or a single one if their heights are nearly equal."""
     low, high = np.quantile(pairs.points[:, 2], (0.01, 0.99)).tolist()
     if high - low < HEIGHT_STEP:
         return [round(0.5 * (low + high), 3)]
@@ -80,8 +80,8 @@ def _heights(pairs: TagPairs) -> list[float]:
 
 
 def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array:
-    """Return the interpolation matrix (M, number of knots) from the grid's logits to those at ``points`` (M, 3) with ``facing``
-    (M,)."""
+    """Return the interpolation matrix (M, number of knots) from the grid's logits to those at ``points`` (M, 3) with
+    ``facing`` (M,)."""
     shape, heights = grid.logits.shape, grid.heights
     axes = [
         knots.linear((points[:, 2] - heights[0]) / (heights[1] - heights[0] if len(heights) > 1 else 1.0), shape[0]),
@@ -98,8 +98,8 @@ def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array
 
 
 def _roughness(shape: Sequence[int]) -> sparse.csc_array:
-    """Return the matrix of a quadratic form: the sum of squared second differences along each axis of a grid of this ``shape``.
-    An axis with two knots has first differences."""
+    """Return the matrix of a quadratic form: the sum of squared second differences along each axis of a grid of this
+    ``shape``. An axis with two knots has first differences."""
     total = sparse.csc_array((int(np.prod(shape)),) * 2)
     for axis, size in enumerate(shape):
         if size < 2:
@@ -124,8 +124,8 @@ def _merged(pairs: TagPairs) -> TagPairs:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of detection model. ``name``: beam, logistic or grid. ``facing``: True if the model depends on the tags' facing.
-    ``own``: True if each antenna has its own model."""
+    """A kind of detection model. ``name``: beam, logistic or grid. ``facing``: True if the model depends on the tags'
+    facing. ``own``: True if each antenna has its own model."""
 
     name: str
     facing: bool = False
@@ -138,9 +138,9 @@ class Kind:
 
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
-    """Fit detection models of a ``kind`` to the reads and misses of ``pairs``. Returns the models, and the index of the model of
-    each of the ``antennas``, which is their number. If each antenna has its own model, an antenna without rounds has a model that
-    is fitted to all antennas. ``floor``: probabilities of false reads and misses."""
+    """Fit detection models of a ``kind`` to the reads and misses of ``pairs``. Returns the models, and the index of the
+    model of each of the ``antennas``, which is their number. If each antenna has its own model, an antenna without
+    rounds has a model that is fitted to all antennas. ``floor``: probabilities of false reads and misses."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     active = [a for a in range(antennas) if np.any(pairs.antenna == a)]
@@ -153,9 +153,9 @@ def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple
 def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tuple[Kind, dict[Kind, float]]:
     """Choose the kind of detection model that predicts held-out reads best. Returns it, and the score of each kind.
 
-    The score is the negative log-likelihood [nats per round] on folds of ``pairs`` that are held out. A more complex model must
-    be better than a simpler one by :data:`WORTH`. ``floor``: probabilities of false reads and misses. ``antennas``: their number.
-    ``facing``: True if the tags' facing is known.
+    The score is the negative log-likelihood [nats per round] on folds of ``pairs`` that are held out. A more complex
+    model must be better than a simpler one by :data:`WORTH`. ``floor``: probabilities of false reads and misses.
+    ``antennas``: their number. ``facing``: True if the tags' facing is known.
     """
     kinds = [Kind("beam"), Kind("logistic"), *([Kind("logistic", facing=True)] if facing else [])]
     if antennas > 1:
@@ -178,8 +178,8 @@ def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
 
 
 def _held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> float:
-    """Return the negative log-likelihood per round of all folds of ``pairs``, each with models of the ``kind`` that are fitted to
-    the other folds."""
+    """Return the negative log-likelihood per round of all folds of ``pairs``, each with models of the ``kind`` that are
+    fitted to the other folds."""
     total = 0.0
     for fold in np.unique(pairs.fold):
         models, which = fit(pairs.part(pairs.fold != fold), kind, floor, antennas)

@@ -1,9 +1,9 @@
 """Estimates RFID settings along trajectories: survey, mounting, detection models, tempering, and models of strength and phase.
 
-Along references all of these are estimated. Along smoothed trajectories only detection models and tempering are estimated. There
-the likelihood of the reads is averaged over possible poses (:func:`~factorgraph_loc.sensors.smoothed.possible_poses`), and models
-keep their kind. Beams and logistic models are fitted in all parameters, grids only in range and rate. The smoother itself estimates
-yaw and clock.
+Along references all of these are estimated. Along smoothed trajectories only detection models and tempering are
+estimated. There the likelihood of the reads is averaged over possible poses
+(:func:`~factorgraph_loc.sensors.smoothed.possible_poses`), and models keep their kind. Beams and logistic models are
+fitted in all parameters, grids only in range and rate. The smoother itself estimates yaw and clock.
 """
 
 import hashlib
@@ -69,8 +69,8 @@ BURSTS = 1.3  # a smaller overdispersion does not change the tempering
 class RfidFit:
     """Fitted detection models and their data.
 
-    ``models``: the models. ``which``: the index of the model of each antenna. ``antennas``: names of the antennas. ``kind``:
-    the kind of all models. ``pairs``: the reads and misses that they are fitted to.
+    ``models``: the models. ``which``: the index of the model of each antenna. ``antennas``: names of the antennas.
+    ``kind``: the kind of all models. ``pairs``: the reads and misses that they are fitted to.
     """
 
     models: tuple[DetectionModel, ...]
@@ -83,8 +83,8 @@ class RfidFit:
 def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = None) -> SensorKnowledge:
     """Estimate the RFID settings of a rig from ``logs`` with references.
 
-    Of logs with the same reads only one is used. ``grids``: path with name prefix of files for detection grids. ``kind``: the
-    kind of detection model, None to choose the best kind. Raises InputError if a log has too few rounds.
+    Of logs with the same reads only one is used. ``grids``: path with name prefix of files for detection grids.
+    ``kind``: the kind of detection model, None to choose the best kind. Raises InputError if a log has too few rounds.
     """
     logs = [log for i, log in enumerate(logs) if recordings(logs)[i] == i]
     settings = rig.of(RfidSettings)
@@ -156,8 +156,8 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
 def _mounted(
     traced: Sequence[Traced], settings: RfidSettings, initial: RfidSettings
 ) -> tuple[RfidSettings, list[FittedConstant]]:
-    """Return settings with the yaws of the antennas and the time offset that the smoother estimated, and these constants. A
-    constant that the logs do not determine keeps its initial value."""
+    """Return settings with the yaws of the antennas and the time offset that the smoother estimated, and these
+    constants. A constant that the logs do not determine keeps its initial value."""
     known, antennas, constants = initial.uncertainties(), dict(settings.all_antennas()), list[FittedConstant]()
     common = corrections_of("rfid.yaw", traced)
     for name, antenna in antennas.items():
@@ -179,8 +179,8 @@ def _mounted(
 def _mean(
     name: str, corrections: Sequence[tuple[float, float]], initial: float, value: float, prior: float
 ) -> FittedConstant | None:
-    """Return a constant that is the same in all logs: ``value`` plus the mean of its ``corrections``, each with a standard
-    deviation. It has the ``initial`` value if the logs do not determine it. Returns None without corrections.
+    """Return a constant that is the same in all logs: ``value`` plus the mean of its ``corrections``, each with a
+    standard deviation. It has the ``initial`` value if the logs do not determine it. Returns None without corrections.
     ``prior``: the standard deviation of the constant before the calibration."""
     if not corrections:
         return None
@@ -193,9 +193,9 @@ def _mean(
 def _refitted(
     pairs: TagPairs, initial: DetectionModel, name: str, floor: Floor
 ) -> tuple[DetectionModel, list[FittedConstant]] | None:
-    """Fit a detection model of the same kind as ``initial`` to ``pairs``. Returns the model and its parameters, or None if the
-    model is a beam and ``pairs`` do not determine it. ``name``: the name of the model. ``floor``: probabilities of false reads and
-    misses."""
+    """Fit a detection model of the same kind as ``initial`` to ``pairs``. Returns the model and its parameters, or None
+    if the model is a beam and ``pairs`` do not determine it. ``name``: the name of the model. ``floor``: probabilities
+    of false reads and misses."""
     family = family_of(initial, pairs)
     model, posterior = fit_model(pairs, family, floor)
     if isinstance(initial, BeamModel) and np.any(posterior.errors > VAGUE * np.abs(posterior.values)):
@@ -245,8 +245,8 @@ def _bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
 
 
 def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """Estimate survey and lever arm by phases. Returns None if there are too few phases, or if the phases agree with the estimate
-    no better than with ``survey`` and ``settings``."""
+    """Estimate survey and lever arm by phases. Returns None if there are too few phases, or if the phases agree with
+    the estimate no better than with ``survey`` and ``settings``."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:
@@ -255,8 +255,8 @@ def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) 
 
 
 def _priors_of(phase: PhaseFit, survey: SurveySettings) -> dict[str, tuple[float, float]]:
-    """Return mean and standard deviation of each change of survey and lever arm by its name, such as ``antennas.x``, from a fit to
-    phases."""
+    """Return mean and standard deviation of each change of survey and lever arm by its name, such as ``antennas.x``,
+    from a fit to phases."""
     shift = (phase.survey.x - survey.x, phase.survey.y - survey.y, phase.survey.heading - survey.heading)
     names = (*SURVEY, "antennas.x", "antennas.y")
     return dict(zip(names, zip((*shift, *phase.lever_arm), phase.sigmas.tolist(), strict=True), strict=True))
@@ -270,8 +270,8 @@ def floor_of(settings: RfidSettings) -> Floor:
 
 
 def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> SurveySettings:
-    """Return a survey transform whose rotation is about the centre of the tags, so that shift and rotation are uncorrelated. A
-    transform that the rig already has is returned unchanged."""
+    """Return a survey transform whose rotation is about the centre of the tags, so that shift and rotation are
+    uncorrelated. A transform that the rig already has is returned unchanged."""
     if survey != SurveySettings():
         return survey
     places = {name: point for log in rounds for name, point in zip(log.names, log.tags.points[:, :2], strict=True)}

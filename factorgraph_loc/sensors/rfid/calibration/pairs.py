@@ -46,8 +46,8 @@ class TagPairs:
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The likelihood of M pairs, each field (M,): the negative log-likelihood, its derivative by the logit, and the Fisher
-    information on the logit."""
+    """The likelihood of M pairs, each field (M,): the negative log-likelihood, its derivative by the logit, and the
+    Fisher information on the logit."""
 
     nll: Array
     gradient: Array
@@ -63,8 +63,8 @@ def pairs_of(
 ) -> TagPairs:
     """Return the pairs of antenna and tag of several logs.
 
-    ``survey``: the transform of the tags' positions. ``within``: for each log the flat indices (round, tag) of the pairs, None for
-    all pairs within :data:`REACH`. ``length``: length of the blocks of time [s].
+    ``survey``: the transform of the tags' positions. ``within``: for each log the flat indices (round, tag) of the
+    pairs, None for all pairs within :data:`REACH`. ``length``: length of the blocks of time [s].
     """
     numbers = {name: i for i, name in enumerate(dict.fromkeys(name for log in logs for name in log.names))}
     parts = []
@@ -94,8 +94,8 @@ def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integ
 def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: Integers) -> tuple[Array, Array]:
     """Return the geometry of the pairs of a log with flat indices ``pairs`` (M,) of round and tag.
 
-    Returns coordinates (M, 4), which are the tag's position in the antenna's frame [m] and its facing as in :class:`TagPairs`,
-    and the distance (M,) of antenna and tag in the plane [m].
+    Returns coordinates (M, 4), which are the tag's position in the antenna's frame [m] and its facing as in
+    :class:`TagPairs`, and the distance (M,) of antenna and tag in the plane [m].
     """
     row, column = np.divmod(pairs, len(log.names))
     transform = survey.transform()
@@ -117,8 +117,8 @@ def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: 
 
 @dataclass(frozen=True)
 class Floor:
-    """Lower bounds of two probabilities at any position of a tag: ``false_read`` of the probability of a read, and ``miss`` of the
-    probability of a miss."""
+    """Lower bounds of two probabilities at any position of a tag: ``false_read`` of the probability of a read, and
+    ``miss`` of the probability of a miss."""
 
     false_read: float = 0.02
     miss: float = 0.02
@@ -130,8 +130,8 @@ class Floor:
 
 
 def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
-    """Return the likelihood of ``hits`` (M,) in ``count`` (M,) rounds with logits (M,). ``floor``: probabilities of false reads
-    and misses, see :mod:`factors.rfid.model`."""
+    """Return the likelihood of ``hits`` (M,) in ``count`` (M,) rounds with logits (M,). ``floor``: probabilities of
+    false reads and misses, see :mod:`factors.rfid.model`."""
     q = np.clip(floor.probability(logit), 1e-12, 1.0 - 1e-12)
     by_logit = (q - floor.false_read) * (1.0 - floor.miss - q) / (1.0 - floor.false_read - floor.miss)
     return Terms(

@@ -46,8 +46,8 @@ NO_FOCUS: Mapping[str, tuple[float, float]] = {}
 class Family:
     """A family of detection models with P parameters.
 
-    ``built``: a function that returns the model for values (P,) of the parameters. ``design``: for models whose logit is linear
-    in the parameters, a function that returns its derivatives (M, P) at points (M, 3) and facings (M,).
+    ``built``: a function that returns the model for values (P,) of the parameters. ``design``: for models whose logit
+    is linear in the parameters, a function that returns its derivatives (M, P) at points (M, 3) and facings (M,).
     """
 
     parameters: tuple[Parameter, ...]
@@ -57,8 +57,8 @@ class Family:
     def jacobian(self, values: Array, points: Array, facing: Array) -> Array:
         """Return the derivatives (M, P) of the logit of a read by the parameters, at their ``values`` (P,).
 
-        ``points`` (M, 3): positions of tags in the antenna's frame [m]. ``facing`` (M,): cosine of the angle between the tag's
-        facing and the direction to the antenna.
+        ``points`` (M, 3): positions of tags in the antenna's frame [m]. ``facing`` (M,): cosine of the angle between
+        the tag's facing and the direction to the antenna.
         """
         if self.design is not None:
             return self.design(points, facing)
@@ -69,8 +69,8 @@ class Family:
 
 
 def features(points: Array, facing: Array) -> Array:
-    """Return the features (M, 11) of :data:`factors.rfid.model.FEATURES` for tags at ``points`` (M, 3) in the antenna's frame,
-    with ``facing`` (M,)."""
+    """Return the features (M, 11) of :data:`factors.rfid.model.FEATURES` for tags at ``points`` (M, 3) in the antenna's
+    frame, with ``facing`` (M,)."""
     x, y, z = points.T
     r = np.sqrt(x**2 + y**2 + NEAR**2)
     w, c = 1.0 - x / r, facing
@@ -78,8 +78,8 @@ def features(points: Array, facing: Array) -> Array:
 
 
 def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
-    """Return the family of logistic models. Each coefficient has a Gaussian prior with mean 0. Its standard deviation is the
-    reciprocal of the feature's standard deviation in ``pairs``, or very large for the constant."""
+    """Return the family of logistic models. Each coefficient has a Gaussian prior with mean 0. Its standard deviation
+    is the reciprocal of the feature's standard deviation in ``pairs``, or very large for the constant."""
     every = _edged(pairs)
     scale = np.std(features(every.points, every.facing), axis=0)
     used = [i for i in range(len(FEATURES)) if i == 0 or (scale[i] > 1e-6 and (with_facing or i not in FACING))]
@@ -118,8 +118,8 @@ def scaled(start: GridModel) -> Family:
 
 
 def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
-    """Return the family of models of the same kind as ``model``. ``pairs``: reads and misses that scale the priors of a logistic
-    model."""
+    """Return the family of models of the same kind as ``model``. ``pairs``: reads and misses that scale the priors of a
+    logistic model."""
     if isinstance(model, BeamModel):
         return beam(model)
     return scaled(model) if isinstance(model, GridModel) else logistic(pairs, with_facing=model.uses_facing)
@@ -145,9 +145,9 @@ def places_of(
 ) -> tuple[tuple[Parameter, ...], Array]:
     """Return the changes of the survey and of each antenna's mounting as parameters, and the covariance of their priors.
 
-    The change of an antenna is the sum of a change that all antennas have in common, and of its own change if there are several
-    antennas. ``focus``: means and standard deviations of changes by name, as estimated by phases, which replace the default
-    priors.
+    The change of an antenna is the sum of a change that all antennas have in common, and of its own change if there are
+    several antennas. ``focus``: means and standard deviations of changes by name, as estimated by phases, which replace
+    the default priors.
     """
     priors = {name: (0.0, sigma) for name, sigma in (SURVEY | COMMON).items()} | dict(focus)
     antennas = settings.all_antennas()
@@ -165,8 +165,8 @@ def places_of(
 
 
 def kind_of(place: Parameter) -> tuple[str, str]:
-    """Return the kind of a parameter of :func:`places_of`, which is a name in SURVEY or COMMON, and the name of its antenna or
-    ""."""
+    """Return the kind of a parameter of :func:`places_of`, which is a name in SURVEY or COMMON, and the name of its
+    antenna or ""."""
     what, _, rest = place.name.partition(".")
     antenna, _, name = rest.rpartition(".")
     return f"{what}.{name}", antenna
@@ -183,8 +183,8 @@ def place(
 ) -> tuple[RfidSettings, SurveySettings, Posterior]:
     """Estimate survey and mounting together with a logistic model of all antennas, by maximal posterior density.
 
-    Returns the changed settings, the changed survey, and the posterior of the changes. ``focus``: see :func:`places_of`.
-    ``with_facing``: True if the model depends on the tags' facing.
+    Returns the changed settings, the changed survey, and the posterior of the changes. ``focus``: see
+    :func:`places_of`. ``with_facing``: True if the model depends on the tags' facing.
     """
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]
@@ -243,9 +243,9 @@ def pose_share(
     which: Sequence[int],
     floor: Floor,
 ) -> float:
-    """Return the fraction of the reads' information on the pose that is left after correlations within windows of time are
-    accounted for. ``logs``: unmerged rounds. ``models``, ``which``: the detection models, and the index of the model of each
-    antenna. ``floor``: probabilities of false reads and misses."""
+    """Return the fraction of the reads' information on the pose that is left after correlations within windows of time
+    are accounted for. ``logs``: unmerged rounds. ``models``, ``which``: the detection models, and the index of the
+    model of each antenna. ``floor``: probabilities of false reads and misses."""
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within, WINDOW)
     logit, columns = modelled(models, which, pairs), []
@@ -257,8 +257,8 @@ def pose_share(
 
 
 def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, block: Integers) -> LikelihoodTerms:
-    """Return the likelihood of ``pairs`` with ``logit`` (M,) and its ``jacobian`` (M, P) by parameters. Reads with the same
-    number in ``block`` (M,) are correlated."""
+    """Return the likelihood of ``pairs`` with ``logit`` (M,) and its ``jacobian`` (M, P) by parameters. Reads with the
+    same number in ``block`` (M,) are correlated."""
     likelihood = terms(logit, pairs.hits, pairs.count, floor)
     information = jacobian.T @ (likelihood.information[:, None] * jacobian)
     scores = by_block(likelihood.gradient[:, None] * jacobian, block)

@@ -1,7 +1,7 @@
 """Data for the calibration of RFID: the rounds of each antenna along the reference of a log, with their reads and misses.
 
-Rounds of an antenna at nearly the same pose are correlated. They are merged into one row with the numbers of reads and of
-rounds.
+Rounds of an antenna at nearly the same pose are correlated. They are merged into one row with the numbers of reads and
+of rounds.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ Integers = NDArray[np.int64]
 class Rounds:
     """K robot poses with rounds of one antenna each, and the T tags of the map that the log reads at least once.
 
-    ``log``: the name of the log. ``t`` (K,): times [s]. ``poses`` (K, 3): of the robot. ``antenna`` (K,): index in the rig.
-    ``count`` (K,): weighted number of rounds. ``hits`` (K, T): weighted number of rounds that read each tag.
+    ``log``: the name of the log. ``t`` (K,): times [s]. ``poses`` (K, 3): of the robot. ``antenna`` (K,): index in the
+    rig. ``count`` (K,): weighted number of rounds. ``hits`` (K, T): weighted number of rounds that read each tag.
     ``tags``: positions and facings as surveyed, without survey transform. ``names``: T EPCs.
     """
 
@@ -56,8 +56,8 @@ class Rounds:
 def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Rounds:
     """Return the rounds of a log within the reference. Unknown EPCs and antennas are omitted.
 
-    ``merged``: True to merge rounds at nearly the same pose. The pose of a round is that at the middle of its reads. Raises
-    InputError if there are too few rounds or too few tags that were read.
+    ``merged``: True to merge rounds at nearly the same pose. The pose of a round is that at the middle of its reads.
+    Raises InputError if there are too few rounds or too few tags that were read.
     """
     stream = log.streams["rfid"]
     assert isinstance(stream, RfidStream)
@@ -87,9 +87,9 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
 
 
 def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) -> Array:
-    """Return the time (count,) [s] from the middle of the reads of each round to the end of the round. A round without reads
-    has the median time. ``age`` (N,), ``inverse`` (N,), ``read`` (N,): age [s], round index, and True for a read, of each
-    row."""
+    """Return the time (count,) [s] from the middle of the reads of each round to the end of the round. A round without
+    reads has the median time. ``age`` (N,), ``inverse`` (N,), ``read`` (N,): age [s], round index, and True for a read,
+    of each row."""
     oldest, youngest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(oldest, inverse[read], age[read])
     np.minimum.at(youngest, inverse[read], age[read])
@@ -101,8 +101,8 @@ def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) 
 
 
 def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integers]:
-    """Assign rows of ``coordinates`` (M, D) to cells of ``sizes`` (D,). Returns the index of the first row in each cell, and
-    the cell number (M,) of each row."""
+    """Assign rows of ``coordinates`` (M, D) to cells of ``sizes`` (D,). Returns the index of the first row in each
+    cell, and the cell number (M,) of each row."""
     keys = np.floor(coordinates / sizes).astype(np.int64)
     keys -= keys.min(axis=0)
     flat = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1))
@@ -113,8 +113,8 @@ def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integ
 def overdispersion(
     hits: Array, count: Array, p: Array, antenna: Integers, tag: Integers, block: Integers
 ) -> tuple[float, float]:
-    """Return the overdispersion of reads, at least 1, and its standard error. An overdispersion of n means that n correlated
-    rounds have as much information as one independent round.
+    """Return the overdispersion of reads, at least 1, and its standard error. An overdispersion of n means that n
+    correlated rounds have as much information as one independent round.
 
     ``hits``, ``count``, ``p`` (M,): reads, rounds, and predicted probability of a read in one round. ``antenna``, ``tag``,
     ``block`` (M,): indices of antenna, tag and block of time. The overdispersion is the variance of the number of reads of a

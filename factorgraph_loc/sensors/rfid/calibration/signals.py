@@ -1,9 +1,9 @@
 """Fits signals of reads to logs with a reference: the model of signal strength, and the geometry from phases.
 
-Phases determine the survey's transform, and a shift that all antennas have in common (lever arm), as in synthetic aperture
-radar. With the correct geometry the phases of one tag's reads within a short window agree, after the phase of the path is
-subtracted (:mod:`factors.rfid.signals`). The estimate maximises this agreement over a log. A coarse grid search finds the
-maximum, because it is wide: errors that are common to a window reduce the agreement only slowly.
+Phases determine the survey's transform, and a shift that all antennas have in common (lever arm), as in synthetic
+aperture radar. With the correct geometry the phases of one tag's reads within a short window agree, after the phase of
+the path is subtracted (:mod:`factors.rfid.signals`). The estimate maximises this agreement over a log. A coarse grid
+search finds the maximum, because it is wide: errors that are common to a window reduce the agreement only slowly.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class PhaseFit:
 
     ``survey``: the transform of the survey. ``lever_arm`` (2,): a correction of x and y [m] of every antenna.
     ``sigmas`` (5,): standard deviations of the survey's x, y [m] and heading [rad], and of the lever arm's x, y [m].
-    ``agreement``, ``initial_agreement``: agreement of the phases with the result and with the initial values, as mean resultant
-    length (0 to 1). ``reads``: number of reads used.
+    ``agreement``, ``initial_agreement``: agreement of the phases with the result and with the initial values, as mean
+    resultant length (0 to 1). ``reads``: number of reads used.
     """
 
     survey: SurveySettings
@@ -154,8 +154,8 @@ DOF = (1.0, 100.0)  # bounds of the degrees of freedom
 def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiSettings:
     """Fit the model of signal strength (:mod:`factors.rfid.signals`) to all ``logs`` by maximum likelihood.
 
-    Signals below the reader's sensitivity are missing, so the fitted path loss is flatter than in free space. Raises InputError
-    if a log has no reference, or if too few reads have an RSSI.
+    Signals below the reader's sensitivity are missing, so the fitted path loss is flatter than in free space. Raises
+    InputError if a log has no reference, or if too few reads have an RSSI.
     """
     names = {name: i for i, name in enumerate(rfid.all_antennas())}
     tables, values = list[Array](), list[Array]()
@@ -175,8 +175,8 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
 
 
 def _student(x: Array, y: Array) -> tuple[Array, float, float]:
-    """Fit a linear model of ``y`` (N,) by features ``x`` (N, F) with Student-t noise. Returns coefficients (F,), scale and
-    degrees of freedom. The method is conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
+    """Fit a linear model of ``y`` (N,) by features ``x`` (N, F) with Student-t noise. Returns coefficients (F,), scale
+    and degrees of freedom. The method is conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
     dof, weights = 5.0, np.ones(len(y))
     for _ in range(ITERATIONS):
         root = np.sqrt(weights)
