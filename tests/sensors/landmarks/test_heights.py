@@ -47,6 +47,16 @@ def test_landmarks_at_the_ceiling_are_as_good_as_others(flat, tall, estimator):
     assert at_height["causal.anees"] < 5.0
 
 
+@pytest.mark.parametrize("estimator", ["ekf", "particle_filter", "smoother"])
+def test_an_inexact_survey_keeps_the_heights(tall, estimator):
+    """Without its height a landmark that is estimated from its survey would contradict each slant range."""
+    marks = {name: mark.model_copy(update={"sigma": 0.1}) for name, mark in tall.world.landmarks.items()}
+    inexact = replace(tall, world=tall.world.model_copy(update={"landmarks": marks}))
+    surveyed, exact = (fgloc.run(log, estimator, sensors=SENSORS).scores for log in (inexact, tall))
+    assert surveyed["causal.position_rmse"] < 1.3 * exact["causal.position_rmse"]
+    assert surveyed["causal.anees"] < 5.0
+
+
 def test_an_unknown_start_among_landmarks_at_the_ceiling(flat, tall):
     at_height, in_plane = (fgloc.run(log, "smoother", sensors=SENSORS, prior="unknown").scores for log in (tall, flat))
     assert at_height["final.position_rmse"] < 1.6 * in_plane["final.position_rmse"]
@@ -72,6 +82,20 @@ def test_a_map_is_made_with_given_heights(tall, tmp_path):
 def test_a_new_landmark_is_level_with_the_sensor(flat, tall, tmp_path):
     alone = replace(flat, rig=tall.rig, world=flat.world.model_copy(update={"landmarks": {}}))
     assert {mark.z for mark in made_map(alone, tmp_path).values()} == {Z}
+
+
+def test_new_landmarks_get_the_given_height(tall, tmp_path):
+    bearings = fgloc.simulate("office", 4, changes=CHANGES).streams["bearing_range"].bearing
+    sightings = replace(tall.streams["bearing_range"], bearing=bearings)
+    world = tall.world.model_copy(update={"landmarks": {}})
+    unknown = replace(tall, world=world, streams=tall.streams | {"bearing_range": sightings})
+    fgloc.build_map(unknown, tmp_path / "made.world.toml", height=HEIGHT)
+    made, true = fgloc.read_world(tmp_path / "made.world.toml").landmarks, tall.world.landmarks
+    assert {mark.z for mark in made.values()} == {HEIGHT}
+    errors = [np.hypot(mark.x - true[name].x, mark.y - true[name].y) for name, mark in made.items()]
+    assert np.median(errors) < 0.3
+    with pytest.raises(fgloc.InputError, match="state z of the landmarks"):
+        fgloc.build_map(tall, tmp_path / "other.world.toml", height=HEIGHT, extend=True)
 
 
 def test_a_map_without_heights_is_doubted(tall):
