@@ -22,10 +22,10 @@ from factors.camera.model import CameraModel, undistorted
 from factors.se2 import Array, Integers
 
 ROUNDS = 3  # largest number of adjustments; outliers are removed after each one
-# an observation is an outlier beyond so many standard deviations of a pixel: after the first adjustment, and later
+# largest error of an inlier, in standard deviations of a pixel: after the first adjustment, and after later ones
 LOOSE, OUTLIER = 6.0, 3.5
 ITERATIONS = 20
-RELATIVE, ABSOLUTE = 1e-4, 1e-4  # the optimization ends if the cost decreases by less
+RELATIVE, ABSOLUTE = 1e-4, 1e-4  # the optimization ends if the sum of squared errors decreases by less
 FOCAL_SIGMA, ASPECT_SIGMA = 0.1, 0.005  # standard deviations of an unknown focal length and of fx / fy, relative
 CENTRE_SIGMA = 0.01  # standard deviation of an unknown principal point, relative to the focal length
 LENS_SIGMA = (0.1, 0.1, 0.003, 0.003)  # standard deviations of an unknown distortion
@@ -98,7 +98,7 @@ def adjust(
 
 def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
     """Return a mask (N,) of the observations whose residual is at most ``limit`` standard deviations. If a point has
-    only one such observation, the mask is False for it too, because one observation does not determine the point."""
+    only one such observation, the mask is False for this observation, because it alone does not determine the point."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     count = np.bincount(tracks.track[right], minlength=tracks.count)

@@ -123,5 +123,5 @@ def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float
 
 
 def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
-    """True if the given position of a landmark is in the frame of the new map. It is not if the given map could not be aligned."""
+    """True if the given position of a landmark with the verdict ``verdict`` is in the frame of the new map ``made``."""
     return made.judged or verdict == "given"

@@ -40,7 +40,7 @@ VERDICTS = {
     UNSEEN: "not seen",
     "not judged": "not judged",
 }
-MIN_COMMON = 3  # landmarks in both maps: with two, a wrong one could not be detected
+MIN_COMMON = 3  # least number of landmarks in both maps: with two, a wrong landmark could not be detected
 UNJUDGED = ": it is not judged; the new map is in the frame of the run's start"  # end of a note
 FACTORS = (0.01, 4.0)  # bounds of the factor by which covariances are scaled
 MAX_PAIRS = 5000  # if there are more pairs of landmarks, this many are drawn at random
@@ -195,7 +195,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))
 
     def cost(pose: Array) -> float:
-        """Return the truncated cost of an alignment. An error below the tolerance is never an outlier."""
+        """Return the sum of truncated squared errors of an alignment. An error below the tolerance is no outlier."""
         error, _, squared = errors(pose)
         tolerated = GATE * np.sum(error**2, axis=1) / TOLERANCE**2
         return float(np.minimum(np.minimum(squared / factor, tolerated), GATE).sum())
@@ -286,7 +286,7 @@ def _assemble(
     """Build the new map: first the landmarks of the given map in their order, then the new ones.
 
     ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new
-    map's frame. ``verdicts``: by name, "new" if missing. ``keep``: names of the landmarks whose given position is used.
+    map's frame. ``verdicts``: by name; others are "new". ``keep``: names of the landmarks with their given position.
     ``flagged``: names of the landmarks whose given position is wrong.
     """
     entries, landmarks = [], {}

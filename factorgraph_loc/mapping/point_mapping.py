@@ -148,7 +148,7 @@ def map_points(
         progress(0.7 * min(1.0, (begin + 50) / len(pairs)))
     tracks = chained(posed.frames, matches)
     triangulated = triangulate(model, posed.cameras, tracks)
-    # before the adjustment, the residuals also contain the errors of the camera poses: allow the epipolar gate
+    # before the adjustment, residuals also contain the errors of the camera poses: allow as much as the epipolar gate
     good = triangulated.good(tracks, replace(model, sigma=gate / GATE), settings.parallax)
     if not good.any():
         raise RunFailedError("no feature was matched between images from several places, so no point was mapped")

@@ -21,7 +21,7 @@ from factors.se2 import Array, Integers
 
 GATE = 16.27  # 99.9 % of chi-square with three degrees of freedom
 FARTHEST = 0.5  # m: largest distance of two estimates of the same point
-PERCENTILE = 90.0  # views that differ by more than this percentile of the views of one point show different points
+PERCENTILE = 90.0  # of the differences between views of one point: views that differ more show different points
 COMPARED = 2000  # number of points from which this percentile is estimated
 CELL = 0.5  # m: size of the cells of space; thinning keeps points in as many cells as possible
 LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact points can be compared
@@ -150,8 +150,8 @@ def _views(points: PointMap) -> list[Integers]:
 
 
 def _limit(points: PointMap, views: list[Integers]) -> float:
-    """Return a limit for the difference between views of the same point: the percentile :data:`PERCENTILE`, over
-    points, of the distance between the two most similar views of a point. Returns 0 if no point has two views."""
+    """Return the largest descriptor distance between views of the same point: the percentile :data:`PERCENTILE` of the
+    distances between the two most similar views of each point. Returns 0 if no point has two views."""
     least = []
     for mine in [mine for mine in views if len(mine) > 1][:COMPARED]:
         apart = distance_matrix(points.descriptors[mine], points.descriptors[mine])

@@ -84,7 +84,7 @@ def map_tags(
         if prior is None:
             if extend:
                 raise InputError(
-                    f"{log.name}: prior is None, expected a start pose: extend with estimated poses needs a start in the map"
+                    f"{log.name}: prior is None, expected the start pose in the map: extend without a reference needs it"
                 )
             prior = PosePrior(log.span()[0], np.zeros(3), EXACT_SIGMA**2 * np.eye(3))
             observations = replace(observations, facing=np.full(len(given), np.nan))

@@ -33,8 +33,8 @@ SAME = 0.05  # m, rad: optima with smaller differences are equal
 MERGED, OVERLAP = 0.5, 9.0
 # m, rad: observations from poses within these differences are added up, on the lattice and in the refinement
 COARSE, FINE = (0.2, 0.15), (0.05, 0.03)
-# least log-likelihood of a located tag, relative to a tag out of reach; for false reads, even the best of thousands of positions
-# has less
+# least log-likelihood of a located tag minus that of a tag out of reach. False reads give less, even at the best of thousands
+# of positions
 GAIN = 8.0
 SURE = 0.95  # a mode with a larger weight is the only one
 LARGEST_SIGMA = 1.0  # m: largest standard deviation of a located tag

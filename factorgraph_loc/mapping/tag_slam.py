@@ -261,7 +261,7 @@ class _Problem:
             covariances = self._problem().covariances(self._values, keys).by_key
         except IndeterminateError as error:
             raise RunFailedError(
-                f"{len(tags)} tags were located, but the reads do not determine their accuracy"
+                f"{len(tags)} tags were located, but the reads do not determine their covariances"
             ) from error
         learnt = {i: LearntPoint(self._values[key], covariances[key]) for i, key in zip(tags, keys, strict=True)}
         return TagSlam(self.t, self._poses(), learnt, self._facing, posteriors)

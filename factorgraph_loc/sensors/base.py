@@ -43,7 +43,7 @@ class Term:
 
 
 class Observation(Protocol):
-    """The information of a measurement, or of a part of it, on the pose at one time and on named blocks. Immutable.
+    """Information of a measurement, or of a part of it, on the pose at one time and on blocks of the state. Immutable.
 
     ``t``: time of the measurement [s]. ``found``: number of detections, possibly 0. ``is_judged``: True if
     :meth:`Sensor.judge` must be called. ``iterations``: number of linearisations, or None if the estimator decides.
@@ -149,9 +149,9 @@ class Link:
 class Binding:
     """The arguments that bind a sensor to a run.
 
-    ``setup``: rig, map and sensors of the run, with at most one sensor of the kind. ``motion``: the odometry.
+    ``setup``: rig, map and sensors of the run. ``motion``: the odometry. ``diagnostics``: receives the innovations.
     ``use``: known to use the map's landmarks only, extended to estimate other landmarks too, unknown to estimate all landmarks.
-    ``points``: the same for image points and for landmarks that are observed by range alone or bearing alone.
+    ``points``: as ``use``, for image points and for landmarks that are observed by range alone or bearing alone.
     ``calibration``: which uncertain constants the estimator learns. ``name``: the name of one of several sensors, otherwise "".
     """
 
@@ -225,13 +225,13 @@ class Finder(Protocol):
         """The pose at the last informative measurement if it is unambiguous, otherwise None."""
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process a measurement while the robot is not localized. Returns False if the measurement is uninformative."""
+        """Process a measurement ``m`` at the odometry state ``odometry``. Returns False if ``m`` is uninformative."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return poses (N, 3) at the last informative measurement, sampled from the hypotheses."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        """Record an observation before it is applied to the track. ``view`` shows the prediction."""
+        """Record an observation at the odometry state ``odometry``. ``view``: the prediction, not corrected yet."""
 
     def refuted_since(self, m: Any, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
         """Return the time [s] since which the track must have been wrong, or None. Call this after a measurement was applied.
@@ -271,14 +271,14 @@ class Sensor:
         raise NotImplementedError
 
     def judge(self, observation: Any, correction: Correction, view: View) -> bool:
-        """Record the innovation of an observation. Returns False if the observation must not be applied.
+        """Decide whether an observation is applied: returns False to reject it. Also records its innovation.
 
-        ``correction``: the result of :meth:`Observation.correct`, not yet applied. ``view`` shows the prediction.
+        ``correction``: the result of :meth:`Observation.correct`, not yet applied. ``view``: the prediction.
         """
         return True
 
     def evidence(self, m: Any) -> Observation | None:
-        """Return the observation on the pose without a prediction, or None if the measurement has no information."""
+        """Return the observation of a measurement for the search of an unknown pose, or None without information."""
         return None
 
     @property

@@ -60,27 +60,21 @@ class SensorType:
     """The description of a sensor: names, sections, and functions as strings ``package.module:name``, "" for none.
 
     - ``channels``: kinds of measurements. ``settings``: sections of the rig. ``layers``: layers of the world.
-    - ``detects``: the layer of the world whose elements the sensor detects, "" for none. ``locates``: True if the sensor
-    localizes
-      the robot without a map.
-    - ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor` of a run, or None if the run does not use the
-    sensor.
+    - ``detects``: the layer of the world with the elements that the sensor detects, "" for none.
+    - ``locates``: True if the sensor localizes the robot without a map.
+    - ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if the run does not use it.
     - ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``.
     - ``draw``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
-    - ``check``: ``(use) -> use``, before a run. It may change settings as the log requires. It raises InputError if log and
-    settings
-      are incompatible.
+    - ``check``: ``(use) -> use``, before a run. It may change settings. It raises InputError if they do not fit the log.
     - ``review``: ``(use, ending) ->`` :class:`~factorgraph_loc.sensors.interfaces.Review`, after a run.
     - ``simulation``: sections of the settings of simulated logs.
     - ``simulate``: ``(ride) ->`` :class:`~factorgraph_loc.sensors.interfaces.Simulated`, for simulated logs.
-    - ``looks``: ``(settings) ->`` expected detections per second by the plural of the detected elements. It raises ValueError
-    if
-      settings of a simulation are inconsistent.
-    - ``on_robot``: ``(world, rig, settings, rng) ->`` :class:`~factorgraph_loc.sensors.interfaces.LiveSensor` or None, for
-    active
-      localization.
-    - ``forecast``: ``(world, rig, speed, settings) ->`` :class:`~factorgraph_loc.sensors.interfaces.Forecast` or None, for
-    planning.
+    - ``looks``: ``(settings) ->`` expected detections per second in a simulated log, such as {"tags": 80.0}. It raises
+      ValueError if the settings of the simulation are inconsistent.
+    - ``on_robot``: ``(world, rig, settings, rng) ->`` :class:`~factorgraph_loc.sensors.interfaces.LiveSensor` or None.
+      It is used for active localization.
+    - ``forecast``: ``(world, rig, speed, settings) ->`` :class:`~factorgraph_loc.sensors.interfaces.Forecast` or None.
+      It is used for the planning of paths.
     - ``calibrator``: a :class:`~factorgraph_loc.sensors.calibrating.Calibrator`.
     """
 

@@ -145,7 +145,7 @@ def _joint(
             xu, xv = (c * ju - b * jv) / determinant, (a * jv - b * ju) / determinant
             for m in range(6):
                 information[j, m] += xu * jacobian[i, 0, m] + xv * jacobian[i, 1, m]
-    # by the matrix inversion lemma, in a form that allows a singular covariance
+    # this form of the matrix inversion lemma allows a singular covariance
     both = gaussian.product(information, covariance)
     for j in range(6):
         both[j, j] += 1.0
@@ -158,7 +158,7 @@ def _joint(
 def _root(camera: CameraPose) -> Array:
     """Return a matrix R (6, 6) with RR' equal to the covariance of the camera pose, which may be singular."""
     values, vectors = np.linalg.eigh(camera.covariance)
-    # rounding errors must not change the directions of a sample
+    # eigenvalues that are zero up to rounding errors must not add directions to the samples
     return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 

@@ -38,7 +38,7 @@ def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
     points = keypoints.points.astype("<f4")
     binary = descriptors.dtype == np.uint8
     narrow = descriptors.astype(np.uint8)
-    fits = binary or bool(np.array_equal(narrow, descriptors))  # those of SIFT are integers below 256
+    fits = binary or bool(np.array_equal(narrow, descriptors))  # SIFT's values are integers below 256
     kept: NDArray[Any] = narrow if fits else descriptors.astype("<f4")
     return _FEATURES.pack(*descriptors.shape, binary, fits) + points.tobytes() + kept.tobytes()
 

@@ -31,7 +31,7 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """This object, whose features must be matched with the map. In measurements of points with known names it is None."""
+        """This object. Measurements of named points have None here, because they have no features."""
         return self
 
     @property

@@ -29,7 +29,7 @@ from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel, TiltScale
 from factors.motion import Increment, propagate
 from factors.se2 import Array
 
-# the reason in the diagnostics why a point is rejected
+# reason for the rejection of a point, as written to the diagnostics
 DISAGREES = "camera: point disagrees with the other points of the image"
 FEW_SHARE = 0.3  # an image misses named points if a smaller fraction of them are inliers
 FEW, MANY = 6, 20  # an image misses matched points if fewer than FEW are inliers, although MANY or more are expected
@@ -47,11 +47,11 @@ NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Predicted:
-    """The prediction for an image.
+    """The current estimate, with which the points of an image are predicted.
 
-    ``pose`` (3,) with body-frame ``covariance`` (3, 3): of the pose variable that the factor depends on.
-    ``constants`` (P,) with covariance ``spread`` (P, P): corrections of the estimated camera constants. None if none is
-    estimated.
+    ``pose`` (3,) with body-frame ``covariance`` (3, 3): the pose of the robot that the image's factor depends on.
+    ``constants`` (P,) with covariance ``spread`` (P, P): the estimates of the P camera constants that are estimated,
+    relative to the rig. None if P is 0.
     """
 
     pose: Array

@@ -143,11 +143,11 @@ FOLDER = "camera"
 
 
 def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Path | None = None) -> ImageStream:
-    """Return the stream of the images that a table lists and that exist, in order of arrival. Of several images with
-    the same timestamp the last is kept.
+    """Return the stream of the images that ``table`` lists. Of images with the same timestamp the last is kept.
 
-    ``folder``: the validated folder of the images, by default that of the native format. Raises InputError if a path
-    leaves the folder or is no regular file, or if a timestamp is more than 0.5 s late.
+    ``t0_ns``: the time zero of the log [ns]. ``warnings``: receives a warning about missing images, which are skipped.
+    ``folder``: the folder of the images, by default ``camera`` next to the table. Raises InputError if a path leaves the
+    folder or is no regular file, or if a timestamp is more than 0.5 s older than that of an earlier row.
     """
     latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings, rules=table.rules).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder

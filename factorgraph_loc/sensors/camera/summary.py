@@ -128,7 +128,10 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
 
 
 def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[Notice]:
-    """Return warnings about images and named points."""
+    """Return warnings about a log's images and named points, such as unreadable images and points that the map lacks.
+
+    ``images``, ``pixels``: the summaries of the streams ``camera`` and ``sightings``, None if the log lacks the stream.
+    """
     out = list[Notice]()
     if log.rig.find(CameraSettings) is None:
         streams = [name for name, summary in (("images", images), ("identified pixels", pixels)) if summary is not None]

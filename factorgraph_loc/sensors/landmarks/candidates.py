@@ -78,7 +78,7 @@ class Candidate:
     due: float = FEWEST
 
     def plus(self, sighting: PartialSighting, source: object) -> Candidate:
-        """Return a candidate with one more sighting. It replaces the last one if the robot had hardly moved before that."""
+        """Return a candidate with a further sighting. It replaces the last one if the last two are closer than APART."""
         end = len(self.sightings)
         if end > 1:
             previous, last = (np.array(s.odometry[1:3]) for s in self.sightings[-2:])

@@ -81,6 +81,7 @@ class KnownLandmarks:
 
         ``offset``: the motion from the pose that the factors depend on to the measurement, None if the times are equal.
         ``twist`` (3,): the robot's velocity at the measurement. It is required if the sensor's time offset is estimated.
+        ``late``: the fraction of late ranges and their excess, as estimated so far.
         """
         fixed, single, surveyed, unknown = self._usable(m)
         model = with_late(self._model, late)

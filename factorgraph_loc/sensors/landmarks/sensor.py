@@ -135,8 +135,7 @@ class LandmarkObservation(ResidualObservation):
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
         """Return the observation as a function of the pose only. Constants and landmarks are fixed at ``values``. The
-        covariances
-        ``spreads`` of landmarks and range biases are added to the noise."""
+        covariances ``spreads`` of landmarks and range biases are added to the noise."""
         if len(self.terms) == 1 and not self.terms[0].blocks:
             return self
         fixed = []
@@ -333,7 +332,8 @@ class LandmarkSensor(Sensor):
         return True
 
     def _learn(self, observation: LandmarkObservation, view: View) -> None:
-        """Learn the share and the excess of late ranges."""
+        """Update the estimate of late ranges (their fraction and their excess) by an observation. An observation
+        without landmarks sighted by range alone is not used."""
         if not self._late.probability or np.isfinite(observation.measured.bearings).all():
             return
         self._late_before.append((observation.t, self._late))

@@ -309,7 +309,7 @@ def require_mappable(log: Log) -> None:
     if not streams:
         raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so there is nothing to map")
     if not log.rig.names("bearing_range"):
-        raise InputError(f"{log.name}: its rig has no [bearing_range], expected the sensor's noise and mounting")
+        raise InputError(f"{log.name}: its rig has no section [bearing_range]: add it with noise and mounting")
 
 
 def detected(log: Log) -> Counter[str]:

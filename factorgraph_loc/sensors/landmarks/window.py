@@ -150,8 +150,8 @@ class SightingWindow:
     def refined(
         self, poses: Array, whitener: Array, iterations: int, noise: Array | None = None
     ) -> tuple[Array, Array]:
-        """Return present poses (N, 3) refined by Levenberg-Marquardt on :meth:`losses`, and their body-frame
-        covariances (N, 3, 3)."""
+        """Minimise :meth:`losses` from ``poses`` (N, 3) by Levenberg-Marquardt. Returns the refined present poses (N, 3)
+        and their body-frame covariances (N, 3, 3). ``whitener``, ``noise``: see :meth:`losses`."""
 
         def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
             information, gradient = self._normal_equations(poses, whitener, noise)

@@ -85,8 +85,8 @@ def jump_warning(kind: str, found: list[Jump], stream: Motion, end: str) -> Noti
 
 
 def without_jumps(stream: M, rules: RowRules, warnings: list[Notice]) -> M:
-    """Return the odometry, or the turn rates of a gyro, without jumps if ``rules`` skip bad rows, and append a warning.
-    Otherwise return it unchanged.
+    """Return the odometry, or the turn rates of a gyro, without jumps, and append a warning about them to ``warnings``.
+    If ``rules``, the rules for bad rows of the log, do not skip bad rows, the stream is returned unchanged.
 
     The velocity before a removed row is valid until the next row. The motion of a removed increment is marked as unknown.
     """

@@ -158,7 +158,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
 
 
 def _with_fix(table: TableRows, warnings: list[Notice]) -> TableRows:
-    """Return the rows of a table without those at latitude 0 and longitude 0, which receivers report while they have no fix."""
+    """Return the rows of a table without those at latitude 0 and longitude 0, which receivers report while they have no
+    fix. Appends a warning about these rows to ``warnings``."""
     none = (table.numbers["latitude"] == 0.0) & (table.numbers["longitude"] == 0.0)
     if not none.any() or none.all():
         return table

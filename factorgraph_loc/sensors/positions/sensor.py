@@ -60,7 +60,7 @@ class PositionSensor(Sensor):
         yield self.observation(m, view.offset)
 
     def judge(self, observation: PositionObservation, correction: Correction, view: View) -> bool:
-        """Record the innovation and the residual [m] in the diagnostics."""
+        """Return True: no position is rejected. Record its innovation and its residuals [m] in the diagnostics."""
         self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
         (error,) = -observation.factor.errors(view.pose[None])
         self._diagnostics.add_residuals(f"{self.name}.x", [float(error[0])])

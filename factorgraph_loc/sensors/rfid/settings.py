@@ -27,8 +27,8 @@ Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
 class PriorSettings(FileModel):
-    """Standard deviations of the parameters of a detection model before a run (:mod:`factors.rfid.parameters`). Every
-    estimator that uses tags estimates a parameter if its value is above 0."""
+    """Standard deviations of two parameters of a detection model before a run (:mod:`factors.rfid.parameters`). A
+    parameter is estimated if its standard deviation is above 0."""
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
     """standard deviation of the logarithm of the model's range"""
@@ -37,9 +37,8 @@ class PriorSettings(FileModel):
 
 
 class RfidUncertainty(FileModel):
-    """Standard deviations of mounting and clock before a run. A constant is estimated if its value is above 0. Defaults
-    are proportional to the largest `prior.range_scale` of the models, because a calibration of the models also
-    calibrates the mounting."""
+    """Standard deviations of mounting and clock before a run. A constant is estimated if its value is above 0. The
+    defaults are multiples of the largest setting ``prior.range_scale`` of the detection models."""
 
     yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
     """standard deviation of a yaw that all antennas share; by default 0.35 times range_scale"""
