@@ -29,7 +29,7 @@ LEAST = 1e-3  # minimum exponent of a step, so that a correction ends even if no
 CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad: size of grid cells. The heaviest cell is the first guess of a mode.
 
 T = TypeVar("T")
-Steps = Generator[float, None, T]  # a computation in steps, which yields the cost of each step and returns the result
+Steps = Generator[float, None, T]  # a computation in steps. It yields the computing cost of each and returns the result
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class Cloud:
 
 class Corrected(NamedTuple):
     """A ``cloud`` after a correction by a likelihood. ``evidence``: the logarithm of the mean likelihood over the particles.
-    ``left``: the exponent of the part of the likelihood that is not yet applied, 0 if all of it is applied."""
+    ``left``: the exponent of the part of the likelihood that is not yet applied, or 0."""
 
     cloud: Cloud
     evidence: float
@@ -183,7 +183,7 @@ def corrected(
     ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a resampled cloud.
     ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the time of the measurement.
     ``below``: after the last step, the particles are resampled only if the effective number is below this fraction of N.
-    ``left``: the sum of the exponents to apply. ``to_end``: if False, the last step is left out.
+    ``left``: the sum of the exponents to apply. ``to_end``: if False, the step that completes this sum is left out.
 
     Raises RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """
@@ -201,7 +201,7 @@ def corrected(
 
 
 def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
-    """Wrap a function of particles as a generator :data:`Steps` with one step. It yields the cost 0 and returns the result."""
+    """Wrap a function of particles as a generator :data:`Steps` with one step, which yields the computing cost 0."""
 
     def steps(cloud: Cloud) -> Steps[T]:
         yield 0.0

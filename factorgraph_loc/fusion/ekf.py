@@ -74,8 +74,8 @@ class _State(NamedTuple):
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def on_pose(self, observation: Observation) -> Observation:
-        """The observation as a function of the pose only. Its blocks are fixed at this state, and their covariances are
-        added to the noise."""
+        """The observation as a function of the pose only. Constants and landmarks are fixed at this state, and their
+        covariances are added to the noise."""
         values, columns = self.layout.values(self.rest), self.layout.columns
         spreads = {name: self.covariance[columns[name], columns[name]] for name in observation.blocks}
         return observation.on_pose({name: values[name] for name in spreads}, spreads)
@@ -306,5 +306,5 @@ class Ekf(Filter):
 
 
 def _at_its_time(observation: Observation, state: _State) -> Observation | None:
-    """The observation on the pose at its own time, with its blocks fixed at ``state``. This takes time and is rarely needed."""
+    """The observation on the robot's pose at the time of the measurement, with all else fixed at ``state``, or None."""
     return state.on_pose(observation).at_its_time()

@@ -54,7 +54,7 @@ from factors import positive, se2
 from factors.motion import Increment
 from factors.se2 import Array
 
-# If weighing all particles costs more than HEAVY (in the units of `Observation.work`), only FEW particles are weighed first.
+# If the computing cost of weighing all particles exceeds HEAVY (in the unit of `Observation.work`), only FEW are weighed first.
 FEW, HEAVY = 500, 2_000_000
 
 

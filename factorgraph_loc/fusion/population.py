@@ -56,7 +56,7 @@ CLEAR = ((0.95, 1.0), (0.85, 3.0))
 # A clear pose needs at least this many observations with detections, and this many different tags or landmarks.
 CLEAR_OBSERVATIONS, CLEAR_THINGS = 3, 2
 
-# Costs, in units of the cost of one tag for one particle, which is some nanoseconds.
+# Computing costs. The unit is the computing time of one tag for one particle, which is some nanoseconds.
 CHUNK = 500_000  # largest cost of one step of a computation
 PARTICLE = 25  # cost of weighing one particle, in addition to the cost of the observation
 RESAMPLED = 60  # cost per particle of each half of a resampling
@@ -158,7 +158,7 @@ class Population:
         return True
 
     def advance(self, work: float = math.inf) -> bool:
-        """Process the queue until the cost exceeds ``work``. Returns True if an observation was completed."""
+        """Process the queue until the computing cost exceeds ``work``. Returns True if an observation was completed."""
         done = False
         while work > 0.0 and (self._running is not None or self._waiting):
             if self._running is None:
@@ -283,7 +283,7 @@ def _cloud(poses: Array, log_weights: Array) -> Cloud:
 
 
 def _likelihood(observation: Evidence, cloud: Cloud) -> Steps[Array]:
-    """The log-likelihood (N,) of an observation at the particles of ``cloud``, computed in steps of about equal cost."""
+    """The log-likelihood (N,) of an observation at the particles of ``cloud``, in steps of about equal duration."""
     each = PARTICLE + observation.work
     count = max(1, CHUNK // each)
     parts = []

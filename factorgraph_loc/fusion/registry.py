@@ -41,7 +41,7 @@ def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
 
 
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
-    """Construct the estimator with this name for a run."""
+    """Construct the estimator with this name. ``setup``: the run. ``settings``: the settings of the estimator."""
     return cast(Estimator, estimator_type(name)(setup, settings))
 
 

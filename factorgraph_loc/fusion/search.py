@@ -27,7 +27,7 @@ from factors.motion import ChainState
 from factors.se2 import Array
 
 DURATION = 60.0  # s: observations of this duration are kept
-SLICE = 2_500_000  # cost of one slice of the computation, in the units of the module `population`
+SLICE = 2_500_000  # computing cost of one slice of the search, in the unit of the module `population`
 PAUSE = 0.05  # s: minimum time between two slices, because a measurement and a tick often arrive together
 
 
@@ -35,7 +35,7 @@ class Search:
     """A global search for the robot's pose. See the module.
 
     ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space in which the robot may be; None means the
-    bounds of the sensors' maps. ``fewest``: the minimum number of particles. ``work``: the cost of one slice.
+    bounds of the sensors' maps. ``fewest``: the minimum number of particles. ``work``: the computing cost of one slice.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Search:
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """True if the particles reject the pose ``place`` of a finder, or have not yet processed the measurement it came from."""
+        """True if the particles reject ``place``, a pose by one sensor, or have not yet processed its measurement."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
@@ -177,8 +177,8 @@ class Search:
 
     @property
     def _leading(self) -> Finder | Population | None:
-        """The source of the present result: a finder that needs only one measurement, otherwise the particles,
-        otherwise any finder. None if no source is informative yet."""
+        """The source of the present result: a finder (which uses one sensor alone) that needs only one measurement,
+        otherwise the particles, otherwise any finder. None if no source is informative yet."""
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):

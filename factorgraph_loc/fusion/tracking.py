@@ -243,9 +243,9 @@ class Tracking(Search):
 class _Compared(NamedTuple):
     """An observation that has corrected the estimated pose, for the comparison of alternative motions.
 
-    ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation as a function of the pose at its
-    time, or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``: the motion
-    from that pose to the observation, or None. ``correction``: the correction of the pose by the observation.
+    ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation on the pose at that time,
+    or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``: the
+    motion from that pose to the observation, or None. ``correction``: the correction by the observation.
     """
 
     odometry: ChainState

@@ -38,7 +38,7 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 @dataclass(frozen=True)
 class ProximityReading:
     """A reading of a proximity sensor as an observation of the search, which weighs particles by it. ``lengths`` (D,) [m]: the
-    measured free lengths in D directions. ``found``, ``work``, ``things``: number of detections, cost, detected objects."""
+    measured free lengths in D directions. The last three fields are constants that the search requires."""
 
     sensor: ProximitySensor
     lengths: Array

@@ -32,8 +32,8 @@ FEW = 0.6  # paths to distant places are evaluated if the few main modes have a 
 EACH, OF_MODES = 48, 96  # particles drawn from each mode, and number of all these that a simulated scan weighs
 COMMITTED = 0.5  # fraction of an arc that is completed before the next choice
 FAR = "waypoint"  # kind of the paths to distant places
-FAR_PER_METRE = 0.02  # nats/m: small cost, so that the shorter of equally informative paths is chosen
-AHEAD = 1.0  # m at the start of a path that must be free
+FAR_PER_METRE = 0.02  # nats/m: small penalty, so that the shorter of equally informative paths is chosen
+AHEAD = 1.0  # m: a path must be free over this length from its start
 BACK = math.radians(135.0)  # a patrol turns by more than this angle only if no other direction is free
 NEAR = 3  # number of nearest tags whose mean distance is compared
 
@@ -79,11 +79,11 @@ Policy = Callable[[Situation], Choice]
 
 
 def information(s: Situation, sign: float = 1.0) -> Choice:
-    """Choose the path with the largest expected information. With ``sign`` -1, the least informative path is preferred,
-    as the paper prints it.
+    """Choose the path with the largest expected information. With ``sign`` -1, it prefers the least informative path,
+    for comparison only.
 
-    Near paths are evaluated first. If no near path is worth its cost and the belief has few modes, paths to distant
-    places are evaluated. If these are not informative either, or if the pose is unknown, the robot patrols.
+    Near paths are evaluated first. If no near path gains enough for its length and the belief has few modes, paths to
+    distant places are evaluated. If these are not informative either, or if the pose is unknown, the robot patrols.
     """
     settings = s.settings.policy
     if not s.sensors.forecasts or not s.candidates:
@@ -143,7 +143,7 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
-    """Return the costs (K,) [nats] of the lengths of the candidates with the indices ``rows``. ``per_metre``: cost per metre."""
+    """Return the penalties (K,) [nats] on the lengths of the candidates ``rows``. ``per_metre``: penalty per metre."""
     return per_metre * np.array([s.candidates[i].length for i in rows])
 
 

@@ -29,7 +29,7 @@ from factors import se2
 from factors.se2 import Array
 
 SIGMA = 0.3  # m: standard deviation of a measured length
-UNEXPECTED = 0.05  # constant likelihood of outliers, relative to the peak of the Gaussian of other lengths
+UNEXPECTED = 0.05  # constant likelihood of an outlier, relative to the peak of the Gaussian of correct lengths
 TEMPERING = 0.25  # exponent of the likelihood
 # names of the random generators; append only, because the order determines the random sequences
 DRAWS = ("constants", "steps", "rfid", "lengths", "landmarks")

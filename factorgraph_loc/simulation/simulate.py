@@ -53,8 +53,7 @@ def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.
     """Return the random generator called ``name``. Generators with different names are independent.
 
     ``seed``: a number, or the seed sequence of another generator. The generator is seeded by ``seed`` and by the index
-    of ``name`` in
-    ``names``, or by the hash of ``name`` if it is not in ``names``.
+    of ``name`` in ``names``, or by the hash of ``name`` if it is not in ``names``.
     """
     digest = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])
     key = names.index(name) if name in names else digest

@@ -32,7 +32,7 @@ from factors.odometry.factor import OdometryFactor, OdometryStack
 from factors.robust import huber_loss
 from factors.se2 import Array, Integers
 
-ANCHORED, SLACK = 4, 2.0  # number of visible points that determine a keyframe's pose; its remaining error in pixels
+ANCHORED, SLACK = 4, 2.0  # number of visible points that determine a keyframe's pose; error of such a pose in pixels
 HORIZON, BUNDLE = 60, 8  # number of keyframes whose sightings are kept, and number of keyframes adjusted together
 DISTANCE = 3.0  # m: initial value of the distance of points
 # consecutive keyframes must share a third of the points in view, but at least FEW and at most ENOUGH
@@ -54,8 +54,8 @@ def bundled(
 ) -> list[tuple[Array, Array]] | None:
     """Adjust the last keyframes and the points that they observe. Returns a pose (3,) and a tilt (2,) for each adjusted keyframe.
 
-    ``keyframes``: consecutive keyframes. Going back from the newest, each is adjusted that shares enough points with the previous
-    one. ``poses``: the initial poses of ``keyframes``. The first adjusted pose is fixed. ``waiting``: the sightings of each point.
+    ``keyframes``: consecutive keyframes. The newest are adjusted, as far back as each shares enough points with the one
+    before. ``poses``: their initial poses. The first adjusted pose is fixed. ``waiting``: the sightings of each point.
     Returns None if there are fewer than :data:`ENOUGH` points, or if most sightings of a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)

@@ -158,8 +158,8 @@ class Monoslam(Filter):
         self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None
         self._relocalized = False
-        # without a map the start is unobservable. Its uncertainty is not in the state: it would shrink there as the linearization
-        # point moves (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
+        # without a map the start is unobservable. Its uncertainty is not in the state, where changes of the linearization point
+        # would reduce it (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
         self._origin: Origin | None = None
 
     def initialize(self, prior: PosePrior) -> None:

@@ -26,7 +26,7 @@ from factors.se2 import Array
 
 MAX_TIME = 2.0  # s between two images that are compared
 ENOUGH = 8  # least number of tracks that agree with the odometry but not with another rotation of the robot
-EXPLAINED = 0.8  # least fraction that another rotation must explain, of the tracks that disagree with the odometry
+EXPLAINED = 0.8  # another rotation must explain this fraction of the tracks that disagree with the odometry
 # rad: additional rotations of the robot that are tried to explain tracks, and the standard deviation of such a rotation
 TURNS, TURN_SIGMA = np.linspace(-0.6, 0.6, 61), 0.01
 FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m: bounds of a point's distance; number of distances that are tried

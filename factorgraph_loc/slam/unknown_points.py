@@ -215,7 +215,7 @@ class UnknownPoints(Mapper):
         return names
 
     def _follow(self, track: Hashable, name: Hashable) -> None:
-        """Note that the feature track ``track`` shows the point ``name``, and that no other track shows it."""
+        """Store that the feature track ``track`` shows the point ``name``, and that no other track shows this point."""
         self._names_by_track = {new_track: of for new_track, of in self._names_by_track.items() if of != name}
         self._names_by_track[track] = name
 

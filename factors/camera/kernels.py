@@ -9,7 +9,7 @@ from factors.robust import huber_loss, huber_weight
 from factors.se2 import Array
 
 NEAREST = 0.05  # m; points with a smaller depth are projected as if at this depth
-MOST_STEPS, ENOUGH = 50, 1e-14  # of Newton's method: maximum steps, and norm of the residual at convergence
+MOST_STEPS, ENOUGH = 50, 1e-14  # maximum steps of Newton's method, and norm of the residual at convergence
 BLOCK = 256  # number of poses whose likelihoods are computed together, so that their data fit into the cache
 BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
 # The columns of a full Jacobian are the pose (3), roll and pitch (2), the point (3), and the camera's constants (8). These are the

@@ -36,7 +36,7 @@ STEPS = 1000  # number of radii at which the slope of a distortion is checked
 GRID = 33  # `folded` checks a lens at this many rows and columns of pixels
 # The indices of x, y and heading of a level robot in the perturbation (6,) of a pose in space, rotation before translation.
 PLANAR = [3, 4, 2]
-NONE = 1e-9  # largest error of a distorted direction whose undistortion succeeded
+NONE = 1e-9  # the undistortion of a direction has failed if its remaining error is larger
 
 # The rotation of a forward-facing camera. The columns are the camera's axes in the robot frame (x forward, y left, z up).
 FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))

@@ -140,7 +140,7 @@ class BearingRangeFactor:
         return self if width == 1.0 else replace(self, model=widened(self.model, width))
 
     def with_late(self, late: LateRanges) -> BearingRangeFactor:
-        """The factor with these ``late`` ranges."""
+        """The factor with these statistics of ``late`` ranges."""
         return self if late == self.model.late else replace(self, model=with_late(self.model, late))
 
     def predicted(self, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
@@ -150,7 +150,7 @@ class BearingRangeFactor:
         return kernels.predicted(self.model.packed, self.packed, pose, contiguous)
 
     def resolved(self, values: Sequence[Array], covariance: Array) -> ResolvedFactor:
-        """The factor for one correction of a Gaussian with these mean ``values`` and their joint ``covariance`` (D, D)."""
+        """The factor for one correction of a Gaussian of all values with mean ``values`` and ``covariance`` (D, D)."""
         error, blocks, slopes = self._linearized(values)
         jacobian, changed, weights = np.concatenate(blocks, axis=2), error.copy(), np.ones(len(error))
         columns, contiguous = np.arange(len(covariance)), np.ascontiguousarray(covariance)
@@ -245,8 +245,8 @@ class BearingRangeFactor:
 
 @dataclass(frozen=True)
 class ResolvedFactor:
-    """A factor whose ranges that may be late are replaced by Gaussian measurements; a :class:`~factors.sighting.SightingFactor`.
-    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the weights."""
+    """The ``factor`` with possibly late ranges replaced by Gaussian measurements. ``shift`` (K,): is added to the
+    whitened range residuals. ``root`` (K,): the square roots of the weights."""
 
     factor: BearingRangeFactor
     shift: Array

@@ -233,7 +233,7 @@ def updated(
             nis -= pull[i] * posterior[columns[i], columns[j]] * pull[j]
     now, expected = residual.copy(), squared.copy()
     mixed = resolve(model, now, jacobian, columns, covariance, slope, gate, weights, expected)
-    nis += (expected - squared).sum()  # a late range is no contradiction
+    nis += (expected - squared).sum()  # the innovation of a late range does not contradict the prediction
     if widest > 1.0 or mixed:
         delta, posterior, _ = corrected(prior, now, jacobian, columns, weights, previous)
     for _ in range(iterations - 1):

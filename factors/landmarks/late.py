@@ -22,25 +22,25 @@ from factors.compiled import compiled
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array
 
-# Each combination of these values is a hypothesis. Another one, for each noise, is that no range is late.
+# Each combination of these values is a hypothesis. A further hypothesis for each of NOISES is that no range is late.
 NOISES = (0.6, 1.0, 1.6)  # factors of the standard deviation of ranges
-SHARES = (0.02, 0.05, 0.12, 0.25, 0.45, 1.0)  # of late ranges; 1 is a bias of all ranges
-MEANS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # m, of the excess; the prior probability is proportional to the inverse
+SHARES = (0.02, 0.05, 0.12, 0.25, 0.45, 1.0)  # fractions of late ranges; 1 is a bias of all ranges
+MEANS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # m: means of the excess; their prior is proportional to the inverse
 SPREADS = (0.2, 0.7)  # standard deviation of the excess divided by its mean
 BIASED = 0.05  # prior probability of a bias, if no range is late
-OUTLIERS, FAR = 0.02, 10.0  # share of gross errors, and their standard deviation in units of that of an innovation
+OUTLIERS, FAR = 0.02, 10.0  # fraction of gross errors, and their standard deviation divided by that of an innovation
 LARGEST = 1e4  # squares of normalised innovations are limited to this value
 LEAST = 0.002  # a smaller share of late ranges is replaced by 0
 EXACT = 1e-9  # a smaller variance of a predicted range, in units of the noise, is replaced by 0
 LEAST_GAIN = 1e-6  # minimum relative reduction of a variance by a range
 LEAST_INFORMATION = (
-    0.2  # minimum information of a range, in units of that of a range that is known to be direct or late
+    0.2  # minimum information of a range, relative to a range that is known to be direct or known to be late
 )
 
 
 class LateRanges(NamedTuple):
-    """The late ranges of a sensor. ``share``: the probability that a range is late. ``mean``, ``spread``: the mean and
-    the standard deviation of the excess of a late range [m]."""
+    """The statistics of late ranges, which are too long because the signal was reflected. ``share``: the probability
+    that a range is late. ``mean``, ``spread`` [m]: mean and standard deviation of the excess of a late range."""
 
     share: float = 0.0
     mean: float = 0.0
@@ -84,14 +84,14 @@ def moments(
     error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, spread: float
 ) -> tuple[float, float, float]:
     """Returns the error and the weight of a Gaussian measurement that has the effect of a range on a prediction, and
-    the normalised innovation squared, averaged over both parts.
+    the normalised innovation squared, averaged over a direct and a late range.
 
     The prediction is corrected by a direct and by a late range. The mixture of both results is replaced by a Gaussian
     with the same mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian
     inference", 2001, 3.1). A variance above that of the prediction is reduced to it.
 
-    ``variance``: that of the predicted range in units of the noise. ``gate``: the noise is increased if a normalised innovation
-    squared exceeds this limit, as in :func:`factors.update.update_state`. The other arguments are those of :func:`mixture`.
+    ``variance``: the variance of the predicted range divided by that of the noise. ``gate``: the noise is increased if
+    a normalised innovation squared exceeds it. The other arguments are those of :func:`mixture`.
     """
     widening = 1.0 + (slope * spread) ** 2
     beyond = error + slope * mean
@@ -118,12 +118,12 @@ def _grid() -> tuple[Array, Array, Array]:
 
 _SHARES, _MEANS, _SPREADS = _grid()
 _IS_LATE = _SHARES < 1.0
-_PARTS = len(MEANS) * len(SPREADS)  # successive hypotheses with one share
+_PARTS = len(MEANS) * len(SPREADS)  # number of successive hypotheses with equal share
 
 
 @lru_cache(maxsize=16)
 def _prior(probability: float) -> Array:
-    """The logarithms of the prior probabilities of all hypotheses (noises, 1 + H). The first column is that no range is late."""
+    """The log prior probabilities (noises, 1 + H) of all hypotheses. In the first column no range is late."""
     biased = BIASED * (1.0 - probability)
     excess = np.where(_IS_LATE, probability, biased) / _MEANS
     for group in (_IS_LATE, ~_IS_LATE):
@@ -134,11 +134,11 @@ def _prior(probability: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LateShares:
-    """What is known about the late ranges of a sensor. Immutable.
+    """The estimated distribution of the late ranges of a sensor. Immutable.
 
     ``probability``: the prior probability that the sensor has late ranges.
     ``log_weights`` (noises, 1 + H): the logarithms of the posterior probabilities of all hypotheses. None means the
-    prior. ``expected``: the late ranges, averaged over all hypotheses.
+    prior. ``expected``: the statistics of late ranges, averaged over all hypotheses.
     """
 
     probability: float

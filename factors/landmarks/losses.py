@@ -75,8 +75,8 @@ def resolve(
     weights: Array,
     squared: Array,
 ) -> bool:
-    """Replace ranges that may be late by Gaussian measurements (:func:`factors.landmarks.late.moments`). Their
-    ``error``, ``weights`` and ``squared`` change in place. Returns True if there are such ranges.
+    """Replace ranges that may be late by Gaussian measurements (:func:`factors.landmarks.late.moments`). Changes their
+    ``error``, ``weights`` and ``squared`` in place. Returns True if there are such ranges.
 
     ``error`` (K, 2), ``jacobian`` (K, 2, D): whitened residuals at the prediction, and their Jacobian. ``columns``
     (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): that of the state.

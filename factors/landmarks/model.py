@@ -44,7 +44,7 @@ class BearingRangeModel:
     ``hypot(range_sigma, range_sigma_relative * r)``.
     ``bearing_bias``, ``bearing_sigma``: offset and standard deviation of bearings [rad].
     ``robust``: the scale of the Geman-McClure loss in standard deviations.
-    ``late``: the late ranges among those without a bearing.
+    ``late``: the statistics of late ranges (too long by a reflection), among those without a bearing.
     ``packed``: the model as an array (14,) for compiled code.
     """
 
@@ -149,7 +149,7 @@ def widened(model: BearingRangeModel, width: float) -> BearingRangeModel:
 
 @lru_cache(maxsize=64)
 def with_late(model: BearingRangeModel, late: LateRanges) -> BearingRangeModel:
-    """The model with these ``late`` ranges."""
+    """The model with these statistics of ``late`` ranges."""
     return replace(model, late=late)
 
 

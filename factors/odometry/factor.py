@@ -188,7 +188,7 @@ def linearize_as_reported(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
     """:func:`linearize_changed`, but with the residual's translation divided by the estimated scale of distances. The
-    translation is then in the unit of the wheels' report, like its noise."""
+    translation is then in the unit that the wheels report, as its noise is."""
     unit = 1.0 + all_changes(constants, indices)[0]
     as_reported = whitener.copy()
     for i in range(3):

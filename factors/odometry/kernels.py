@@ -54,7 +54,7 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
     heading = max(noise[7] * distance + noise[8] * rotation + noise[9] * moving, least_heading) + noise[11] * unknown
     if unknown > 0.0:  # the robot moved an unknown fraction of the reported way
         along += unknown * SHARE_VARIANCE * (distance / max(duration, SHORTEST)) ** 2
-    # (nx, ny): displacement of the end, in its own frame, per change of the heading at the start
+    # (nx, ny): displacement of the end, in the frame of the end, per change of the heading at the start
     c, s = math.cos(turned), math.sin(turned)
     nx, ny = s * x - c * y, c * x + s * y
     # the mean heading during the motion differs from the final one by half the rotation

@@ -52,9 +52,9 @@ class TagReadCounts:
     C): the number of rounds that read each of C listed tags. Tags that are not listed were not read. ``odds`` (C,):
     prior log-odds that a listed tag is weak, moved or dead (:class:`~factors.rfid.tag_states.TagStates`), and not as
     surveyed. ``-inf``, the default, means certainly as surveyed.
-    ``elsewhere`` (C,): the tempered log-likelihood ratio of a tag's reads and misses, between a tag that is not as
-    surveyed and a tag out of reach that is never read. The default is that of dead tags: 0, or ``-inf`` for a tag that
-    was read. ``tags`` (C,): indices in the map of the listed tags, ascending. The default is all tags of the map.
+    ``elsewhere`` (C,): the tempered log-likelihood of a tag's reads and misses if it is not as surveyed, minus that of
+    a tag out of reach that is never read. By default 0, or ``-inf`` if the tag was read, as for a dead tag.
+    ``tags`` (C,): indices in the map of the listed tags, ascending. The default is all tags of the map.
     ``unlisted_odds``: the odds of tags that are not listed.
     ``twists`` (K, 3): the robot's body-frame velocity [m/s, m/s, rad/s] at each measurement. The default is zero.
     """
@@ -281,8 +281,8 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """An estimate of the cost of :meth:`log_likelihood` for each of many poses that are far apart: about the number
-        of tags to evaluate."""
+        """An estimate of the computing time of :meth:`log_likelihood` per pose, if the poses are far apart: about the
+        number of tags to evaluate."""
         return self._unadjusted._places.work(counts.packed)
 
     @property

@@ -95,7 +95,7 @@ class RfidFactor:
 
     @property
     def work(self) -> int:
-        """An estimate of the cost of the likelihood at one pose: about the number of reads and misses to evaluate."""
+        """An estimate of the computing time at one pose: about the number of reads and misses to evaluate."""
         if isinstance(self.likelihood, RfidLikelihood) and isinstance(self.reads, TagReadCounts):
             return self.likelihood.work(self.reads)
         return len(self.reads.antennas)

@@ -29,8 +29,7 @@ from factors.se2 import Array, Integers
 MOST = 1 << 25  # maximum number of elements of a table; cells are made larger if necessary
 # Poses are far apart if the area within their reach exceeds this multiple of the area within reach of one pose.
 WIDE = 2.0
-# Costs in units of the cost of a table look-up for one tag: the fixed cost of a pose, and the cost of a tag and antenna if there is
-# no table.
+# Computing times, relative to reading a table for one tag: of a pose, and of a tag and antenna if there is no table.
 PLACED = 25
 BY_ANTENNA = 7
 
@@ -181,7 +180,7 @@ class Places:
         )
 
     def work(self, counts: Counts) -> int:
-        """An estimate of the cost of the likelihood at one pose, in units of the cost of one tag that was not read."""
+        """An estimate of the computing time for ``counts`` at one pose. The unit is that of one tag without reads."""
         near = in_reach(self.points[:, :2], self.antennas.reach)
         _, antennas, _, hits, *_ = counts
         if not self.tables.gain.size:
@@ -198,7 +197,7 @@ class Places:
         return out
 
     def _missed(self, scan: Scan, tempering: float) -> MissTable:
-        """The table of misses for the odds of most tags. The last table is cached, because consecutive scans are often alike."""
+        """The table of misses for tags that are not exceptional. The last table is cached for similar scans."""
         key = (scan.antennas.tobytes(), scan.rounds.tobytes(), scan.unlisted_odds, tempering)
         if key not in self._last:
             self._last.clear()
@@ -333,7 +332,7 @@ def _fill(
     for a in range(len(gain)):
         at, m = packed.antennas[a], packed.which[a]
         unit, reach2, is_logistic = 1.0 / packed.scale[m], packed.reach[m] ** 2, packed.kinds[m] == LOGISTIC
-        by_reach = is_logistic or layers > 1  # False: the whole square of a table is in reach
+        by_reach = is_logistic or layers > 1  # False if the whole square of a table is in reach
         for h in range(len(heights)):
             level, edge = levels[a, h], 0.0
             if not is_logistic:

@@ -259,7 +259,7 @@ def _chances(
     table = tables.chances[tables.start[level] : tables.start[level] + (2 * half + 1) ** 2]
     cells = np.empty(
         count, np.int32
-    )  # computed in a separate loop, because the compiler cannot vectorise a table look-up
+    )  # computed in a separate loop, because the compiler cannot vectorise the access to a table
     for n in range(count):
         scale = unit[n] * (1.0 / CELL)
         ex, ey = scale * (tx - x[n]), scale * (ty - y[n])

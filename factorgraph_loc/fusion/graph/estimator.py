@@ -49,7 +49,7 @@ from factors.se2 import Array
 __all__ = ["Batch", "BatchSettings", "Smoother", "SmootherSettings"]
 
 
-REPLAYED, TICK = 300, 2  # cost of the measurements replayed at once, and of one tick, in the units of `Sensor.work`
+REPLAYED, TICK = 300, 2  # computing cost of one slice of a replay, and of one tick, in the unit of `Sensor.work`
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,7 @@ class Smoother(Timeline):
         return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:
-        """Continue the replay of measurements by one slice of fixed cost."""
+        """Continue the replay of measurements by one slice of fixed computing cost."""
         work = REPLAYED
         while self._behind and work > 0:
             m = self._behind.popleft()

@@ -63,7 +63,7 @@ class Keyframe:
     ``index``, ``key``: its number and its key. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time.
     ``from_previous``: the motion since the previous keyframe. ``factor``: the factor of this motion, None until it is needed.
     ``is_elsewhere``: True if the robot was carried from the previous keyframe to this one. ``nodes``: the factors of measurements.
-    ``causal``: the estimate while this was the newest keyframe. ``final``: the estimate when this keyframe left a window.
+    ``causal``: the estimate while this was the newest keyframe. ``final``: the estimate when it left the window.
     """
 
     index: int
@@ -271,7 +271,7 @@ class Graph:
 
     @property
     def mapped_constants(self) -> int | None:
-        """The key of the estimated constants of the sensor whose points are mapped, or None if there are none."""
+        """The key of the estimated constants of the sensor that observes unknown points, or None if there are none."""
         return self.keys.get(self.mapper.sensor)
 
     def recalibrated(self, increment: Increment) -> Increment:

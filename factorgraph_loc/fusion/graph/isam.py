@@ -201,8 +201,8 @@ class Incremental:
         return value
 
     def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
-        """The estimate and covariance of the variable ``key``. ``known``: the covariance if it is already computed. ``graph``: the
-        copy of the graph in whose diagnostics a damping of the covariance is reported; by default the graph itself."""
+        """The estimate and covariance of the variable ``key``. ``known``: the covariance if it is already computed.
+        ``graph``: where a damping of the covariance is reported, by default the graph of the run."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if known is None else known

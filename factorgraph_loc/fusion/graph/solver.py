@@ -44,8 +44,8 @@ from factors.graph import (
 )
 from factors.se2 import Array
 
-# A pose may stay this much longer [s] in a window than the lag. Several poses then leave together, and their estimates are computed
-# at once. The second value is for windows with points, which are large.
+# A pose may stay in a window longer than the lag by this time [s]. Several poses then leave together, which saves time. The
+# second value is for windows with points, which are large.
 MARGIN, WITH_POINTS = 2.0, 1.0
 FOREVER = 1e300  # s; with this lag only variables with the time minus infinity leave a window
 
