@@ -48,7 +48,7 @@ def section(options: Options) -> Report:
     }
     outcomes = report.collect(faulty, jobs)
     report.say(
-        f"Number of rendered offices: {len(ready)}, of {options.seconds(DURATION):.0f} s, with a map from another "
+        f"Number of rendered offices: {len(ready)}. Each drive has {options.seconds(DURATION):.0f} s, and the map is from another "
         "drive. The cells are "
         f"position RMSE [m]: causal / final / causal in the last {AFTERWARDS:.0f} s of the worst run."
     )

@@ -59,7 +59,7 @@ def sentence(known: Sequence[FrameKnown]) -> str:
     low, high = (chi2.ppf(tail, 3 * count) / count for tail in tails)
     least = np.sqrt(np.mean([one.least**2 for one in known]))
     return (
-        f"The errors of the start poses have a mean NEES of {np.mean([one.nees for one in known]):.2f} (in 95 % of random draws: "
-        f"{low:.2f} to {high:.2f}). Without tags all poses of a run contain this error. With tags, and with the exact shape of the "
-        f"path, the Cramer-Rao bound of the error is {least:.4f} m."
+        f"The start poses have a mean NEES of {np.mean([one.nees for one in known]):.2f} (95 % interval for random errors: "
+        f"{low:.2f} to {high:.2f}). Without tags, the error of the start pose remains in all poses of a run. With tags the error "
+        f"is at least {least:.4f} m, even if the shape of the path is exactly known (Cramér-Rao bound)."
     )

@@ -84,8 +84,8 @@ def chain(report: Report, options: Options) -> None:
         report.say(
             f"The log has {links.images} images of 640 x 480 px with at most {COUNT} features (`{links.feature}`) each, "
             "and a map of "
-            f"{links.points} points. {os.cpu_count()} threads detect features, the other steps use one thread. *Smooth*: the "
-            "smoother without *associate*."
+            f"{links.points} points. {os.cpu_count()} threads detect features, the other steps use one thread. *Smooth*: "
+            "time of the smoother without *associate*."
         )
         whole = links.find + links.follow + links.associate + links.smooth
         parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}
@@ -102,7 +102,7 @@ def estimators(report: Report, duration: float) -> None:
         f"The next table has times of steps in {duration:.0f} s of `office` with identified points. A step processes an image with "
         "about 20 points (and a round of all eight antennas), and computes the estimate. *Second half*: steps in the "
         "second half of "
-        "the run. *Learnt*: estimated points."
+        "the run. *Learnt*: number of points that are estimated."
     )
     rows = []
     for (i, _), (ms, learnt) in report.collect(timed, jobs, workers=1).items():

@@ -62,7 +62,8 @@ def section(options: Options) -> Report:
 def accuracy(report: Report, outcomes: dict[tuple[int, int], Tested]) -> None:
     report.say(
         f"The cells combine both recordings, with {len(outcomes) // len(RUNS)} odometry seeds each. *Shipped rig*: "
-        "`datasets/rfid-aisle.rig.toml`, learnt on both. The cells are RMSE / median / p95 [m] / heading RMSE [rad] / ANEES."
+        "`datasets/rfid-aisle.rig.toml`, learnt on both recordings. The cells are RMSE / median / p95 [m] / heading RMSE [rad] / "
+        "ANEES."
     )
     rows = []
     for key in dict.fromkeys(key for outcome in outcomes.values() for key in outcome.runs):

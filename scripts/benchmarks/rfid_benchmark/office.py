@@ -23,7 +23,8 @@ def section(options: Options) -> Report:
             found[name] = {label: [outcome[label] for outcome in outcomes] for label in CONFIGS}
     worlds = ", ".join(f"{len(runs['smoother'])} worlds of {name}" for name, runs in found.items())
     report.say(
-        f"The table combines {worlds}, 10 min each. *Inside*: share of times at which the ANEES over worlds is in its 95 % band."
+        f"The table combines {worlds}, 10 min each. *Inside*: share of times at which the mean NEES over the worlds is in its "
+        "95 % band, ideally 95 %."
     )
     cells = [(name, label, *accuracy_cells(one)) for name, runs in found.items() for label, one in runs.items()]
     report.table(("preset", "estimator", *ACCURACY), cells)

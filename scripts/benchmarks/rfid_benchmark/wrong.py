@@ -74,7 +74,7 @@ def section(options: Options) -> Report:
         f"The table combines {len(seeds)} worlds of `office`, {DURATION:.0f} s each. *Ratio*: causal error, divided by "
         "the error with "
         "the right range, read probability and tags, and with a tempering for bursts. In brackets: 95 % interval over worlds. "
-        "*Worst*: the largest ratio of a single world. *ANEES, right*: with these right values."
+        "*Worst*: the largest ratio of a single world. *ANEES, right*: ANEES of estimators that know these values."
     )
     heads = ("wrong", "estimator", "ratio", "worst", "ANEES", "ANEES, right", "not localized")
     report.table(heads, rows)
