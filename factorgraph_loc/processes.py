@@ -231,7 +231,7 @@ def _without_script() -> Iterator[None]:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Let processes that start in this block ignore keyboard interrupts. Signals to this process are deferred until its end."""
+    """Let processes that start in this block ignore keyboard interrupts. This process gets its signals after it."""
     resource_tracker.ensure_running()  # otherwise it starts with the first process, and unblocks interrupts
     came: list[int] = []
     replaced = {}

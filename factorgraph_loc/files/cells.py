@@ -94,7 +94,7 @@ class Cells:
         """Return the cells without invalid rows if the manifest skips them, and in order of time if the manifest sorts them.
 
         ``columns``: the description of each field, the timestamps first. ``offset`` [s]: is added to the timestamps.
-        ``more``: further invalid cells. The numbers of skipped and of sorted rows are appended to ``warnings``.
+        ``more``: further invalid cells. Skipped rows and sorted rows add a warning each to ``warnings``.
         """
         rules = self.rules
         if rules is None or rules.refuse:
@@ -110,7 +110,7 @@ class Cells:
         return kept
 
     def without(self, faults: Sequence[Fault], warnings: list[Notice]) -> "Cells":
-        """Return the cells of the rows that have no fault. A warning has the number of rows with ``faults``.
+        """Return the cells of the rows without ``faults``. Skipped rows add a warning to ``warnings``.
 
         Raises InputError at the first fault if the manifest does not skip invalid rows.
         """
@@ -158,7 +158,7 @@ class Cells:
         return stamps[0]
 
     def _of_one_log(self, t_ns: Integers) -> Integers:
-        """Return the timestamps. Raises InputError if they are too far apart, with the key that skips the outlier."""
+        """Return ``t_ns``. Raises InputError, with the key that skips outliers, if timestamps are too far apart."""
         try:
             require_span([(self.path, self.rows, t_ns)])
         except InputError as error:

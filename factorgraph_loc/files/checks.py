@@ -20,15 +20,15 @@ ROUNDING = 1e-6  # s; tolerance of comparisons of time differences
 
 
 def require_finite(source: object, rows: Integers, names: Sequence[str], table: Array) -> None:
-    """Raise InputError at the first number of ``table`` (N, K) that is NaN or infinite. ``names``: the names of the K columns."""
+    """Raise InputError at the first number of ``table`` (N, K) that is NaN or infinite.
+
+    ``names``: names of the K columns. ``rows`` (N,): row numbers in the file ``source``, for the message.
+    """
     require_none(source, rows, not_finite(names, table))
 
 
 def not_finite(names: Sequence[str], table: Array) -> list[Fault]:
-    """Return a :class:`Fault` for each of the K columns of ``table`` (N, K), with a mask of its numbers that are NaN or infinite.
-
-    ``names``: the names of the K columns.
-    """
+    """Return the NaN and infinite numbers of ``table`` (N, K) as a :class:`Fault` for each of the K columns ``names``."""
     columns = zip(names, table.T, strict=True)
     return [Fault(name, values, ~np.isfinite(values), "a finite number") for name, values in columns]
 
@@ -36,10 +36,10 @@ def not_finite(names: Sequence[str], table: Array) -> list[Fault]:
 def in_order(
     source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], rules: RowRules | None = None
 ) -> Integers:
-    """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last one.
+    """Return the indices (M,) of the rows to keep: the last of all rows with equal timestamps ``t_ns`` (N,).
 
-    ``rules``: the rules of the manifest, from which the message names a remedy; None without a manifest. Raises
-    InputError if a timestamp is older than the one before it.
+    ``rows`` (N,): row numbers in the file ``source``. ``rules``: keys of the manifest, for the error message. Skipped
+    rows add a warning to ``warnings``. Raises InputError if a timestamp is older than the one before it.
     """
     _require_order(source, rows, t_ns, rules)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
@@ -59,9 +59,9 @@ def increments_in_order(
 ) -> tuple[Integers, Array]:
     """Merge the odometry increments that have equal timestamps ``t_ns`` (N,), by composition of their motions.
 
-    ``moves`` (N, 3): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there. A fourth column, the
-    time [s] in which the motion is unknown, is summed. Returns distinct timestamps (M,) and the motion (M, 3 or 4) since the
-    timestamp before. ``rules``: see :func:`in_order`. Raises InputError if a timestamp is older than the one before it.
+    ``moves`` (N, 3 or 4): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there, and
+    optionally the time [s] in which the motion is unknown. Returns distinct timestamps (M,) and the motion (M, 3 or 4)
+    since the timestamp before. For errors and the other arguments see :func:`in_order`.
     """
     _require_order(source, rows, t_ns, rules)
     last, out = composed(t_ns, moves[:, :3])
@@ -76,7 +76,7 @@ def increments_in_order(
 
 
 def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRules | None) -> None:
-    """Raise InputError at the first row whose timestamp is older than that of the row before it."""
+    """Raise InputError at the first timestamp ``t_ns`` (N,) that is older than the one before it, see :func:`in_order`."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
@@ -85,7 +85,7 @@ def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRul
 
 
 def _remedy(rules: RowRules | None) -> str:
-    """Return the end of an error message that names the key for sorting rows. Return "" without a manifest."""
+    """Return the end of an error message, with the manifest's key for sorting rows. Return "" if ``rules`` is None."""
     return "" if rules is None else rules.sorting
 
 
@@ -98,10 +98,10 @@ def arrivals(
     *,
     max_late_ns: int | None = MAX_LATE_NS,
 ) -> None:
-    """Check the delays of timestamps ``t_ns`` (N,) in order of arrival. A timestamp older than a previous one is late.
+    """Check timestamps ``t_ns`` (N,) in file order. A row is late if a row before it has a newer timestamp.
 
-    Late timestamps cause a warning. Raises InputError if one is older than the newest before it by more than
-    ``max_late_ns``; None permits any delay.
+    Late rows add a warning to ``warnings``. Raises InputError if a row is late by more than ``max_late_ns``, unless it
+    is None. For the other arguments see :func:`in_order`.
     """
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
@@ -127,10 +127,10 @@ def last_in_order(
     names: Sequence[str] | None = None,
     rules: RowRules | None = None,
 ) -> Integers:
-    """Return the indices (M,) of the rows to keep, in order of arrival: of rows with equal timestamps only the last one.
+    """Check timestamps ``t_ns`` (N,) by :func:`arrivals`. Return the indices (M,) of the rows to keep, in file order.
 
-    ``t_ns`` (N,): timestamps, which are checked by :func:`arrivals`. ``names``: N landmarks; if given, only rows with
-    equal timestamp and landmark count as equal.
+    Of rows with equal timestamps, only the last is kept. ``names``: the landmark of each row. If it is given, only rows
+    with equal landmark and timestamp count as equal. For the other arguments see :func:`in_order`.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)

@@ -60,7 +60,7 @@ class ColumnMapping(FileModel):
     """which rows to read: by column of the file, the value or the list of possible values"""
 
     def chosen(self) -> dict[str, set[str]]:
-        """Return the setting ``where`` as texts: by column of the file, the set of permitted cells. Other rows are not read."""
+        """Return the setting ``where`` with values as texts: for each column in it, the values of the rows to read."""
         return {
             column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
             for column, values in self.where.items()
@@ -81,13 +81,13 @@ def read_mapped(
     optional: Collection[str] = (),
     either: Collection[str] = (),
 ) -> Cells:
-    """Read the cells of a file that a mapping assigns to fields.
+    """Read those columns of the file ``path`` that ``mapping`` assigns to fields.
 
     ``shapes``: sets of fields. The mapping must have all fields of one of these sets.
-    ``optional``: fields that the mapping may have too. The file may lack their columns.
-    ``either``: fields whose columns the file may lack too, but it must have at least one of those that the mapping has.
+    ``optional``: further fields that the mapping may have. The file may lack the columns of these fields.
+    ``either``: fields of the shapes. The file may lack some of their columns, but not all.
 
-    Raises InputError with file, row and column if the mapping or the file is invalid, or no row is selected.
+    Raises InputError if the mapping or the file is invalid, or if no row has the values in ``mapping.where``.
     """
     given = set(mapping.columns)
     known = set(optional).union(*shapes)
@@ -95,7 +95,7 @@ def read_mapped(
         raise InputError(f"{path}: there is no field {quoted(unknown[0])} to map{nearest(unknown[0], sorted(known))}")
     if not any(set(shape) <= given <= set(shape).union(optional) for shape in shapes):
         expected = " or ".join(", ".join(shape) for shape in shapes)
-        raise InputError(f"{path}: columns maps {listed(sorted(given)) or 'nothing'}, expected {expected}")
+        raise InputError(f"{path}: columns maps {listed(sorted(given)) or 'nothing'}, expected the fields {expected}")
     if stray := sorted(set(mapping.units) - given):
         raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns: map the field, or remove the unit")
     needed: list[Alternatives] = [
@@ -123,8 +123,7 @@ def _mapped(
 ) -> Cells:
     """Return the cells of a file by field.
 
-    ``columns``: cells by column of the file. ``available``: names of all columns of the file. ``unwanted``: number of
-    rows that ``where`` excludes. ``passed``: number of JSON objects that lack needed columns.
+    ``columns``: cells by column of the file. ``available``: names of all its columns. For others see :class:`Cells`.
     """
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
@@ -156,8 +155,9 @@ class TableFolder:
         return inside(self.path, name, self.path)
 
     def read(self, mapping: TimedMapping, shapes: Sequence[Collection[str]], columns: Mapping[str, Column]) -> Cells:
-        """Read the file of a mapping by :func:`read_mapped`, and record what was read by :meth:`noted`. ``columns``:
-        the description of each field.
+        """Read the file of a mapping by :func:`read_mapped` with ``shapes``, and pass the cells to :meth:`noted`.
+
+        ``columns``: the description of each field.
         """
         return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
 

@@ -108,7 +108,7 @@ class Column:
     def in_unit(self, unit: str | float, source: object = "") -> tuple[Column, float]:
         """Return the column with bounds in another unit, and the factor from that unit to :attr:`unit`.
 
-        ``unit``: a name in ``units``, or the factor. Raises InputError with the file ``source`` for an unknown unit.
+        ``unit``: a name in ``units``, or that factor. Raises InputError with the file ``source`` for an unknown unit.
         """
         factor = self.units.get(unit, 0.0) if isinstance(unit, str) else float(unit)
         if not LEAST_UNIT <= abs(factor) <= 1.0 / LEAST_UNIT:
@@ -187,7 +187,7 @@ def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int,
 
 
 def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Integers]]) -> None:
-    """Raise InputError if timestamps of a log are more than :data:`MAX_SPAN` apart. It names the one farthest from the median.
+    """Raise InputError if timestamps of a log are more than :data:`MAX_SPAN` apart. The message has the worst outlier.
 
     ``tables``: for each table the file, the row numbers (N,) in the file, and the timestamps (N,) [ns].
     """
@@ -198,7 +198,7 @@ def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Intege
         raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
-# the unit of a timestamp since 1970 is the first whose bound it exceeds; this is correct for times after 1973
+# the unit of a timestamp since 1970 is the first one with a bound below the timestamp, which is correct after 1973
 SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
 
 

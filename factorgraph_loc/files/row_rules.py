@@ -84,8 +84,8 @@ class RowRules(FileModel):
         return np.flatnonzero(~wrong)
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
-        """Return indices (N,) that sort the rows by their timestamps ``t_ns`` (N,). If ``order`` is "refuse", the
-        indices are 0 to N - 1. If rows are sorted, a warning has the number of late rows."""
+        """Return indices (N,) that sort the rows by timestamp ``t_ns`` (N,), or 0 to N - 1 if ``order`` is "refuse".
+        Sorted rows add a warning to ``warnings``. ``rows`` (N,): row numbers in the file ``source``, for the warning."""
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))

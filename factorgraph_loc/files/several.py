@@ -47,7 +47,7 @@ def is_name(name: str) -> bool:
 def by_name(section: str, value: Model | Mapping[str, Model] | None) -> dict[str, Model]:
     """Return the models in a field of the type :func:`one_or_several`, by table name.
 
-    ``section``: name of the field. The table of a single model has this name, that of several models is ``section.NAME``.
+    ``section``: name of the field. A single model is in the table ``section``, one of several in ``section.NAME``.
     """
     if isinstance(value, Mapping):
         return {f"{section}.{name}": model for name, model in value.items()}

@@ -26,7 +26,7 @@ def readers() -> dict[str, Path]:
 
 
 def folder() -> Path:
-    """Return the folder of these files. It is inside the installed package, or next to the package in a source checkout."""
+    """Return the folder ``datasets`` of the installed package. In a source checkout it is next to the package."""
     package = Path(str(resources.files(__name__.partition(".")[0])))
     installed = package / "datasets"
     return installed if installed.is_dir() else package.parent / "datasets"

@@ -209,7 +209,7 @@ def read_table(path: Path, tables: Sequence[Table], rules: RowRules, warnings: l
     """Read a CSV or Parquet file that contains one of several possible ``tables``. Other columns of the file are ignored.
 
     Raises InputError with file, row and column if a value is missing, is not a number, or is out of bounds, unless
-    ``rules`` skip such rows. Skipped and sorted rows are counted in ``warnings``.
+    ``rules`` skip such rows. Skipped rows and sorted rows add a warning each to ``warnings``.
     """
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
         cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables, rules)

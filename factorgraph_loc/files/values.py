@@ -24,7 +24,7 @@ FEW = 30  # maximum number of values that a Python loop checks faster than NumPy
 def seconds_of(where: str, value: object, name: str = "t") -> float:
     """Return the time ``value`` [s] as a float. Raises InputError if it is not a number or out of range.
 
-    ``where``, ``name``: the object and its field that have the value, for the message. See :func:`numbers`.
+    ``where``: the object that has the value, and ``name``: the field of the object; both are for the message.
     """
     if type(value) is float and SECONDS.low <= value <= SECONDS.high:
         return value

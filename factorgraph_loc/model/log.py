@@ -83,8 +83,8 @@ class Log:
     def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
         """Return the measurements as :meth:`measurements` does, but with rows of one stream joined, which is faster to process.
 
-        Successive rows of a stream with ``joins`` are one :class:`~factorgraph_loc.model.measurement.Rows` if no other
-        measurement arrives between them, and if each row is newer than the previous one.
+        Successive rows of a stream become one :class:`~factorgraph_loc.model.measurement.Rows` if the stream allows it
+        (``joins``), no other measurement arrives between them, and each row is newer than the previous one.
         """
         order = self._in_order(sensors)
         joined = next((rank for rank, name in enumerate(order) if self.streams[name].joins), None)
@@ -146,9 +146,9 @@ def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]
 def cut(log: Log, start: float, end: float) -> Log:
     """Return the part of a log, and of its reference, with timestamps from ``start`` to before ``end`` [s].
 
-    Timestamps are those of each sensor's own clock, and do not change. A known start is dropped. A velocity from before
-    ``start`` does not apply in the part. The first increment of odometry is still the motion since the previous row of
-    the whole log. Raises InputError if no measurement is left.
+    Timestamps do not change. Time offsets of sensors are not considered. The part has no known start pose. Its first
+    odometry increment is still the motion since the previous row of the whole log. Raises InputError if no measurement
+    is left.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:
@@ -171,9 +171,9 @@ def cut(log: Log, start: float, end: float) -> Log:
 def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
     """Join two logs to the log of a kidnapped robot: ``second`` follows ``gap`` seconds after the end of ``first``.
 
-    The timestamps of ``second`` are shifted; its poses are not changed. The time between the references is not scored. The last
-    velocity of ``first`` applies until the first row of ``second``. The first increment of ``second`` becomes zero. Start, metadata
-    and absolute time are those of ``first``. Raises InputError if rig, map or kind of odometry differ, or if ``gap`` <= 0.
+    The timestamps of ``second`` are shifted, its poses are not changed, and its first odometry increment becomes zero.
+    Start, metadata and absolute time are from ``first``. Raises InputError if rig, map or kind of odometry differ, or
+    if ``gap`` <= 0.
     """
     if gap <= 0.0:
         raise InputError(f"the gap between {first.name} and {second.name} is {gap:g} s, expected more than 0")

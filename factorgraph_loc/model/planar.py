@@ -18,7 +18,7 @@ RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a
 TILT = math.radians(10.0)  # angle between the z axes of the robot and the world: limit for a warning
 NEGLIGIBLE = 1e-9  # component of a unit vector below which an axis does not contribute
 UNIT = 0.01  # tolerance of the norm of a quaternion
-# a variance marks a null pose if it is at least HUGE [m^2] and at least ABOVE_USUAL times the median, because odometry is uncertain
+# a variance marks a null pose if it is at least HUGE [m^2] and at least ABOVE_USUAL times the median of all variances
 HUGE, ABOVE_USUAL = 1000.0, 100.0
 NAMED = {"body": "x y z", "optical": "z -x -y"}  # axes that point forward, left and up, by name
 

@@ -77,11 +77,13 @@ def parse_position(prior: str) -> list[float]:
     try:
         x, y, *heading = (float(part) for part in prior.split(","))
     except ValueError:
-        raise InputError(f"prior is {quoted(prior)}, expected {PRIORS}") from None
+        raise InputError(f"prior is {quoted(prior)}, expected one of {PRIORS}") from None
     if len(heading) > 1:
-        raise InputError(f"prior is {quoted(prior)}, expected {PRIORS}")
+        raise InputError(f"prior is {quoted(prior)}, expected one of {PRIORS}")
     if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST and all(abs(angle) <= 2.0 * math.pi for angle in heading)):
-        raise InputError(f"prior is {quoted(prior)}, expected metres, at most {FARTHEST:g}, and a heading in radians")
+        raise InputError(
+            f"prior is {quoted(prior)}, expected X and Y up to {FARTHEST:g} m, and a heading up to 2 pi rad"
+        )
     return [x, y, *heading]
 
 
@@ -105,8 +107,8 @@ def parse_seeds(text: str, source: object = "--seeds") -> range:
 class Ticks:
     """The ticks of a run, the times of the recorded estimates, generated while measurements arrive.
 
-    ``start``: time of the first tick [s]. A tick follows all measurements up to its time. A gap of more than ``gap`` [s] between
-    measurements has no ticks, so that the cost of a gap does not grow with its length. The grid continues after the gap.
+    ``start``: time of the first tick [s]. A tick follows all measurements up to its time. Ticks have a constant
+    interval, but there are none in a time of more than ``gap`` [s] without measurements.
     """
 
     def __init__(self, start: float, gap: float = TICK_GAP) -> None:

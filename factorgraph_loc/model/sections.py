@@ -19,8 +19,8 @@ class Section:
 
     ``kind``: the class of its settings, a :class:`~factorgraph_loc.files.models.FileModel`.
     ``always``: True if a rig without the section gets the default settings.
-    ``several``: True if a rig may have several such sensors by name, ``[section.NAME]``. Their stream, its only table
-    and the modality of the measurements must then have the name of the section.
+    ``several``: True if a rig may have several such sensors, each in a table ``[section.NAME]``. The sensor's stream,
+    its only table and the modality of its measurements must then have the name of the section.
     """
 
     kind: Place
@@ -36,9 +36,9 @@ class Layer:
     ``table``: the description of a table with many elements.
     ``read``: a function ``(content, source, folder) -> elements`` that converts the value in a world file, such as the
     name of a table in ``folder``.
-    ``write``: a function ``(elements, path of the world file without suffixes) -> content``. It may write a table and
-    returns the value in the world file, or None to keep the elements there.
-    ``suffix``: the suffix of these tables.
+    ``write``: a function ``(elements, path of the world file without suffixes) -> content``. It writes a table and
+    returns its name for the world file, or returns None if the world file itself shall contain the elements.
+    ``suffix``: the suffix of the tables that ``write`` writes.
     """
 
     kind: Place
@@ -98,5 +98,5 @@ def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
 
 
 def layers() -> dict[str, Layer]:
-    """Return the layers of a map by name."""
+    """Return the layers that a map may have, such as ``landmarks`` and ``tags``, by name. Sensors register them."""
     return {name: layer for sensor in registered().values() for name, layer in sensor.layers.items()}

@@ -108,9 +108,9 @@ class SensorSettings(FileModel):
         return Estimated.of(self.constants, getattr(self, "uncertainty", None))
 
     def map_error(self, world: World) -> Callable[[Array], Array] | None:
-        """Return a function for the error of the sensor's map. Returns None if the frame of the map is exact.
+        """Return a function from poses (N, 3) to covariances (N, 3, 3) of (x, y, heading), or None if the map is exact.
 
-        From poses (N, 3) the function computes covariances (N, 3, 3) of (x, y, heading), the error of the map's frame there.
+        A covariance is the uncertainty of the frame of the sensor's map at that pose.
         """
         return None
 
