@@ -128,7 +128,7 @@ class Stack(Protocol):
         whose columns :mod:`factors.chain` defines."""
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """The loss, summed over all factors."""
+        """The loss at ``poses`` (N, 3) and ``parameters`` (P,), summed over all factors."""
 
 
 @runtime_checkable
@@ -190,7 +190,7 @@ def jacobian_factors(
 
 
 def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:
-    """A linear factor on the variables ``keys``, from the whitened ``residual`` (m,) and a Jacobian (m, d) for each variable."""
+    """A linear factor on the variables ``keys``, from the whitened ``residual`` (m,) and Jacobian ``blocks`` (m, d)."""
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)

@@ -43,7 +43,7 @@ class Layout:
         return columns
 
     def plus(self, name: str, size: int) -> Layout:
-        """The layout with one more block, with this name and number of components, at the end."""
+        """The layout with one more block at the end. ``size``: its number of components."""
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:
@@ -52,7 +52,7 @@ class Layout:
 
 
 def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Estimated]:
-    """The estimated constants of the odometry and of the sensors, by the name of their block."""
+    """The estimated constants of the odometry (``motion``) and of the sensors, by the name of their block."""
     return {MOTION: motion.constants} | {name: sensor.constants for name, sensor in sensors.items()}
 
 

@@ -149,8 +149,8 @@ class Population:
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
-        """Queue an observation with the fields of :class:`WeighedObservation`. Returns False if it is ignored, because
-        it is older than the last queued observation."""
+        """Queue an observation. The arguments are the fields of :class:`WeighedObservation`. Returns False if it is
+        ignored, because it is older than the last one in the queue."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
         if newest is not None and odometry.t < newest.t:
             return False

@@ -135,7 +135,7 @@ class Tracking(Search):
         return is_doubted(self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
-        """Report an observation before it corrects the estimated pose. Sensors that can find a pose use it to check the track."""
+        """Report an observation before it corrects the pose, for sensors that check the track. ``view``: the state."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
             self._looked.append(odometry.t)

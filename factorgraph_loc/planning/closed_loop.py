@@ -279,7 +279,7 @@ class _ClosedLoop:
 
 
 def _rates(simulation: SimulationSettings) -> Iterator[tuple[str, float]]:
-    """Yield for each of the robot's sensors the name of the setting of its rate, and the rate [Hz]."""
+    """Yield the names of those settings in ``simulation`` that are rates of sensors, with the rates [Hz]."""
     yield "rounds_per_second", simulation.rounds_per_second
     for sensor in sensors().values():
         for section in sensor.simulation if sensor.on_robot else ():

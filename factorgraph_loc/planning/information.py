@@ -114,10 +114,9 @@ def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
 
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
-    """True if particles (M, 3) with ``weights`` (M,) are poorly described by a Gaussian.
-
-    This is so if the heading is unknown. It is also so if the entropy of a Gaussian with their covariance exceeds the
-    entropy of their positions by more than :data:`SEVERAL`.
+    """True if particles ``poses`` (M, 3) with ``weights`` (M,) are poorly described by a Gaussian. This is so if the
+    heading is unknown, or if the entropy of a Gaussian with their covariance exceeds the entropy of their positions by
+    more than :data:`SEVERAL`.
     """
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:

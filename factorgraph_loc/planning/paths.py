@@ -138,8 +138,8 @@ def waypoints(space: FreeSpace, count: int) -> Array:
 
 
 def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: int = 1) -> NDArray[np.int64]:
-    """Return how far robots can follow paths without coming too close to walls: the index (C, M) of the last pose that
-    is reached, for each of C paths and M robots.
+    """Return how far robots can follow paths in ``space`` without coming too close to walls: the index (C, M) of the
+    last pose that is reached, for each of C paths and M robots.
 
     ``poses`` (M, 3): the start poses of the robots in the world frame. A robot that starts too close to a wall may
     drive away from it.

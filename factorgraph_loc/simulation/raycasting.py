@@ -217,8 +217,8 @@ def _shade(
     rotation: Array,
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
-    """Return the index of the face that the ray along (x, y, 1) in the camera frame hits, as :func:`cast` does, and the
-    colour (blue, green, red) of the hit point."""
+    """Return the index of the face that the ray along (x, y, 1) in the camera frame hits, and the colour (blue, green,
+    red) of the hit point. The other arguments are those of :func:`cast` and :func:`expose`."""
     x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]

@@ -92,8 +92,8 @@ def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
 
 
 def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
-    """Return the plan of an office: rooms on both sides of a corridor along x. Each room has a door to the corridor
-    and, if it is large enough, furniture in its two outer corners."""
+    """Return the plan of an office in ``outline``: rooms on both sides of a corridor along x. Each room has a door to
+    the corridor and, if it is large enough, furniture in its two outer corners."""
     if width < 4.0 or depth < 6.0:
         raise InputError(f"world: {width:g} x {depth:g} m is too small for an office, expected at least 4 x 6 m")
     rooms = max(1, round(width / ROOM_WIDTH))

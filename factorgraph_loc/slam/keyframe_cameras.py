@@ -122,8 +122,8 @@ class LocalBundle:
     pixels: Array
 
     def linearize(self, state: State) -> tuple[Array, Array, Array]:
-        """Return the whitened, robustly weighted residuals (M, 2) of the pixels, their Jacobian, and the squared
-        whitened residuals (M,) without weights."""
+        """Return the whitened, robustly weighted residuals (M, 2) of the pixels at ``state``, their Jacobian, and the
+        squared whitened residuals (M,) without weights."""
         poses, tilts, points = state
         at = poses[self.frames], tilts[self.frames], points[self.owners], self.pixels
         model = self.model

@@ -114,7 +114,7 @@ class LoopClosure:
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """Return the old points that one image shows, or None if it shows none. Other images are not considered."""
+    """Return the old points that one image shows, or None if it shows none. The arguments are those of ``compare``."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:
@@ -128,8 +128,8 @@ def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable
 
 
 def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tuple[Array, Integers, Integers] | None:
-    """Return the pose (3,) of the robot, computed from the ``points`` in an image, and the matches: indices of points
-    (M,) and of features (M,). Returns None if the pose is not on the floor, or if too few of the visible points match.
+    """Return the pose (3,) of the robot, computed from the ``points`` in the image ``frame``, and the indices (M,) of
+    the matched points and features. Returns None if the pose is not on the floor, or if too few visible points match.
     """
     associator = Associator(points, model)
     somewhere = associator.relocalized(frame)

@@ -256,7 +256,7 @@ class Monoslam(Filter):
         return self._matcher.unless_slipped(m, state, eye, *slip)
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Return the state after the Kalman update by the matches. In a known map the update is iterated, with Huber weights.
+        """Return the state after a Kalman update of ``prior`` by ``match``, iterated with Huber weights in a known map.
 
         The noise of a pixel outside the gate is increased.
         """

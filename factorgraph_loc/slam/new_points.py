@@ -153,7 +153,7 @@ def has_parallax(
     last: PointSighting,
     last_camera: KeyframeCamera,
 ) -> bool:
-    """True if the angle between the rays of two sightings is large enough for a triangulation. This is a cheap first test."""
+    """True if the angle between the rays of the sightings ``first`` and ``last`` is large enough to triangulate."""
     sigma = math.hypot(model.sigma, max(first_camera.slack, last_camera.slack)) / model.fx
     angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
     return float((first_camera.rotation @ first.ray) @ (last_camera.rotation @ last.ray)) < math.cos(angle)

@@ -159,9 +159,9 @@ class UnknownPoints(Mapper):
     def _add_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, most: int, movers: MovingThings
     ) -> Array:
-        """Collect the sightings of points that are not in the graph. Add at most ``most`` of these points, if triangulated, to it.
-
-        Returns the pose (3,) of the keyframe. It is adjusted if the points of the graph do not determine it.
+        """Collect the sightings of points that are not in the graph. Add at most ``most`` of these points, if
+        triangulated, to it. ``movers``: the tracks on moving objects. Returns the pose (3,) of the keyframe, which is
+        adjusted if the points of the graph do not determine it.
         """
         m, keyframe, graph, addition = image.m, image.keyframe, image.graph, image.addition
         fresh = [i for i, name in enumerate(chosen.names) if name not in self._points]
@@ -193,7 +193,7 @@ class UnknownPoints(Mapper):
 
     def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
         """Return the name of the point in each row of the image. A point of a feature has the number of the feature
-        track in which it was first observed. Lost points are searched, and keep their name in another track."""
+        track in which it was first observed. Lost points are searched from ``camera``, and keep their name."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
@@ -371,7 +371,7 @@ class UnknownPoints(Mapper):
     def _add_observation(
         self, image: _NewImage, name: Hashable, sighting: PointSighting, agrees: bool, pose: Array
     ) -> None:
-        """Add the observation ``sighting`` of the point ``name`` of the graph, or count an outlier if ``agrees`` is False."""
+        """Add a sighting of the point ``name`` from ``pose`` (3,), or count an outlier if ``agrees`` is False."""
         point = self._points[name]
         if not agrees:
             self.diagnostics.reject("camera: point disagrees with the other points of the image")
@@ -389,7 +389,7 @@ class UnknownPoints(Mapper):
         self._add_factor(image, image.keyframe, point.key, sighting)
 
     def _add_factor(self, image: _NewImage, keyframe: Keyframe, key: int, sighting: PointSighting) -> None:
-        """Add the factor of a ``sighting`` of the point with this ``key`` from ``keyframe``."""
+        """Add the factor of a ``sighting`` of the point ``key`` from ``keyframe`` to the graph of ``image``."""
         constants = image.graph.mapped_constants
         keys = (keyframe.key, *(() if constants is None else (constants,)), tilt_key(keyframe.index), key)
         twist = self._cameras.twists.get(keyframe.index)

@@ -49,16 +49,16 @@ def _radial(k: Lens, rr: float) -> tuple[float, float]:
 
 @compiled
 def radial_slope(k: Lens, rr: float) -> float:
-    """The derivative of the distorted distance from the axis by the undistorted distance, of a rational or fisheye
-    lens. ``rr``: the squared undistorted distance."""
+    """The derivative of the distorted distance from the axis by the undistorted distance, of a rational or fisheye lens
+    ``k``. ``rr``: the squared undistorted distance."""
     radial, slope = _radial(k, rr)
     return float(radial + rr * slope)
 
 
 @compiled(inline="always")
 def _bent(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """Distort a direction (x, y) within the valid radius. Returns the distorted direction (2 numbers), and its
-    derivatives: x by x, x by y (which equals y by x), and y by y."""
+    """Distort a direction (x, y) within the valid radius of the lens ``k``. Returns the distorted direction (2
+    numbers), and its derivatives: x by x, x by y (which equals y by x), and y by y."""
     k1, k2, p1, p2 = k[4], k[5], k[6], k[7]
     rr = x * x + y * y
     radial = 1.0 + k1 * rr + k2 * rr * rr
@@ -75,7 +75,7 @@ def _bent(k: Lens, x: float, y: float) -> tuple[float, float, float, float, floa
 
 @compiled(inline="always")
 def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float, float, float]:
-    """Distort any direction (x, y). Returns the distorted direction (2 numbers) and its Jacobian row by row (4 numbers).
+    """Distort any direction (x, y) by the lens ``k``. Returns the result (2 numbers) and its Jacobian by rows (4).
 
     Let B be the distortion and R its valid radius. Beyond R the distortion of a direction d is extrapolated radially,
     as ``t B(d / t)`` with ``t = |d| / R``. Directions far outside of the image then do not appear in the image.
@@ -93,7 +93,7 @@ def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float,
 def pixel(
     k: Lens, p0: float, p1: float, p2: float
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
-    """Project a point (p0, p1, p2) in the camera frame. Returns the pixel coordinates u and v, and their gradients by the point."""
+    """Project a point in the camera frame by the lens ``k``. Returns the pixel (u, v), and the gradients of u and v."""
     near = 1.0 / max(p2, NEAREST)
     x, y = p0 * near, p1 * near
     xd, yd, xx, xy, yx, yy = _distorted(k, x, y)
@@ -132,7 +132,7 @@ def in_camera(
 
 @compiled(error_model="numpy")
 def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
-    """Invert the distortion by Newton's method.
+    """Invert the distortion of the lens ``k`` by Newton's method.
 
     ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and the remaining errors (K,)
     of their distortion. Only directions at which the lens's Jacobian has a positive determinant are found. The result
@@ -308,8 +308,8 @@ def see(
     residual: Array,
     jacobian: Array,
 ) -> float:
-    """Linearise one measurement of :func:`whiten`. ``at``: pose, tilt, point and measured pixel. Writes ``residual``
-    (2,) and ``jacobian`` (2, WIDTH). Returns the squared norm of the residual without robust weight."""
+    """Linearise one measurement of :func:`whiten`. ``camera``: lens, position, rotation. ``at``: pose, tilt, point,
+    pixel. Writes ``residual`` (2,) and ``jacobian`` (2, WIDTH). Returns the squared residual without robust weight."""
     pose, tilt, point, measured = at
     u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
     residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma

@@ -136,5 +136,5 @@ class PointPrior:
 
 
 def _from_robot(pose: Array, point: Array) -> Array:
-    """A world point (3,) in the robot frame."""
+    """Transform a world point (3,) to the frame of a robot at ``pose`` (3,)."""
     return np.append(se2.transform_to(pose, point[:2]), point[2])

@@ -337,7 +337,7 @@ class BearingRangeStack:
         jacobian[:, 6 + self._column : 6 + end] = by_all[:, CONSTANTS:][:, self._estimated]
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """The robust loss, summed over all factors."""
+        """The robust loss at ``poses`` (N, 3) and ``parameters`` of the graph, summed over all factors."""
         error, _, slopes = self._whitened(poses, parameters)
         return float(losses.loss(self._model, error, slopes))
 

@@ -132,8 +132,8 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
 
 @compiled(error_model="numpy")
 def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
-    """The number of landmarks whose normalised innovation squared exceeds ``limit``, at a ``pose`` (3,) with body-frame
-    ``covariance`` (3, 3)."""
+    """The number of landmarks in the measurement ``packed`` with a normalised innovation squared above ``limit``, at a
+    ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
     count = len(packed[0])
     error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
     linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
@@ -266,7 +266,7 @@ def weighted(
 
 @compiled(error_model="numpy")
 def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """The whitened errors (K,) of ranges at a predicted pose with body-frame ``covariance`` (3, 3), their
+    """The whitened errors (K,) of the ranges in ``packed`` at a pose with body-frame ``covariance`` (3, 3), their
     :func:`slopes` (K,), and the variances (K,) of the predicted ranges in units of the noise."""
     count = len(packed[0])
     error, jacobian, slope, variances = (

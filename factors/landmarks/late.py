@@ -123,7 +123,7 @@ _PARTS = len(MEANS) * len(SPREADS)  # number of successive hypotheses with equal
 
 @lru_cache(maxsize=16)
 def _prior(probability: float) -> Array:
-    """The log prior probabilities (noises, 1 + H) of all hypotheses. In the first column no range is late."""
+    """The log priors (noises, 1 + H) of all hypotheses, first no late range. ``probability``: of late ranges."""
     biased = BIASED * (1.0 - probability)
     excess = np.where(_IS_LATE, probability, biased) / _MEANS
     for group in (_IS_LATE, ~_IS_LATE):

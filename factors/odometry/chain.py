@@ -129,9 +129,8 @@ class OdometryChain:
         return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array, unknown: Array | None = None) -> None:
-        """Add N motions as :meth:`add_increment` does, in order of time and after all existing rows. Motions with equal
-        timestamps are composed.
-        """
+        """Add N motions (N,) as :meth:`add_increment` does, in order of time and after all existing rows. Motions with
+        equal times are composed."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
             return
@@ -304,7 +303,7 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
 
 @compiled
 def twist_at(knots: Array, count: int, constants: Array, t: float) -> tuple[float, float, float]:
-    """The robot's mean velocity before ``t``, as :meth:`OdometryChain.twist` defines it."""
+    """Compute :meth:`OdometryChain.twist`. The arguments are those of :func:`state_at`."""
     a, b = state_at(knots, count, t - TWIST_TIME, constants), state_at(knots, count, t, constants)
     moved = se2.between_scalars(a[1], a[2], a[3], b[1], b[2], b[3])
     x, y, turned = se2.log_scalars(moved[0], moved[1], moved[2])

@@ -113,7 +113,7 @@ def insert(
 @compiled
 def integrate(rows: Array, knots: Array, begin: int, end: int, constants: Array) -> None:
     """Integrate the odometry rows from index ``begin`` up to, but not including, ``end``. Writes the state at each row
-    into ``knots``, computed from the previous one."""
+    into ``knots``. ``constants``: the model as an array."""
     scale_distance, scale_rotation, speed_bias = constants[0], constants[1], constants[2]
     heading_rate_bias, heading_drift, turn_slowdown = constants[3], constants[4], constants[5]
     c, s, lag, hold = constants[_COS], constants[_SIN], constants[LAG], constants[HOLD]

@@ -246,7 +246,7 @@ def cost_of_all(
     constants: Array,
     indices: Integers,
 ) -> float:
-    """Half the sum of the squared residuals of :func:`linearize_all`."""
+    """Half the sum of the squared residuals of :func:`linearize_all`, for the same arguments."""
     total = 0.0
     for k in range(len(first)):
         delta = steps.deltas[k]

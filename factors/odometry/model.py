@@ -44,7 +44,7 @@ class Growth:
     per_time: float = 0.0
 
     def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> "Growth":
-        """The growth with further independent errors, which have the standard deviations of the arguments."""
+        """The growth after adding independent errors with the given standard deviations, in the same units."""
         return Growth(
             math.hypot(self.per_distance, per_distance),
             math.hypot(self.per_rotation, per_rotation),

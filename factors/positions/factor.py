@@ -86,7 +86,7 @@ class PositionFactor:
         return replace(self, robust=width * self.robust)
 
     def _covariances(self, poses: Array) -> Array:
-        """The covariances (N, 2, 2) of the errors in the world frame, caused by the measurement and by ``offset``."""
+        """The world-frame covariances (N, 2, 2) of the errors by measurement and ``offset``, at ``poses`` (N, 3)."""
         if self.offset is None:
             return np.broadcast_to(self.covariance, (len(poses), 2, 2))
         x, y = self.arm

@@ -146,7 +146,7 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """The score of signal strengths or phases, whose mean and variance are not computed: ``expected`` is ``nll``,
+        """The score of signal strengths or phases, without the mean and variance of ``nll``: ``expected`` is ``nll``,
         and ``variance`` is zero."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 

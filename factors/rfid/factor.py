@@ -309,7 +309,7 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
 
 @compiled
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """The covariance (D, D) after an update, and the change of the logarithm of the covariance's determinant by the update."""
+    """The covariance (D, D) after adding ``information`` to the prior, and the change of its log determinant."""
     size, both = len(information), prior_information.copy()
     for i in range(size):
         for j in range(size):

@@ -103,8 +103,9 @@ def reach_of(packed: Packed, offsets: Array) -> float:
 
 @compiled(inline="always")
 def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
-    """Write the antenna of each measurement into ``out`` (K, 8): position and boresight in the world, then boresight
-    and position in the frame of the pose. Returns the largest distance [m] from the pose at which a tag can be read."""
+    """Write the antenna of each measurement, at ``offsets`` (K, 3) from ``pose``, into ``out`` (K, 8): position and
+    boresight in the world, then boresight and position in the frame of the pose. Returns the reach [m] from
+    ``pose``."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]

@@ -271,7 +271,7 @@ def _logits(
 def logit(
     kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """The logit of a tag at (x, y, z) in the antenna's frame with facing cosine c, and its derivatives by x, y, z and c."""
+    """The logit of a tag at (x, y, z) in the antenna's frame with facing cosine c, and its four derivatives."""
     if kind == BEAM:
         return _beam(parameters, x, y, z, c)
     if kind == LOGISTIC:

@@ -160,7 +160,7 @@ class TagStates:
         self._evidence = kept
 
     def _add(self, tags: Integers, evidence: NDArray[np.float32], sign: float) -> None:
-        """Add (``sign`` 1) or remove (``sign`` -1) the evidence of a scan."""
+        """Add (``sign`` 1) or remove (``sign`` -1) the evidence of a scan on ``tags``."""
         if _learn(self._weights, self.odds, tags, evidence, sign):
             self._doubtful = None
         self._raise_prior()
@@ -290,7 +290,7 @@ def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
 
 @compiled
 def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
-    """Exclude the state dead for ``tags``. Returns True if this changes which tags are believed to be weak, moved or dead."""
+    """Exclude the state dead of ``tags``. Returns True if a tag is no longer believed to be weak, moved or dead."""
     changed = False
     for t in tags:
         if weights[t, DEAD] > -np.inf:

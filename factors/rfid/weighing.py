@@ -199,8 +199,8 @@ def weigh_tag(
 ) -> None:
     """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
 
-    ``at``, ``models``: the results of :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of measurements to
-    evaluate. ``product`` (N,), ``room`` (N,): working memory.
+    ``at``, ``models``, ``measured``: as of :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of
+    measurements to evaluate. ``product`` (N,), ``room`` (N,): working memory.
     """
     points, normals, levels, hits = tags
     _, antennas, rounds = measured

@@ -130,6 +130,6 @@ class AtTheEnd:
     is_kept = is_open
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """Solve the whole run. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes."""
+        """Solve the whole ``graph``. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes."""
         poses = {k.key: k.causal[0] for k in graph.keyframes.values() if k.causal is not None}
         return solve_whole(graph, graph.constant_priors()[0] | self._guesses | poses, is_guess=True)

@@ -256,8 +256,8 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add the landmark ``new`` to ``addition``, with its earlier observations by ``sensor`` or with its prior. If the poses of
-        most observations have left the graph, the present estimate of the landmark is used as its prior."""
+        """Add the landmark ``new``, observed at ``view``, to ``addition``, with its earlier observations by ``sensor``.
+        If it has none, or if most of their poses have left the graph, it gets a prior instead."""
         graph = self._graph
         key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean

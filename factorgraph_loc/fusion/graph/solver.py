@@ -286,7 +286,7 @@ class LinearFactors:
 
     def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
         """Correct the Jacobian of a factor that is ``linearized`` at a held variable, so that it agrees with the
-        marginal factors (see the module). Returns the factor with its linearisation point."""
+        marginal factors (see the module). ``keys``: its variables. Returns the factor."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
         if sum(map(is_place, keys)) > 1:  # a factor on one position has absolute information, which must not be removed
