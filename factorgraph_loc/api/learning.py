@@ -49,7 +49,7 @@ def calibrate(
 
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:
-    """Return the path of the report of the rig ``out``. Raises InputError if the name is invalid, or if a file exists."""
+    """Return the path of the report next to the rig file ``out``. For errors see :func:`output.with_ending`."""
     return output.with_ending(out, RIG, ".report.html", overwrite=overwrite)
 
 

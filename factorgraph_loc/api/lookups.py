@@ -115,7 +115,7 @@ def known_rigs() -> dict[str, Rig]:
 
 
 def sources_of_rigs() -> dict[str, tuple[str, Callable[[], Rig]]]:
-    """Return by name, for each known rig, a text that states to what it belongs, and a function that makes it."""
+    """Return by name, for each known rig, a text that says which logs it is for, and a function that makes it."""
     default: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
     recorded = {name: ("a known log", partial(read_rig, file)) for name, file in shipped().items()}
     return default | recorded | {name: ("fgloc simulate", lambda name=name: preset(name).rig) for name in PRESETS}

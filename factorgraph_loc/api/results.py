@@ -57,8 +57,9 @@ def export(
 ) -> list[Path]:
     """Write results for other programs. Returns the written files.
 
-    ``results``: folders of runs or a log, see :func:`view`. ``out``: a file, whose suffix selects the content: .mcap has runs for
-    Foxglove and RViz; .tum and .kitti have the final trajectory of a run, or the reference of a log; .ply has the points of a map.
+    ``results``: folders of runs or a log, see :func:`view`. ``out``: a file. Its suffix selects the content: .mcap for
+    runs in Foxglove and RViz; .tum or .kitti for the final trajectory of a run, or the reference of a log; .ply for the
+    points of a map.
     """
     require_format(Path(out))
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
@@ -70,10 +71,10 @@ def _listed(results: LogLike | Sequence[LogLike]) -> list[LogLike]:
 
 
 def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, list[StoredRun]]:
-    """Return the log and the runs in ``results``. If ``results`` has no log, the known data set is read whose name the
-    runs contain.
+    """Return the log and the runs in ``results``. ``read``: a function that reads a log.
 
-    ``read``: reads a log. Raises InputError if there are several logs, or if no known data set has the name that the runs contain.
+    If ``results`` has no log, the known data set that the runs name is read. Raises InputError if there is none, or if
+    there are several logs.
     """
     places = [Path(name) for name in results if not isinstance(name, Log) and is_results(Path(name))]
     logs = [name for name in results if isinstance(name, Log) or Path(name) not in places]

@@ -91,10 +91,9 @@ def run_and_learn(
 ) -> tuple[RunResult, Knowledge]:
     """Run an estimator on a log, estimate the rig from the same log, and compute the final trajectory with the estimated rig.
 
-    The smoother and the calibration of the rig alternate. The estimated rig depends on the whole log, so only the final
-    trajectory uses it. All other results use the given rig. The effective configuration of the result has the estimated
-    rig as ``learnt_rig``. ``progress`` is called with the fraction of the work that is done. Raises InputError if the
-    log has too little information, and the errors of :func:`~factorgraph_loc.experiments.run.run`.
+    The estimated rig depends on the whole log. Therefore only the final trajectory uses it, and causal estimates use
+    the given rig. The configuration in the result has the estimated rig as ``learnt_rig``. ``progress`` is called with
+    the fraction of the work that is done. Raises InputError if the log has too little information.
     """
     report = progress or (lambda _share: None)
     runs = TURNS + 2

@@ -66,7 +66,7 @@ def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 
 
 def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[Iterator[Message]]:
-    """Yield all messages, as several iterators of which each is ordered by time."""
+    """Yield iterators over all messages. Each iterator is ordered by time."""
     moving = [(run.name, BASE if len(runs) == 1 else f"{run.name}/{BASE}", run.played(), run.final) for run in runs]
     if log.reference is not None:
         moving.append((REFERENCE, f"{REFERENCE}/{BASE}", log.reference, log.reference))

@@ -37,10 +37,7 @@ class _Learnt(FileModel, extra="ignore"):
 
 
 class RunFolder(FileModel, extra="ignore"):
-    """The folder ``path`` of a run, and some keys of its file ``config.toml``: log, estimator, sensors and seed of the run.
-
-    Other keys of the file are ignored.
-    """
+    """The folder ``path`` of a run, with the log, estimator, sensors and seed in its file ``config.toml``."""
 
     path: Path
     log: Annotated[str, Field(min_length=1)]
@@ -53,9 +50,9 @@ class RunFolder(FileModel, extra="ignore"):
 class StoredRun:
     """A stored run. Times are in seconds from the start of its log.
 
-    ``causal``: causal estimates from the first localized one on. ``final``: the trajectory that is estimated from the whole log.
-    Both may be empty. ``series``: by name (``error_position`` [m], ``error_heading`` [rad], ``nees``), times (K,) and values (K,)
-    for the estimates of :meth:`played`. ``landmarks``: estimated landmarks by name. ``events``: time and text of each event.
+    ``causal``: causal estimates from the first localized one on. ``final``: the trajectory estimated from the whole
+    log. Both may be empty. ``series``: times (K,) and values (K,) of the ``error_position`` [m], ``error_heading``
+    [rad] and ``nees`` of the estimates in :meth:`played`. ``landmarks``: estimated landmarks by name.
     """
 
     name: str

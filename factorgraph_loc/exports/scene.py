@@ -30,7 +30,7 @@ class Lights:
 
 
 def colours() -> Iterator[Colour]:
-    """Yield the colours of the first, the second and further runs, without end. They are the colours of plots."""
+    """Yield a colour for each of any number of runs, the same as in plots. Colours repeat after the last one."""
     # without the last colour, black, because the background of viewers is black
     for colour in itertools.cycle(drawing_figures.COLOURS[:-1]):
         red, green, blue = bytes.fromhex(colour[1:])

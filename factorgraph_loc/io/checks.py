@@ -21,7 +21,7 @@ from factorgraph_loc.sensors.tables import columns_of
 from factorgraph_loc.text import Notice, listed, notice
 from factors.se2 import Array
 
-TURNED = 2.0  # rad by which the odometry turns, beyond which a reference with constant heading has no valid headings
+TURNED = 2.0  # rad; if the odometry turns by more, constant headings of a reference are invalid
 LONG_GAP = 5.0  # s between successive timestamps above which a gap is reported
 TOLERANCE = 1e-9  # relative tolerance for converted values
 

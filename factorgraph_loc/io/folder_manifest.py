@@ -67,7 +67,7 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
     guesses = _guesses(path)
     if not any(table.has("t") for table in guesses):
         raise InputError(
-            f"{tables}: has no table with times, expected files such as odometry.csv: {', '.join(SUFFIXES)}"
+            f"{tables}: has no table with times, expected files such as odometry.csv with a suffix {', '.join(SUFFIXES)}"
         )
     roles = _roles(guesses)
     options: dict[str, Any] = {}
@@ -82,7 +82,7 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
         )
     if "rfid" in options and not roles.tables["rfid"].has("antenna"):
         options["rfid"]["antenna"] = "antenna"
-        roles.remarks.append("the reads name no antenna: all are assigned to one, whose name is set in antenna")
+        roles.remarks.append("the reads name no antenna: antenna in [options.rfid] is the antenna name of all reads")
     reference = roles.tables.get("reference")
     if reference is not None and not _has_headings(reference):
         roles.remarks.append(f"{reference.name}: has no headings")
@@ -143,7 +143,7 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
     """Return the settings that describe the map table with the ``role`` tags or landmarks in a world file.
 
-    If the EPCs in the map and in the reads differ in letter case, a setting converts those of the map.
+    If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map.
     """
     table, reads = roles.tables[role], roles.tables.get("rfid")
     settings = table.mapping(FIELDS[role])

@@ -144,7 +144,7 @@ class Guess:
         return all(name in self.fields for name in names)
 
     def mapping(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the settings that describe the table in a manifest, with those of the fields ``names`` that the table has."""
+        """Return the settings that describe the table in a manifest. Of its fields, only ``names`` are described."""
         out: dict[str, Any] = {"file": self.name}
         if self.is_tum:
             return out | {"format": "tum"}

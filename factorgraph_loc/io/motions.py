@@ -22,7 +22,7 @@ from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array, Integers
 
-# a motion is a jump if its rate exceeds FASTER times the largest rate before it; that rate is at least SPEED [m/s] or TURN [rad/s]
+# a motion is a jump if its rate exceeds FASTER times both the largest rate before it and SPEED [m/s] or TURN [rad/s]
 SPEED, TURN, FASTER = 1.0, 2.0, 3.0
 RESET_DISTANCE = 0.05  # m: maximum distance from the origin after a reset of the odometry
 ZERO = 1e-6  # m and rad: magnitude below which a value is zero
@@ -63,8 +63,8 @@ class WheelSizes(FileModel):
         """Return the motion (N, 3) of the robot ahead [m], to the left [m] and about the vertical [rad].
 
         ``wheels`` (N, 2 or 4): the distances [m] of the left and the right wheel, and of the rear left and the rear
-        right wheel. Speeds [m/s] of the wheels give rates. Mecanum wheels: Taheri, Qiao, Ghaeminezhad, "Kinematic model
-        of a four mecanum wheeled mobile robot", 2015, eq. 22 to 24.
+        right wheel. Speeds [m/s] give rates. Wheels that may be mecanum wheels add a warning about the file ``source``.
+        Formulas: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot", 2015, eq. 22 to 24.
         """
         assert self.track is not None
         left, right, rear_left, rear_right = (wheels if wheels.shape[1] == 4 else np.hstack((wheels, wheels))).T
@@ -151,8 +151,8 @@ def after_rest(moves: Array) -> Array:
 def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[Notice]) -> Array:
     """Return the motions (N - 1, W) [m] of W wheels between N timestamps [ns].
 
-    ``distances`` (N, W): the distances of the wheels [m]. ``scales`` (W,): metres per encoder count. Encoders that wrap
-    to 0 are continued. At a reset, a fast jump to zero, the previous motion is continued, with a warning.
+    ``distances`` (N, W): the distances of the wheels [m]. ``scales`` (W,): metres per encoder count. Encoders may wrap.
+    At a reset to zero the previous motion is continued, with a warning about the file ``source`` in ``warnings``.
     """
     steps = np.stack([wheel_steps(distances[:, i], float(scale)) for i, scale in enumerate(scales)], axis=-1)
     durations = _durations(t_ns)
@@ -189,7 +189,7 @@ def odometry_stream(
 ) -> IncrementStream | VelocityStream:
     """Return the odometry stream of ``values``: velocities (N, 2) or increments (N, 3 or 4), at N timestamps [ns].
 
-    Rows that jump are skipped if the ``rules`` say so; ``warnings`` then has their number.
+    ``t0_ns``: timestamp of t = 0. If the ``rules`` skip invalid rows, jumps are skipped, with a warning in ``warnings``.
     """
     t, columns = checks.seconds(t_ns, t0_ns), np.ascontiguousarray(values.T)
     stream = VelocityStream(t, *columns) if len(columns) == 2 else IncrementStream(t, *columns)

@@ -38,7 +38,7 @@ def proposal_of(
     """Return the manifest of the log at ``path`` with the ``options`` of a reader.
 
     It is to be saved in ``folder`` if the log is below ``folder``, else in the folder that contains the log. Rig and
-    map are files beside the log: those with the log's name, or the only ones. A remark asks for a missing rig or map.
+    map are files next to the log, either with the log's name or the only ones. A remark asks for a missing rig or map.
     If ``with_map`` is false, the options describe the map, and no remark asks for one.
     """
     root = folder if path.is_relative_to(folder) else path.parent

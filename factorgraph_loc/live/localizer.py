@@ -276,7 +276,7 @@ class Localizer:
         return _copied(estimate, at)
 
     def _tidy(self, estimator: Estimator) -> None:
-        """Make the estimator forget the past before the ``history``, and shorten the lists of diagnostics."""
+        """Remove data older than ``history`` from the estimator, and shorten the lists of diagnostics."""
         self._tidied = self._newest
         if isinstance(estimator, ForgettingEstimator) and self._ticks is not None and self._ticks.count:
             estimator.forget(self._newest - self._history)

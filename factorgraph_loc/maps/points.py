@@ -49,9 +49,9 @@ class PointMap:
 
     ``names``: P unique names. ``positions`` (P, 3): in the world frame [m]. ``covariances`` (P, 3, 3) [m^2].
     ``feature``: the kind of ``descriptors`` (V, D), "" if points are identified only by name (V = 0). ``owners`` (V,):
-    index of the point of each view. ``seen_from`` (V, 3): position of the camera at each view [m]. ``common`` (V, 3,
-    3): the error that all points in a view share, as a covariance of (x, y, heading) about the camera, see
-    :class:`CommonError`. None if the map was made with a reference.
+    index of the point of each view. ``seen_from`` (V, 3): position of the camera at each view [m].
+    ``common`` (V, 3, 3): covariances of (x, y, heading) about the camera of the error that all points in a view share,
+    see :class:`CommonError`. None if the map was made with a reference.
     """
 
     names: tuple[str, ...]
@@ -267,9 +267,8 @@ class CommonError:
     ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): unit vectors from the
     camera to the points. ``covariances`` (K, 3, 3): the shared error of (x, y, heading) about each place.
 
-    Such a map is distorted like the estimated trajectory from which it was made. A robot that localizes in it has the same error.
-    More points do not reduce this error. It is therefore not part of an image's noise, but is added to the covariance of the pose.
-    It is the error of the mapping robot's pose when it observed the points, moved to the localized robot as a rigid body.
+    Such a map is distorted like the estimated trajectory from which it was made. A robot that localizes in the map has
+    the same error, however many points it observes. The error is therefore added to the covariance of its pose.
     """
 
     places: Array
@@ -303,7 +302,7 @@ class CommonError:
 def carried(covariances: Array, arms: Array) -> Array:
     """Return ``covariances`` (N, 3, 3) of (x, y, heading) [m, rad] of a rigid body, moved to other points of the body.
 
-    ``arms`` (N, 2): the vectors from the old points to the new ones [m]. Both are in the world frame.
+    ``arms`` (N, 2): the vectors from the old points to the new ones [m]. Both arguments are in the world frame.
     """
     lever = np.repeat(np.eye(3)[None], len(arms), axis=0)
     lever[:, 0, 2], lever[:, 1, 2] = -arms[:, 1], arms[:, 0]

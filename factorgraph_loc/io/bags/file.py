@@ -175,7 +175,7 @@ class Bag:
         return topic
 
     def store(self, name: str) -> Typestore:
-        """Return the message definitions of the topic ``name``. Those of ROS 2 are used if the bag contains no definitions."""
+        """Return the message definitions of the topic ``name``: those in the bag, or those of ROS 2 if it has none."""
         if name not in self._stores:
             connection = self._connections[name][0]
             definition = connection.msgdef

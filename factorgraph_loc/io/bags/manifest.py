@@ -316,7 +316,7 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     if "antenna" not in fields:
         settings["antenna"] = "antenna"
         out.remarks.append(
-            f"{topic.name} does not distinguish antennas: all reads get the antenna name that the setting antenna has"
+            f"{topic.name} does not distinguish antennas: antenna in [options.rfid] is the antenna name of all reads"
         )
     if units := _units(fields):
         settings["units"] = units
@@ -335,7 +335,7 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
 def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[str, dict[str, Any]]:
     """Return the proposed topics of ranges to landmarks with their settings, by the name of the topic.
 
-    Such a topic has fields for a distance and, beside it in the message, for the name of a landmark.
+    Such a topic has fields for a distance and, at the same place in the message, for the name of a landmark.
     """
     candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
     out.remarks += [

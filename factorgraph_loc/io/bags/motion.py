@@ -90,7 +90,7 @@ class JointRows:
     def pairs(self, warnings: list[Notice]) -> tuple[Integers, Array]:
         """Return timestamps (N,) [ns] and the values (N, W) of W wheels in order of time.
 
-        Raises InputError if no message has all joints.
+        Skipped rows add warnings to ``warnings``. Raises InputError if no message has all joints.
         """
         joints = self._wheels.joints
         if not len(self.rows):
@@ -103,10 +103,10 @@ class JointRows:
 
 
 def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
-    """Pair the messages of the left and the right wheel that are nearest in time.
+    """Pair each message of the left wheel with the nearest message in time of the right wheel.
 
-    Returns timestamps (N,) [ns] and the values (N, 2), left and right. A pair has the later one of the two timestamps.
-    Raises InputError if the time between the two messages of each pair exceeds :data:`MAX_OFFSET`.
+    Returns the later timestamps (N,) [ns] and the values (N, 2) of the pairs, left and right. Pairs that are farther
+    apart than :data:`MAX_OFFSET` are skipped, with a warning in ``warnings``. Raises InputError if no pair is left.
     """
     l_ns, left = lefts.in_order(("wheel",), warnings)
     r_ns, right = rights.in_order(("wheel",), warnings)
@@ -210,8 +210,9 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
     """Return the timestamps (N,) [ns] and the velocities (N, 2), forward [m/s] and about the vertical [rad/s].
 
-    ``rows``: two velocities, then optionally a quaternion and the variances of x and y. These show null poses, which a device
-    reports while it has lost its pose. If there are any, the result is that of :func:`motions.through_losses`: increments (N, 4).
+    ``rows``: two velocities, then optionally a quaternion and the variances of x and y. If these contain null poses,
+    which a device reports while it has lost its pose, a warning is added to ``warnings``, and increments (N, 4) are
+    returned instead of velocities, see :func:`motions.through_losses`.
     """
     values = rows.values
     null = are_null(values[:, 2:6], values[:, 6:]) if values.shape[1] > 2 else np.zeros(len(rows), dtype=bool)

@@ -79,7 +79,8 @@ class Start:
             self._found = (t_ns, np.array([seven(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
-        """Return the start, at its time [s] after ``t0_ns``. Raises InputError if a variance of x, y or heading is not positive."""
+        """Return the start, with the time [s] after ``t0_ns``. A tilted robot adds a warning to ``warnings``. Raises
+        InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
         t_ns, values, variances = self._found
         turns = checked_rotations(self._source, np.ones(1, dtype=np.int64), values)
@@ -201,9 +202,9 @@ class FrameReference:
             edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
 
     def path(self, warnings: list[Notice]) -> PosePath:
-        """Return the trajectory, at the timestamps of the most frequent transform in the chain. Other transforms are interpolated.
+        """Return the trajectory at the timestamps of the most frequent transform. Other transforms are interpolated.
 
-        Times at which a transform is unknown are left out. Raises InputError if no time remains, or nothing in the chain moves.
+        Skipped rows add warnings to ``warnings``. Raises InputError if no time has all transforms, or if none changes.
         """
         edges = [
             path_of(self._edges[name], warnings) if name in self._edges else self._static.poses[name]

@@ -126,8 +126,8 @@ class RowsOfTopic:
     def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
         """Return the M collected rows that the rules keep, and their indices (M,) among all collected rows.
 
-        ``faults``: faults of rows that the caller has detected, which are treated like numbers that are missing or out
-        of bounds. Raises InputError at such a row, unless the rules skip it.
+        ``faults``: faults that the caller has detected, in addition to values that are missing or out of bounds.
+        Raises InputError at an invalid row, unless the rules skip it with a warning in ``warnings``.
         """
         cells = {**self._names, **dict(zip(self._numbered, self._rows.values.T, strict=True))}
         cells |= {STAMP.name: self._rows.t_ns, INDEX: np.arange(len(self._rows))}

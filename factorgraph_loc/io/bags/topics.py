@@ -228,18 +228,18 @@ class TopicRows:
         return np.array(self._values, dtype=float).reshape(-1, self._width)
 
     def in_order(self, names: Sequence[str], warnings: list[Notice]) -> tuple[Integers, Array]:
-        """Return timestamps (M,) [ns] and numbers (M, width) in order of time.
+        """Return timestamps (M,) [ns] and numbers (M, width) of valid rows in order of time, see :meth:`kept`.
 
-        ``names``: the names of the columns. Raises InputError, with the number of the message, at a number that is not finite.
+        ``names``: the names of the columns. Rows with a number that is not finite are invalid.
         """
         keep = self.kept(checks.not_finite(names, self.values), warnings)
         return self.t_ns[keep], self.values[keep]
 
     def kept(self, faults: Sequence[Fault], warnings: list[Notice], among: Integers | None = None) -> Integers:
-        """Return the indices of the rows without ``faults``, in order of time. Of rows with equal timestamps, the last is kept.
+        """Return the indices of the rows without ``faults``, in order of time; of rows with equal timestamps, the last.
 
         ``among``: indices of the rows that the faults describe, by default all. Raises InputError at a fault, or at a
-        row that is out of order, unless the rules skip or sort such rows.
+        row that is out of order, unless the rules skip or sort such rows. This adds warnings to ``warnings``.
         """
         rows, t_ns = self.rows, self.t_ns
         keep = np.arange(len(rows)) if among is None else among
@@ -249,7 +249,7 @@ class TopicRows:
 
 
 class Gatherer(Protocol):
-    """Collects the needed data from the messages of one topic. ``add`` also checks a message, because messages are not kept."""
+    """Collects the needed data from the messages of one topic. ``add`` checks a message and copies its data."""
 
     def add(self, item: Stamped, t_ns: int) -> None: ...
 

@@ -52,7 +52,7 @@ class PosesFile(TimedMapping, Turned):
 
 class OdometryFile(PosesFile, motions.WheelSizes):
     """The table of odometry. ``columns`` maps t and one of: v, w (speed and turn rate); dx, dy, dtheta (motion since
-    the previous row); x, y, and heading or a quaternion (poses, of which only the relative motion is used); left, right
+    the previous row); x, y, and heading or a quaternion (poses; only their relative motion is used); left, right
     (distances of the wheels); left_speed, right_speed (speeds); left_angle, right_angle (angles); left_rate, right_rate
     (angular rates). Four wheels also need rear_left, rear_right (rear_left_speed, ...). ``radius`` and ``track`` of the
     rig ([odometry.wheels]) have precedence over these settings."""
@@ -131,10 +131,10 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
 
 
 def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tuple[Cells, Integers]:
-    """Return the rows of ``mapped`` without null poses, and the timestamps [ns] of the null poses, which a device
-    reports while it has lost its pose.
+    """Return the rows of ``mapped`` without null poses, and the timestamps [ns] of the null poses.
 
-    Raises InputError if a quaternion is not a unit quaternion, unless the mapping skips such rows.
+    A device reports null poses while it has lost its pose. Raises InputError if a quaternion is not a unit quaternion,
+    unless the mapping skips such rows. Null poses and skipped rows add warnings to ``warnings``.
     """
     if "qw" not in mapped.columns:
         return mapped, np.zeros(0, dtype=np.int64)

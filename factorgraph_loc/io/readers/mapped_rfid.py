@@ -34,7 +34,7 @@ from factorgraph_loc.sensors.rfid.tables import SIGNALS
 from factorgraph_loc.text import Notice, listed, notice, quoted
 from factors.se2 import Array
 
-NAME = "the * of "  # with a pattern such as rssi_* behind it: the name of the text in place of *, in errors
+NAME = "the * of "  # in errors, "the * of rssi_*" means the text that replaces * in the name of a column
 EPCS = ("epc", "epc_base64")
 OPTIONAL = (*SIGNALS, *EPCS, "channel", "last", "count")
 CHANNEL = Column("channel", "whole", PURE, 1.0, 1000.0, True, "the number of a channel")

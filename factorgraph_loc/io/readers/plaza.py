@@ -134,7 +134,7 @@ def beacons(source: str, table: Array) -> World:
 
 def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> IncrementStream:
     """Return the rows ``driven`` of odometry as increments. If they begin after ``t0_ns``, a row without motion is
-    added at ``t0_ns``, so that the first motion has a duration."""
+    added at ``t0_ns``. Composed rows add a warning to ``warnings``."""
     moves = np.column_stack((driven.numbers["dx"], np.zeros(len(driven.rows)), driven.numbers["dtheta"]))
     t_ns, moves = checks.increments_in_order(driven.path, driven.rows, driven.t_ns, moves, warnings)
     if t_ns[0] > t0_ns:
@@ -144,8 +144,8 @@ def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> Increme
 
 
 def ranges(observed: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """Return the rows ``observed`` of ranges as a stream, sorted by time. The file joins overlapping recordings, so its
-    order is not the order of arrival."""
+    """Return the rows ``observed`` of ranges as a stream with times after ``t0_ns`` [ns]. Rows are sorted by time, with
+    a warning in ``warnings`` if their order changes."""
     distance = observed.numbers["range"]
     require(distance > 0.0, observed.path, observed.rows, "range", distance, "more than 0")
     if moved := int(np.count_nonzero(observed.t_ns < np.maximum.accumulate(observed.t_ns))):

@@ -181,9 +181,9 @@ def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, L
 
 
 def _rig(moves: TableRows, ranged: TableRows, durations: Array, warnings: list[Notice]) -> Rig:
-    """Return a rig with the noise of the file: the medians of the standard deviations of motions and of the variances of ranges.
+    """Return a rig with the median noise of the motions ``moves`` and of the ranges ``ranged``.
 
-    ``durations``: the durations of the motions [s], because the noise of odometry is stated per square root of a second.
+    ``durations``: the durations of the motions [s]. Noise that differs between rows adds a warning to ``warnings``.
     """
     per_time = {}
     for name, column in {"along": "cxx", "lateral": "cyy", "heading": "ctt"}.items():
