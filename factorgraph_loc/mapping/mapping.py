@@ -41,7 +41,7 @@ VERDICTS = {
     "not judged": "not judged",
 }
 MIN_COMMON = 3  # least number of landmarks in both maps: with two, a wrong landmark could not be detected
-UNJUDGED = ": it is not judged; the new map is in the frame of the run's start"  # end of a note
+UNJUDGED = ": the maps are not compared, and the new map is in the frame of the run's start"  # end of a note
 FACTORS = (0.01, 4.0)  # bounds of the factor by which covariances are scaled
 MAX_PAIRS = 5000  # if there are more pairs of landmarks, this many are drawn at random
 MAX_ITERATIONS = 20
@@ -153,14 +153,14 @@ def make_map(
     if not given:
         return _assemble(log, learnt, np.zeros(3), {}, notes=not_located(log, learnt))
     if len(common) < MIN_COMMON and not in_frame:
-        few = "only {mapped} of the given map's landmarks were mapped, a comparison needs {least} or more"
+        few = "only {mapped} of the given map's landmarks were mapped, expected {least} or more"
         return _unjudged(log, learnt, notice("few_mapped", few + UNJUDGED, len(common), MIN_COMMON))
     points = [learnt[name] for name in common]
     targets = np.array([log.world.position(name) for name in common])
     surveys = np.array([given[name].spread() for name in common])
     alignment = IN_FRAME if in_frame else align_robustly(points, targets, surveys)
     if not in_frame and alignment.inliers < max(MIN_COMMON, len(common) / 2):
-        few = "only {inliers} of {mapped} landmarks agree with the given map under one alignment"
+        few = "only {inliers} of {mapped} landmarks agree with the given map after the best alignment"
         return _unjudged(log, learnt, notice("few_inliers", few + UNJUDGED, alignment.inliers, len(common)))
     moved = {name: _moved(point, alignment) for name, point in learnt.items()}
     wrong = [n for n in common if _differ(moved[n], given[n])]

@@ -155,7 +155,7 @@ def map_points(
     total, (chosen, old) = tracks.count, tracks.kept(good[tracks.track])
     if (settings.focal or settings.lens) and not model.is_brown:
         raise InputError(
-            "focal and lens can adjust only a camera with distortion_model plumb_bob and four numbers: remove focal and lens"
+            "a camera is adjusted only if its distortion_model is plumb_bob with four numbers: remove the settings focal and lens"
         )
     try:
         adjusted = bundle.adjust(
@@ -299,7 +299,7 @@ def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) 
     usual = np.diag(np.repeat(np.square((turn_sigma, shift_sigma)), 3))
     if log.reference is None or not log.reference.has_heading:
         raise InputError(
-            f"{log.name}: has no reference with headings, which is needed for the camera poses of its images"
+            f"{log.name}: has no reference with headings, but the camera poses of its images are computed from it"
         )
     poses = log.reference.at(t, max_gap=MAX_GAP)
     inside = np.asarray(np.isfinite(poses).all(axis=1))
@@ -315,7 +315,8 @@ def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) 
 def _on_robot(model: CameraModel, reference: Trajectory, t: Array, poses: Array, usual: Array) -> tuple[Cameras, Array]:
     """Return the camera poses of a robot on the floor at ``poses`` (F, 3), and their covariances (F, 6, 6).
 
-    ``t`` (F,) [s]: the times of the poses. ``usual`` (6, 6): the covariance for a reference without covariances.
+    ``t`` (F,) [s]: the times of the poses. ``reference``: gives their covariances. ``usual`` (6, 6): the covariance of
+    a camera pose, used if the reference has no covariances.
     """
     places = [camera_pose(model, pose) for pose in poses]
     cameras = Cameras(

@@ -36,7 +36,7 @@ def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
     """
     kinds = {points.feature for points in (first, second) if points.feature}
     if len(kinds) > 1:
-        raise InputError(f"the maps have points of the features {' and '.join(sorted(kinds))}, expected one kind")
+        raise InputError(f"the maps have different kinds of features: {' and '.join(sorted(kinds))}, expected one kind")
     pairs = _same(first, second)
     old, new = pairs[:, 0], pairs[:, 1]
     positions, covariances = first.positions.copy(), first.covariances.copy()

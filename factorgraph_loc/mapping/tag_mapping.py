@@ -84,7 +84,7 @@ def map_tags(
         if prior is None:
             if extend:
                 raise InputError(
-                    f"{log.name}: prior is None, expected the start pose in the map: extend without a reference needs it"
+                    f"{log.name}: prior is None, expected the start pose in the map, to extend it with poses from odometry"
                 )
             prior = PosePrior(log.span()[0], np.zeros(3), EXACT_SIGMA**2 * np.eye(3))
             observations = replace(observations, facing=np.full(len(given), np.nan))
@@ -123,14 +123,14 @@ def _along_reference(
     (K, 3) of the antenna observations.
     """
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference: map its tags with poses from odometry instead")
+        raise InputError(f"{log.name}: has no reference: map its tags with --poses odometry")
     if not log.reference.has_heading:
-        raise InputError(f"{log.name}: its reference has no headings: map its tags with poses from odometry instead")
+        raise InputError(f"{log.name}: its reference has no headings: map its tags with --poses odometry")
     at = log.reference.at(observations.t, max_gap=MAX_GAP)
     which = np.asarray(np.isfinite(at).all(axis=1))
     if not which.any():
         raise InputError(
-            f"{log.name}: its reference has no pose at the time of any read: map its tags with poses from odometry instead"
+            f"{log.name}: its reference has no pose at the time of any read: map its tags with --poses odometry"
         )
     posteriors = search(
         observations.model, observations.along(at[which], which), observations.heights, observations.facing

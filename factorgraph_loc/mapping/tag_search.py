@@ -23,7 +23,7 @@ from factors.rfid.model import RfidModel, probability
 from factors.se2 import Array, Integers, wrap, wrap_scalar
 
 CELL = 0.4  # m: spacing of the lattice
-LEVEL = 0.2  # m: tags of about the same height share a lattice
+LEVEL = 0.2  # m: tags with a smaller difference of height share a lattice
 DIRECTIONS = 8  # facings that are tried on the lattice
 CANDIDATES = 6  # positions per tag that are refined
 CUT = 40.0  # a position is refined if its negative log-likelihood exceeds the minimum on the lattice by at most this value
@@ -36,7 +36,7 @@ COARSE, FINE = (0.2, 0.15), (0.05, 0.03)
 # least log-likelihood of a located tag minus that of a tag out of reach. False reads give less, even at the best of thousands
 # of positions
 GAIN = 8.0
-SURE = 0.95  # a mode with a larger weight is the only one
+SURE = 0.95  # if the weight of a mode is larger, the other modes are ignored
 LARGEST_SIGMA = 1.0  # m: largest standard deviation of a located tag
 LEAST = 0.05  # an antenna is in reach of a tag if it reads the tag with at least this probability
 ITERATIONS = 30
@@ -50,7 +50,7 @@ PER_EVALUATION = 2000  # observations that are evaluated on the lattice at once,
 @dataclass(frozen=True, eq=False)
 class TagCandidates:
     """C candidates for the positions of tags. ``tag`` (C,): index of the tag. ``places`` (C, 2) [m]: its position.
-    ``facing`` (C,) [rad]: its facing, NaN if it does not matter."""
+    ``facing`` (C,) [rad]: its facing, NaN if the detection model does not depend on it."""
 
     tag: Integers
     places: Array

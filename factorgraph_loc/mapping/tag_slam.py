@@ -99,9 +99,9 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
     index = {name: i for i, name in enumerate(names)}
     rows = [row for m in scans for row in _rows(m, antennas, index)]
     if not rows:
-        known = listed(antennas)
         raise InputError(
-            f"{log.name}: its rig has none of the antennas that read tags, expected antennas among {known}"
+            f"{log.name}: no read is by an antenna of its rig, which has {listed(antennas)}: "
+            "use the names of the log in [rfid.antennas]"
         )
     rows.sort(key=lambda row: row[0])
     t, antenna, rounds, hits = zip(*rows, strict=True)

@@ -34,7 +34,7 @@ Columns = Mapping[str, slice]  # the components of an error state that belong to
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of a graph. Its values are the pose and then the ``blocks``, in this order. ``rows``: number of its
+    """A factor of a graph on the pose and on the ``blocks`` of the state with these names. ``rows``: number of its
     residuals."""
 
     factor: Factor

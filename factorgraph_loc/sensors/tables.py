@@ -36,8 +36,8 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """The context in which the rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list
-    to append to. ``shared``: what several sensors of the log have in common, such as the origin of latitudes, by name.
+    """The context in which the rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``:
+    receives warnings. ``shared``: values that several sensors have in common by name, such as the origin of latitudes.
     """
 
     rig: Rig
@@ -166,7 +166,7 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
         if table.stream and isinstance(stream, load(table.stream)):
             fields = {c.name: getattr(stream, c.field or c.name) for c in table.columns if c is not STAMP}
             return {table.name: {STAMP.name: checks.absolute(stream.t, writing.t0_ns), **fields}}
-    raise InputError(f"{writing.log}: {channel.name} has no table in this format")
+    raise InputError(f"{writing.log}: {channel.name} cannot be written: the native format has no table for it")
 
 
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:

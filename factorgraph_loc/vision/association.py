@@ -34,7 +34,7 @@ NEAREST, FARTHEST = 0.2, 50.0  # m: depths of points that are searched
 LARGEST_ANGLE, LARGEST_RATIO = math.radians(50.0), 2.0
 GATE = float(chi_squared.quantile(0.99, 2))
 CELL = 20.0  # px, cells for sorting features
-# px, radii of gates: added to each gate because the prediction is not exact; upper bound
+# px: value that is added to the radius of each gate, because the prediction is not exact, and largest radius
 SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
 MARGIN = 20.0  # px: points that are predicted this far outside the image are still searched
 SAME_PIXEL = 4.0  # px: closer points and features may be the same

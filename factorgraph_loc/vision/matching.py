@@ -59,7 +59,7 @@ def match(
     distances = distance_matrix(first, second)
     if allowed is not None:
         if allowed.shape != distances.shape:
-            raise InputError(f"matching: allowed pairs have shape {allowed.shape}, expected {distances.shape}")
+            raise InputError(f"matching: allowed has shape {allowed.shape}, expected {distances.shape}")
         distances[~allowed] = np.inf
     if distances.size == 0:
         return Matches(np.empty((0, 2), dtype=np.int64), np.empty(0))

@@ -184,7 +184,7 @@ class KeyframeIndex:
         values = as_numbers(descriptors)
         sample = values[np.linspace(0, len(values) - 1, min(SAMPLE, len(values))).astype(np.int64)]
         begin = sample[np.linspace(0, len(sample) - 1, min(WORDS, len(sample))).astype(np.int64)]
-        with warnings.catch_warnings(action="ignore"):  # about words without a nearest descriptor, which stay unchanged
+        with warnings.catch_warnings(action="ignore"):  # words that are nearest to no descriptor stay unchanged
             self._words, _ = kmeans2(sample, begin, ROUNDS, minit="matrix")
         self._descriptions = self._described(values, self._of)
 

@@ -211,7 +211,7 @@ def test_from_an_unknown_start_the_map_is_brought_onto_the_given_one_with_its_fa
     assert made.rms < 0.6
     for name, tag in made.world.tags.items():
         assert se2.wrap_scalar(tag.facing - room.world.tags[name].facing) == pytest.approx(0.0, abs=1e-9)
-    with pytest.raises(InputError, match="prior is None, expected a start pose"):
+    with pytest.raises(InputError, match="prior is None, expected the start pose"):
         map_tags(room, "odometry", None, extend=True)
 
 

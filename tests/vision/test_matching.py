@@ -120,7 +120,7 @@ def test_bad_input_is_an_error() -> None:
         match(floats, np.full((1, 35), np.nan, dtype=np.float32))
     with pytest.raises(InputError, match=r"ratio is 0.0, expected more than 0"):
         match(floats, floats, ratio=0.0)
-    with pytest.raises(InputError, match=r"allowed pairs have shape \(1, 2\), expected \(2, 2\)"):
+    with pytest.raises(InputError, match=r"allowed has shape \(1, 2\), expected \(2, 2\)"):
         match(floats, floats, allowed=np.ones((1, 2), dtype=bool))
     with pytest.raises(InputError, match=r"covariance 1 is .* expected positive definite"):
         gates(np.zeros((2, 2)), np.array([np.eye(2), -np.eye(2)]), np.zeros((1, 2)))

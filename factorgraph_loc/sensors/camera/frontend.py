@@ -81,7 +81,7 @@ def with_features(
         return log, ()
     if log.rig.find(CameraSettings) is None:
         raise InputError(
-            f"{log.name}: has images, but its rig {log.rig.name} has no [camera] with the camera's mounting"
+            f"{log.name}: has images, but its rig {log.rig.name} has no section [camera]: add it with focal length and mounting"
         )
     camera = log.rig.of(CameraSettings).model()
     kept = FeatureCache(cache_folder())

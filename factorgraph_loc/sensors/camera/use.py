@@ -57,7 +57,7 @@ def _doubts(use: Use) -> Iterator[Notice]:
             yield notice("fixed_points", sentence, use.log.name, use.estimator)
     elif _uses_camera(use) and not (use.estimates_points and landmarks != "known"):
         alternative = f", or {use.estimator}.landmarks=unknown" if use.estimates_points else ""
-        sentence = "{log}: the map has no points for the camera: give --world{alternative}"
+        sentence = "{log}: the map has no points for the camera: give a map with --world{alternative}"
         yield notice("no_points", sentence, use.log.name, alternative)
 
 

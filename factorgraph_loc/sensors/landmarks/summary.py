@@ -80,7 +80,7 @@ def summarize(log: Log) -> Summary:
     """
     unseen, unknown = _unmatched(log)
     suspects = find_suspects(log)
-    other_case = "landmark {landmark} is in the map with other capital letters"
+    other_case = "landmark {landmark} is in the map with other upper and lower case letters"
     problems = [
         *_shifted(log),
         *(notice("unknown_landmarks", UNKNOWN_LANDMARK, name, count) for name, count in unknown.items()),

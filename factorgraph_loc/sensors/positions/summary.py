@@ -43,7 +43,9 @@ def summarize(log: Log) -> Summary:
         problems.append(notice("repeated_positions", sentence, repeated, len(t)))
     ratio = _ratio(log, t, places)
     if ratio is not None and ratio < SMALL:
-        sentence = "the positions travel {ratio:.1g} times as much as the odometry: are they in metres, or frozen?"
+        sentence = (
+            "the positions travel {ratio:.1g} times as much as the odometry: they may be constant, or not in metres"
+        )
         problems.append(notice("small_positions", sentence, ratio))
     return Summary({"position": entries}, problems=problems, text=[Paragraph(line)])
 

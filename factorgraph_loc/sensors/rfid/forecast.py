@@ -231,8 +231,8 @@ class RfidForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> RfidForecast | None:
-    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: those of the simulation, for the
-    rate of rounds. Returns None without antennas or tags."""
+    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: the settings of the simulation,
+    which include the rate of rounds. Returns None without antennas or tags."""
     if rig.find(RfidSettings) is None or not world.tags:
         return None
     likelihood = RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags)

@@ -30,7 +30,7 @@ from factors.rfid.signals import (
 from factors.rfid.tag_states import FARTHEST, TagStates, sigma_poses
 from factors.se2 import Array, Integers
 
-# s; a read becomes evidence on the state of its tag after this time, because by then a wrong track is suspicious
+# s; a read changes the state of its tag only after this time, because a wrong track becomes suspicious earlier
 CONFIRMED = 1.0
 CLEAR = math.log(0.99 / 0.01)  # log-odds of a tag that is clearly dead, weak or moved
 WIDENED = 4.0  # factor of the pose's sigmas for evidence on tags, because consecutive scans share the pose error
@@ -91,7 +91,7 @@ def extent(world: World, tags: TagArray) -> Array:
 
 
 def whole_scans(log: Log) -> list[RfidScan]:
-    """Return all RFID scans of a log in order of arrival, or [] if it has none."""
+    """Return all RFID scans of a log, or [] if it has none."""
     return [m for m in log.measurements(("rfid",)) if isinstance(m, RfidScan)]
 
 

@@ -289,9 +289,9 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return the factor without tags that are clearly dead, weak or moved. The probability that another tag is
-        dead, weak or moved remains that from before the scan, because a scan must not be used twice. Returns None for
-        phases if ``width`` is above 1, because phases have local optima centimetres apart."""
+        """Return the factor without tags that are clearly dead, weak or moved. The probabilities of these states of the
+        other tags are not updated by the scan itself. Returns None for phases if ``width`` is above 1, because phases
+        have local optima centimetres apart."""
         factor = cast(RfidFactor, factor)
         if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None
@@ -318,7 +318,7 @@ def bind(binding: Binding) -> TagSensor | None:
     signals = [signal for signal in ("rssi", "phase") if signal in sensors]
     for signal in signals:
         if getattr(settings, signal, None) is None:
-            raise InputError(f"the rig has no [rfid.{signal}], which the sensor {signal} needs")
+            raise InputError(f"the rig has no [rfid.{signal}]: add it, or do not use the sensor {signal}")
     if settings is None or TagSensor.modality not in sensors:
         return None
     # strength and phase use the mounting of the rig, so reads must not estimate another mounting

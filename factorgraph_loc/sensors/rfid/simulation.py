@@ -283,7 +283,7 @@ def looks(settings: Any) -> dict[str, float]:
     """Return {"tags": the number of simulated chances to read a tag per second}. Raises ValueError if the rig has no
     RFID reader, or if a fault names an unknown antenna."""
     if settings.rig.find(RfidSettings) is None:
-        raise ValueError("the rig has no rfid, expected antennas")
+        raise ValueError("the rig has no section [rfid], expected one with antennas")
     stop, names = settings.faults.antenna_stop, list(settings.rig.of(RfidSettings).all_antennas())
     if stop is not None and stop.antenna not in names:
         raise ValueError(
@@ -330,7 +330,7 @@ class SimulatedReader:
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
-    """Return the simulated reader of a rig. Raises InputError if the settings have faults, which are not supported here."""
+    """Return the simulated reader of a rig. Raises InputError if the settings have faults, which it cannot simulate."""
     if settings.faults != FaultSettings():
-        raise InputError(f"{settings.name}: has faults, which active runs do not support")
+        raise InputError(f"{settings.name}: has faults, which active runs do not support: remove the section [faults]")
     return SimulatedReader(world, rig, settings.rounds_per_second, rng)

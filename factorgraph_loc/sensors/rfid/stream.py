@@ -119,7 +119,7 @@ class RfidStream(Stream):
 
     @cached_property
     def number(self) -> Integers:
-        """The number (N,) of each row's round among all R rounds of the log, in order of arrival."""
+        """The number (N,) of each row's round among all R rounds of the log, in the order of the rows."""
         scan = np.cumsum(np.diff(self.t, prepend=np.nan) != 0.0).tolist()
         numbers: dict[tuple[int, int], int] = {}
         keys = zip(scan, self.round.tolist(), strict=True)
@@ -251,10 +251,10 @@ def along_reference(
     Raises InputError if the log has no reference or no reads.
     """
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference trajectory, expected one for calibration")
+        raise InputError(f"{log.name}: has no reference trajectory, which the calibration needs")
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
-        raise InputError(f"{log.name}: has no RFID reads, expected a log with reads")
+        raise InputError(f"{log.name}: has no RFID reads (stream rfid)")
     t = stream.t - stream.age + log.rig.time_offset("rfid")
     tag = np.array([tags.get(name, -1) for name in stream.epc], dtype=np.int64)
     antenna = np.array([antennas.get(name, -1) for name in stream.antenna], dtype=np.int64)

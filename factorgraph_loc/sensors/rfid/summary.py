@@ -133,7 +133,7 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
 
 
 def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
-    """Return warnings about tags, antennas and clock of the reads of a log."""
+    """Return warnings about tags, antennas and clock of the reads of a log. ``found``: their summary."""
     out = list[Notice]()
     if found.unread:
         sentence = "{unread} of {tags} tags of the map are never read: {names}"

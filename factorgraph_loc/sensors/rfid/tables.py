@@ -77,7 +77,7 @@ class ReadsByRound:
     """N reads in R rounds.
 
     ``t_ns`` (N,), ``epc`` (N), ``number`` (N,): time [ns], EPC and round index of each read. ``columns``: RSSI, phase and
-    frequency, each (N,). ``end_ns`` (R,) and ``antenna`` (R): end [ns] and antenna of each round, in order of arrival.
+    frequency, each (N,). ``end_ns`` (R,) and ``antenna`` (R): end [ns] and antenna of each round.
     """
 
     t_ns: Integers
@@ -169,7 +169,7 @@ def _require_all(inventories: TableRows) -> None:
     first, rows = int(inventories.rows.min(initial=2)), inventories.rows
     if first > 2 or np.any(rows != np.arange(first, first + len(rows))):
         raise InputError(
-            f"{inventories.path}: rows are skipped or sorted, but reads refer to them by number: remove their column inventory"
+            f"{inventories.path}: rows are skipped or sorted, but reads refer to rows by number: remove the reads' column inventory"
         )
 
 

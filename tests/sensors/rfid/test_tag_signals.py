@@ -119,5 +119,7 @@ def test_a_rig_without_what_the_sensor_needs(estimator, sensor, without):
     log = simulate(preset("office", {"drive": {"duration": 5.0}, "rssi": {}, "phase": {}}), 1)
     if without == "rfid":
         log = replace(log, rig=log.rig.model_copy(update={"rfid": None}))
-    with pytest.raises(InputError, match=rf"^the rig has no \[rfid\.{sensor}\], which the sensor {sensor} needs$"):
+    with pytest.raises(
+        InputError, match=rf"^the rig has no \[rfid\.{sensor}\]: add it, or do not use the sensor {sensor}$"
+    ):
         run(log, RunConfig(estimator, sensors=("odometry", "rfid", sensor)))

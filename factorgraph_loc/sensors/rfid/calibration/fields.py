@@ -138,9 +138,9 @@ class Kind:
 
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
-    """Fit detection models of a ``kind`` to the reads and misses of ``pairs``. Returns the models, and the index of the
-    model of each of the ``antennas``, which is their number. If each antenna has its own model, an antenna without
-    rounds has a model that is fitted to all antennas. ``floor``: probabilities of false reads and misses."""
+    """Fit detection models of a ``kind`` to the reads and misses of ``pairs``. Returns the models, and for each antenna
+    the index of its model. If each antenna has its own model, an antenna without rounds gets a model that is fitted to
+    all antennas. ``floor``: probabilities of false reads and misses. ``antennas``: the number of antennas."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     active = [a for a in range(antennas) if np.any(pairs.antenna == a)]
