@@ -51,7 +51,7 @@ def calibrate(
     ``grids``: path prefix of the files of learnt detection grids, required for logs with tag reads.
 
     Raises InputError if a log lacks a reference or odometry, is too short, or has other sensors than the first log.
-    Also if it has neither exteroceptive measurements nor a reference with headings.
+    It must also have exteroceptive measurements or a reference with headings.
     """
     report = progress or (lambda _done, _total: None)
     blind = bool(logs) and all(log.reference is None for log in logs)

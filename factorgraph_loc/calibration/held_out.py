@@ -49,8 +49,8 @@ class Trial:
     """The runs of an estimator on one held-out section of a log.
 
     ``log``: name of the log. ``scores``: the scores of the run by rig (:data:`RIGS`), None if the run failed.
-    ``doubted``: of the run with the learnt rig, the landmarks or tags that are probably moved or dead. By kind of doubt
-    and name it has their probabilities.
+    ``doubted``: probabilities that landmarks or tags have moved or are dead, as {kind: {name: probability}}, from the
+    run with the learnt rig.
     """
 
     log: str

@@ -69,7 +69,7 @@ def summary(calibration: Calibration) -> list[str]:
     if same:
         lines.append(f"no significant change from the input rig: {listed(same)}")
     if vague := [_name(c) for c in constants if not c.is_determined]:
-        lines.append(f"not determined by the logs, near the input rig: {listed(vague)}")
+        lines.append(f"not determined by the logs, and therefore near the input rig: {listed(vague)}")
     if alike := [f"{a} and {b} ({rho:+.2f})" for a, b, rho in _correlations(calibration)]:
         lines.append(f"known mainly by their sum or difference (correlation): {listed(alike)}")
     for estimator in ESTIMATORS if calibration.trials else ():

@@ -268,6 +268,6 @@ def _notes_on_tags(made: MadeTags) -> list[str]:
     chance = [name for name, why in unmapped.items() if why.kind == "chance"]
     if chance:
         lines.append(
-            f"{len(chance)} tags that the map lacks were read so rarely that no position explains the reads better than chance"
+            f"{len(chance)} tags are neither in the given nor in the new map, because they were read too rarely to be located"
         )
     return lines + [f"not in the map: {name}, {why}" for name, why in unmapped.items() if name not in chance]

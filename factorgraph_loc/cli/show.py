@@ -38,7 +38,7 @@ def warnings(doubts: Sequence[object]) -> None:
     for doubt in doubts[:WARNINGS]:
         note(f"warning: {one_line(str(doubt))}")
     if len(doubts) > WARNINGS:
-        note(f"warning: {len(doubts) - WARNINGS} more are listed with the results")
+        note(f"warning: {len(doubts) - WARNINGS} more warnings are listed with the results")
 
 
 def outcome(doubts: Sequence[str], failures: Sequence[str], most: int | None = None, more: str = "") -> None:
@@ -107,7 +107,7 @@ def first_use() -> None:
     function: Any = relative  # numba replaces it by an object with statistics
     cache = function.stats.cache_path
     if cache is None or not any(Path(cache).glob("*.relative-*.nbi")):
-        note("the first use compiles for up to a minute; later ones do not")
+        note("the first use of fgloc compiles functions, for up to a minute")
 
 
 @contextmanager

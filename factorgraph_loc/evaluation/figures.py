@@ -182,7 +182,7 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
 
 
 def _draw(axis: Axes, t: Array, single: Array, mean: tuple[Array, Array], low: float) -> None:
-    """Draw single values (N,) and their running mean over time. ``mean``: its times and values. The y axis starts at low / 4."""
+    """Draw single values (N,) and their running ``mean`` (times, values). The y axis starts at ``low`` / 4."""
     axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
     axis.plot(*mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
     # the smallest values are not in the range of the axis

@@ -274,7 +274,7 @@ def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> l
 
 
 def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:
-    """Return the kind of the independent units, and True if there are enough for intervals and tests."""
+    """Return the units, "logs" or "seeds", and True if there are enough of them for intervals and tests."""
     if len(clusters) == 1:
         return "seeds", len(clusters[0]) >= ENOUGH_LOGS
     return "logs", len(clusters) >= ENOUGH_LOGS

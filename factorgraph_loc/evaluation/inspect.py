@@ -89,7 +89,7 @@ def _problems(name: str, sensors: Mapping[str, Summary]) -> list[Notice]:
 
 
 def _summary(t: Array) -> StreamSummary:
-    """Summarize a stream. ``t`` (N,): timestamps [s] in order of arrival."""
+    """Summarize a stream. ``t`` (N,): timestamps [s] in the order of the rows."""
     if len(t) == 0:
         return StreamSummary(0, 0.0, 0.0, 0.0, ())
     stamps = np.unique(t)

@@ -153,6 +153,7 @@ def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap:
 
 def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
     """Return the scores of one trajectory against the reference by name. All are None if there is no reference.
+    ``max_gap`` [s]: see :func:`errors`.
 
     - ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95`` and ``max`` of the errors, see :func:`errors`.
     - ``rpe_position_per_m``, ``rpe_heading_per_m``: root mean square of the relative errors over pieces of one metre of path, see
@@ -217,7 +218,7 @@ def landmark_figures(
         pair = pairs(trajectory, log.reference, max_gap)
         pose = se2.align_points(pair.poses[:, :2], pair.truth[:, :2])
     if names and np.isfinite(pose).all():
-        # in the frame of the estimate, like the covariances
+        # errors in the frame of the estimate, in which the covariances are given
         error = positions - se2.transform_to(pose, truth)
         figures["landmarks.rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
         covariances = np.array([landmarks[name].covariance for name in names])

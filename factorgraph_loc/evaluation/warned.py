@@ -19,7 +19,7 @@ def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the runs that have each warning, by the text of the warning in order of appearance."""
+    """Return the runs that have each warning, as {text of the warning: runs}, in order of the first run."""
     concerned: dict[str, list[Row]] = {}
     for row in rows:
         for text in (row.get(WARNINGS) or "").split("\n"):

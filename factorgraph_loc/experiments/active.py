@@ -65,8 +65,8 @@ class ActiveJob:
         return digest_of(given + [model.model_dump(mode="json") for model in (self.simulation, self.settings)])
 
     def make(self) -> Files:
-        """Execute the run. Return the content of its files by name: the scores as JSON, and the plot as PNG. If the
-        input is invalid, return the file that describes the failure."""
+        """Execute the run. Return its files as {file name: content}: the scores as JSON and the plot as PNG, or for
+        invalid input the file that describes the failure."""
         try:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)
         except InputError as error:

@@ -193,7 +193,8 @@ def _median(rows: Sequence[Row], key: str) -> float:
 
 
 def comparison(rows: Sequence[Row]) -> Figure:
-    """Plot for each world and estimator the distances as a box per policy, and the fraction of localized runs over distance."""
+    """Plot for each world and estimator the distances until localization as a box per policy, and the fraction of
+    localized runs over distance."""
     panels = cases(rows)
     seeds = len({row["seed"] for row in rows})
     figure, axes = grid(len(panels), 2, 4.2 * len(panels) + 1.0, f"metres driven until localized, {seeds} runs of each")

@@ -57,14 +57,15 @@ class Planned(Protocol):
     def columns(self) -> dict[str, Any]: ...
 
     def make(self) -> Files:
-        """Compute the run, and return the content of its files by name. Raises FglocError if it fails for a known reason."""
+        """Compute the run, and return {file name: content}. Raises FglocError if it fails for a known reason."""
 
 
 class Take(Protocol):
     """A function that claims and returns the next run, or None if there is none now."""
 
     def __call__(self, loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
-        """Prefer a run with the source ``loaded``, which a worker has in memory. Otherwise avoid the sources ``avoided``."""
+        """Prefer a run with the source ``loaded``, which is in memory. Avoid sources that other workers use,
+        ``avoided``."""
 
 
 class Executor(AbstractContextManager[Any], Protocol):
@@ -151,7 +152,7 @@ def execute(
 
 
 def compute(run: Planned) -> Files:
-    """Compute a run in this process. Return the content of its files by name, or of the file that describes its failure.
+    """Compute a run in this process. Return {file name: content}. A failure is returned as a file that describes it.
 
     Raises only StoreError, if the disk for temporary files is full or not writable.
     """
@@ -173,7 +174,8 @@ def compute(run: Planned) -> Files:
 
 
 def failure(kind: Kind, reason: str, details: str = "") -> Files:
-    """Return the content of the file of a failed run, by its name. ``kind``: such as "timeout". ``details``: a traceback, or ""."""
+    """Return the file that describes a failed run, as {file name: JSON}. ``kind``: such as "timeout". ``reason``: a
+    sentence for the user. ``details``: a traceback, or ""."""
     content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
     return {FAILURE: json_text(content).encode()}
 

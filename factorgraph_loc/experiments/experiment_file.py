@@ -221,7 +221,7 @@ class Experiment(FileModel):
     @field_validator("logs", "estimators", mode="before")
     @classmethod
     def _named(cls, value: Any, info: Any) -> Any:
-        """Convert entries that are only a name to tables."""
+        """Convert entries of ``logs`` and ``estimators`` that are only a name to tables, such as {"name": "ekf"}."""
         key = "log" if info.field_name == "logs" else "name"
         return (
             [{key: entry} if isinstance(entry, str) else entry for entry in value] if isinstance(value, list) else value

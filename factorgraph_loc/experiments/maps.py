@@ -48,7 +48,7 @@ POINTS = "points"
 KINDS = (POINTS, "landmarks", "tags")  # kinds of maps; by default the first kind that a log has is mapped
 FLAGS: dict[
     str, tuple[str, tuple[str, ...]]
-] = {  # options of some kinds of maps: by name, the option of the command line and these kinds
+] = {  # by field of MapOptions, its option on the command line, and the kinds of maps to which it applies
     "estimator": ("--estimator", ("landmarks",)),
     "settings": ("--set", ("landmarks",)),
     "height": ("--height", ("landmarks", "tags")),
@@ -188,7 +188,7 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
         raise InputError("--poses is for maps of tags, but this is a map of landmarks: remove --poses")
     if "landmarks" in settings:
         raise InputError(
-            f"--set is {estimator}.landmarks, but --extend alone selects how the map is used: remove this --set"
+            f"--set {estimator}.landmarks cannot be used to make a map: remove it. To keep the given landmarks, give --extend"
         )
     require_mappable(log)
     if options.extend and not log.world.landmarks:

@@ -252,7 +252,7 @@ def _slowest_update(result: RunResult) -> Array:
 
 
 def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:
-    """Return the content of the files of a run by name, for the store of an experiment.
+    """Return the files of a run as {file name: content}, for the store of an experiment.
 
     The files are those of :func:`write_run`, except that times are in a file of their own and ``update_ms`` is empty.
     Therefore all other files are reproducible. ``started``: value of ``perf_counter`` at the start of the run.
@@ -267,7 +267,8 @@ def run_files(result: RunResult, log: Log, started: float, align: Alignment = "n
 
 
 def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out: Path) -> None:
-    """Write :data:`TABLES` into the folder ``out``: a row for each run, the differences between methods, and the text ``text``."""
+    """Write :data:`TABLES` into ``out``: the runs ``table``, the ``differences`` of methods, and ``text`` as
+    table.md."""
     write_text(out / "results.csv", plain_lines(table.write_csv()))
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))

@@ -69,7 +69,7 @@ class PlannedRun(RunConfig):
         }
 
     def make(self) -> dict[str, bytes]:
-        """Execute the run, and return the content of its files by name.
+        """Execute the run. Return its files as {file name: content}.
 
         Raises VanishedError if the log has changed since the experiment was planned, and FglocError if the run fails.
         """

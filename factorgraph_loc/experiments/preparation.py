@@ -9,7 +9,7 @@ from factorgraph_loc.files.models import FileModel, nearest
 from factorgraph_loc.fusion import registry
 from factorgraph_loc.model.belief import EXACT_SIGMA, HEADING_SIGMA, POSITION_SIGMA, PosePrior
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.scoring import PRIORS, parse_position
+from factorgraph_loc.model.scoring import parse_position
 from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.sensors.interfaces import Use, lacking_section
 from factorgraph_loc.sensors.registry import channels, functions, moving, parent_of
@@ -18,6 +18,7 @@ from factorgraph_loc.text import Notice, listed, notice, quoted
 # standard deviations of a start pose that is a pose of the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
+SET_PRIOR = "set the prior (--prior) to"  # start of the remedy in messages about the start
 
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
@@ -41,7 +42,7 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
         return None, prior
     if prior == "log":
         if log.start is None:
-            raise InputError(f"{log.name}: has no start pose, expected a prior {PRIORS}")
+            raise InputError(f"{log.name}: has no start pose: {SET_PRIOR} reference, X,Y,HEADING, X,Y or unknown")
         return PosePrior(log.start.t, np.array(log.start.pose), np.diag(np.square(log.start.sigmas))), prior
     if prior == "reference":
         return _from_reference(log), prior
@@ -70,12 +71,12 @@ def first_odometry(log: Log) -> float:
 def _from_reference(log: Log) -> PosePrior:
     """Return a prior at the first pose of the reference at or after the first odometry. Raises InputError without such a pose."""
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference to start from, expected a prior {PRIORS}")
+        raise InputError(f"{log.name}: has no reference to start from: {SET_PRIOR} log, X,Y,HEADING, X,Y or unknown")
     start = first_odometry(log)
     first = int(np.searchsorted(log.reference.t, start))
     if first == len(log.reference):
         raise InputError(
-            f"{log.name}: its reference ends before the first odometry at {start:.3f} s, choose another prior"
+            f"{log.name}: its reference ends before the first odometry at {start:.3f} s: {SET_PRIOR} X,Y,HEADING or unknown"
         )
     t, pose = float(log.reference.t[first]), np.array(log.reference.poses[first])
     covariance = _covariance(REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)
@@ -126,7 +127,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
-    """Return warnings about sensors of the rig that cannot be used, and about missing odometry. ``sensors``: the used ones."""
+    """Return warnings about sensors of the rig that are not among the used ``sensors``, and about missing odometry."""
     available = (*log.streams, *_filled_columns(log))
     sentence = "{log}: the rig lists the sensor {sensor}, the log has none"
     doubts = [notice("no_stream", sentence, log.name, s) for s in log.rig.sensors if s not in available]

@@ -15,6 +15,7 @@ from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.causal_run import CausalRun, rare_garbage_collection, span_of
 from factorgraph_loc.experiments.doubts import in_bent_map, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.preparation import (
+    SET_PRIOR,
     at_origin,
     checked_use,
     resolve_prior,
@@ -126,14 +127,14 @@ def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior |
         return _Start(at_origin(log), "origin", (notice("no_start", sentence, log.name),))
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
-            f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings, "
-            "expected a prior reference, log or X,Y,HEADING"
+            f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings: "
+            f"{SET_PRIOR} reference, log or X,Y,HEADING"
         )
     finds = finds_heading(estimator) and detecting(log.world, use.sensors)
     if prior is not None and not prior.has_heading and not finds:
         raise InputError(
-            f"{config.estimator} cannot find an unknown heading on {log.name} with these settings and sensors, "
-            f"expected a prior X,Y,HEADING"
+            f"{config.estimator} cannot find an unknown heading on {log.name} with these settings and sensors: "
+            f"{SET_PRIOR} X,Y,HEADING"
         )
     return _Start(prior, source)
 

@@ -180,7 +180,7 @@ class Store:
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
         """Write the files of a run atomically, and replace existing ones. The caller must hold a claim of the run.
 
-        ``files``: the content of each file by name.
+        ``files``: {file name: content}.
         """
         checksums = {name: _sha256(content) for name, content in files.items() if name != TIMINGS}
         manifest = json.dumps({"key": key, "files": checksums}, indent=1).encode()
@@ -204,7 +204,8 @@ class Store:
 
     @contextmanager
     def claim(self, key: str) -> Iterator[bool]:
-        """Claim a run in this block, so that no other process computes it. Yields False if another process has claimed it."""
+        """Claim a run in this block against other processes. Yields False if another process has claimed it, else
+        True."""
         path = self.folder / "claims" / key
         with self._writing():
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -241,7 +242,7 @@ def _remove(path: Path) -> None:
 
 
 def _lock(handle: int, path: Path) -> bool:
-    """Lock an open file without waiting. Return False if another process has locked it, or has removed it in the meantime."""
+    """Lock an open file without waiting. Return False if another process has locked or removed it, else True."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -18,4 +18,4 @@ show.first_use()
 def test_the_first_use_announces_once_that_it_compiles(tmp_path):
     cache = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", USE], env=cache, capture_output=True, text=True, check=True)
-    assert done.stderr == "the first use compiles for up to a minute; later ones do not\n"
+    assert done.stderr == "the first use of fgloc compiles functions, for up to a minute\n"

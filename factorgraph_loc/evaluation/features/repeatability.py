@@ -91,8 +91,8 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 
 def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
-    """Return one-to-one pairs of points whose regions overlap at their own size (see ``magnified`` of
-    :func:`overlaps`). The ratio between the sizes of the two points is below :data:`SCALE_RATIO`."""
+    """Return one-to-one pairs of points of two images with a ratio of sizes below :data:`SCALE_RATIO` and regions that
+    overlap without magnification (see :func:`overlaps`)."""
     pairs = overlaps(first, second, homography, magnified=False)
     alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
     return pairs.best((pairs.error < OVERLAP_ERROR) & alike)

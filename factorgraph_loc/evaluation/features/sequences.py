@@ -166,7 +166,7 @@ def find_sequences(paths: Several[Path]) -> list[Sequence]:
             raise InputError(f"{path}: there is no such image or folder")
     names = [sequence.name for sequence in sequences]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{twice[0]}: several sequences have this name, expected different names")
+        raise InputError(f"{twice[0]}: is the name of several folders or photographs, expected different names")
     return sequences
 
 

@@ -278,11 +278,8 @@ def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
 
 
 def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[Notice]:
-    """Return warnings about likely mistakes.
-
-    One is a path whose heights vary much although ``align`` ignores them. The other is a planar trajectory that is
-    compared in space with one at other heights.
-    """
+    """Return warnings about heights that vary although ``align`` ignores them, and about a planar trajectory that is
+    compared in space with a trajectory at other heights."""
     if align == "se2":
         rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]
         sentence = "{path}: z varies by {rise:.1f} m and is ignored: check that its z axis points up"
