@@ -25,7 +25,7 @@ from factorgraph_loc.simulation import simulate as make_log
 
 
 def datasets(data_root: str | Path | None = None) -> list[Dataset]:
-    """Return the known data sets, whose names can be given as logs. ``data_root``: the folder of their files."""
+    """Return the known data sets. Their names can be given as logs. ``data_root``: the folder of their files."""
     return describe(data_root)
 
 

@@ -1,8 +1,8 @@
 """Reading of files within limits of size and memory, without the messages that C and Rust libraries print about damaged files.
 
-All input files are opened by this module. They must be regular files, because a FIFO blocks and a device never ends. The size of a
-file, and sizes that its header declares, are checked before memory is allocated. Messages of libraries must be suppressed at the
-descriptor: libpng and libjpeg ignore the log level of OpenCV, and polars prints from its threads before it raises.
+All input files are opened by this module. They must be regular files, because a FIFO blocks and a device never ends.
+The size of a file, and sizes that its header declares, are checked before memory is allocated. Messages of libraries
+are suppressed at the file descriptor of stderr, because libpng, libjpeg and polars print at any log level.
 """
 
 import errno

@@ -31,11 +31,11 @@ class Cells:
 
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file.
     ``columns``: for each field N texts, or numbers (N,) with NaN for empty cells.
-    ``labels``: by field, the name of the column in the file, if it differs from the field.
-    ``units``: by field, the name of the unit in the file, or the factor from it to ``Column.unit``. ``decimal``: the
-    decimal mark. ``left_out``: columns of the file that are not read. ``passed``: number of JSON objects that lack
-    needed columns. ``unwanted``: number of rows that ``where`` of the manifest excludes.
-    ``rules``: whether the manifest permits to skip invalid rows and to sort late rows, None without a manifest.
+    ``labels``: for each field the name of the column in the file, if it differs from the field.
+    ``units``: for each field the unit in the file: a name, or the factor to ``Column.unit``.
+    ``decimal``: the decimal mark. ``left_out``: columns of the file that are not read.
+    ``passed``, ``unwanted``: numbers of JSON objects that lack needed columns, and of rows that ``where`` excludes.
+    ``rules``: what the manifest says about invalid and late rows, None without a manifest.
     ``unread``: number and error of each row that could not be split into cells.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """

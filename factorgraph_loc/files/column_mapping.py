@@ -190,7 +190,7 @@ class TableFolder:
             if unchosen > 0:
                 names = listed(dict.fromkeys(name for _, mapping in tables for name in mapping.where))
                 sentence = (
-                    "{source}: {unchosen} of {rows} rows are not read, because their {columns} is not a value of where"
+                    "{source}: {unchosen} of {rows} rows are not read: their {columns} is none of the values in where"
                 )
                 rows_of_file = count + tables[0][0].passed
                 warnings.append(notice("unchosen_rows", sentence, path.name, unchosen, rows_of_file, names))

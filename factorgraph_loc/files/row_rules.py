@@ -91,8 +91,8 @@ class RowRules(FileModel):
             return np.arange(len(t_ns))
         count, first = int(np.count_nonzero(late)), int(np.argmax(late > 0))
         sentence = (
-            "{source}:{row}: time is {t} ns, before that of an earlier row: {rows} such rows, late by at most {delay:.3f} s, are "
-            "sorted"
+            "{source}:{row}: the time {t} ns is before the time of an earlier row: {rows} such rows, late by at most "
+            "{delay:.3f} s, are sorted"
         )
         warnings.append(notice("sorted_rows", sentence, source, rows[first], t_ns[first], count, late.max() * 1e-9))
         return np.argsort(t_ns, kind="stable")

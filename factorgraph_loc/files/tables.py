@@ -165,9 +165,9 @@ class TableRows:
     """The parsed values of N rows of a table.
 
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps
-    [ns]. ``numbers``: by column, numbers (N,) in ``Column.unit``, NaN for empty cells. ``names``: by column, N texts.
-    ``left_out``: columns of the file that are not read.
-    ``rules``: whether the manifest permits to skip invalid rows and to sort late rows, None without a manifest.
+    [ns]. ``numbers``: numbers (N,) of each column in ``Column.unit``, NaN for empty cells. ``names``: N texts of each
+    column of names. ``left_out``: columns of the file that are not read.
+    ``rules``: what the manifest says about invalid and late rows, None without a manifest.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """
 

@@ -115,8 +115,8 @@ def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.b
 def null_poses(source: object, row: int, count: int) -> Notice:
     """Return the warning about ``count`` null poses, the first in ``row`` of ``source``."""
     sentence = (
-        "{source}:{row}: the pose is null, the first of {poses}: they are skipped, and the motion is unknown until the next "
-        "pose"
+        "{source}:{row}: the pose is null, the first of {poses} null poses: they are skipped, and the motion is unknown "
+        "until the next valid pose"
     )
     return notice("null_poses", sentence, source, row, count)
 

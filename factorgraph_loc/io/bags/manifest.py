@@ -35,7 +35,7 @@ INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
 # by field of an RFID read: the unit that is assumed if the name of the message field implies none
 IF_UNSTATED = {"phase": "rad", "frequency": "Hz", "stamp": "us"}
-# by field of an RFID read: suffixes of names that imply a unit, of which the longest match is used
+# by field of an RFID read: suffixes of names that imply a unit; the longest match is used
 UNITS = {"phase": ANGLES, "frequency": ENDS["frequency"], "stamp": {unit: unit for unit in ("us", "ms", "ns")}}
 
 

@@ -132,7 +132,7 @@ class OdometryTopic(PoseTopic):
     """part of odometry messages to use: pose, for the motion between messages, or twist, for the velocity; for wheels,
     pose means their angles and twist their angular rates"""
     wheels: WheelSettings | None = None
-    """joints and sizes of the wheels, for a topic of joint states, or for two topics, of which topic is the left wheel's"""
+    """joints and sizes of the wheels, if topic has joint states, or is the topic of the left wheel of two"""
 
 
 class ImuTopic(RowTopic, Turned):

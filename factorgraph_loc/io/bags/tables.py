@@ -156,7 +156,7 @@ class RfidTopic(RowTopic, ReadNames):
     units: dict[Literal["rssi", "phase", "frequency", "stamp"], str | float] = Field(default_factory=dict)
     """units of rssi, phase, frequency and stamp, or factors that convert to dBm, rad, Hz and us, the default units"""
     frames: dict[str, str] = Field(default_factory=dict)
-    """frame in tf_static of each antenna whose name differs from that of its frame"""
+    """frame in tf_static of each antenna that is not named like its frame"""
     rounds: Literal["gaps", "message"] = "gaps"
     """message if a message has the reads of one inventory round, gaps if rounds are separated by round_gap"""
     round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] = 0.05
@@ -264,7 +264,7 @@ class Landmarks(RowsOfTopic):
             if topic.type not in DETECTIONS:
                 known = ", ".join(DETECTIONS)
                 raise InputError(
-                    f"{bag.path}: topic {topic.name} is of type {topic.type}: set fields, which only these types need not: {known}"
+                    f"{bag.path}: topic {topic.name} is of type {topic.type}: set fields in its options, or use a type {known}"
                 )
             name, place = DETECTIONS[topic.type]
             fields = {"landmark": name} | {axis: f"{place}.{axis}" for axis in "xyz"}

@@ -102,7 +102,7 @@ class RfidFile(TimedMapping, ReadNames):
     columns: dict[str, str] = Field(default_factory=dict)
     """column of the file for each field, in addition to those of the preset"""
     preset: Literal["impinj_itemtest", "impinj_iot", "sllurp_log", "sllurp_reports"] | None = None
-    """known tool, whose columns and units are used unless they are given here"""
+    """known tool; its columns and units are used unless they are given here"""
     channels: tuple[Annotated[float, Field(gt=100.0, lt=10_000.0), InUnit("MHz")], ...] | Channels | None = None
     """frequencies of channels 1, 2, ..."""
     round_gap: Annotated[float, Field(gt=0.0, le=10.0), InUnit("s")] | None = None
