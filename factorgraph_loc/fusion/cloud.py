@@ -48,7 +48,7 @@ class Cloud:
     parts: Mapping[str, slice] = field(default_factory=dict)
     odometry: ChainState = NO_ODOMETRY
 
-    @property
+    @cached_property
     def weights(self) -> Array:
         return np.asarray(np.exp(self.log_weights))
 
