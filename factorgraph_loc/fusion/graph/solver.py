@@ -57,7 +57,8 @@ class FullHistory:
     ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
 
     Sensor constants are in all branches of iSAM2's elimination tree. To read an estimate, iSAM2 would therefore solve the whole
-    tree. The variables of the last update are at the root of the tree. They are solved separately, which is faster.
+    tree. The variables of the last update are at the root of the tree. Without points they are solved separately, which is faster.
+    An update with points has many variables, for which one solution of the whole tree takes less time.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
@@ -72,7 +73,8 @@ class FullHistory:
         """Add the factors ``nodes`` and new variables, and solve. ``values``: initial values of the new variables.
         ``t`` [s]: the time of new poses."""
         self.begin((), nodes, values, {})
-        self._touched = {key for node in nodes for key in node.keys}
+        touched = {key for node in nodes for key in node.keys}
+        self._touched = () if any(map(is_point, touched)) else touched
 
     def begin(
         self,
