@@ -77,8 +77,8 @@ def poses_between(
     ``elsewhere`` (M-1,): True where somebody carried the robot to the next pose. Poses in between then ignore the next pose.
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
 
-    The misclosure of the odometry at the next pose is distributed in proportion to time. The covariance is the linear
-    interpolation of both, plus that of a Brownian bridge. Returns poses (T, 3) and body-frame covariances (T, 3, 3).
+    The misclosure of the odometry at the next pose is distributed in proportion to time. The covariance is interpolated
+    linearly, plus that of a Brownian bridge. Returns poses (T, 3) and body-frame covariances (T, 3, 3).
     """
     count = len(previous)
     at, out = np.empty((count, 3)), np.empty((count, 3, 3))

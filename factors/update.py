@@ -31,9 +31,9 @@ class Correction:
     ``residual`` (K, g): whitened residuals of K sightings at the prediction, predicted minus measured.
     ``nis``: the normalised innovation squared. ``dof``: its degrees of freedom.
 
-    The last three fields are for likelihoods without residuals, such as that of RFID reads.
-    ``excess_nll``: the negative log-likelihood at the prediction minus its expected value. ``variance``: the variance
-    of ``excess_nll``. ``evidence``: the marginal log-likelihood by Laplace's method, or None if it was not computed.
+    The last three fields are for likelihoods without residuals, such as the likelihood of RFID reads. ``excess_nll``:
+    the negative log-likelihood at the prediction minus its expected value. ``variance``: the variance of
+    ``excess_nll``. ``evidence``: the marginal log-likelihood by Laplace's method, or None if it was not computed.
     """
 
     delta: Array

@@ -44,8 +44,8 @@ ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))
 NOISE = 2.0  # factor on the covariance of odometry, because these particles do not estimate its constants
 OUTSIDE = -1.0  # change of the log-weight, at each motion, of a particle outside of free space
 
-# The particles reject a pose of another sensor if those within REACH standard deviations of it have less total weight than
-# NEGLIGIBLE. The covariance of the pose is first increased by WIDENED (standard deviations in m, m, rad).
+# The search rejects a pose found by a sensor if the particles within REACH standard deviations of it have less total weight
+# than NEGLIGIBLE. The covariance of the pose is first increased by WIDENED (standard deviations in m, m, rad).
 NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2
 REACH = 5.0
 

@@ -110,9 +110,9 @@ def run_active(
 ) -> ActiveRun:
     """Simulate a robot that drives from an unknown start until it is localized or gives up.
 
-    ``policy``, ``estimator``: the names of both. Runs with the same ``seed`` have the same world, start and noise sequences, for
-    all policies and estimators. Raises InputError for an unknown policy or estimator, for a start that is not free, and for a
-    sensor with a higher rate than the robot's control. Raises RunFailedError if the estimator fails.
+    ``policy``, ``estimator``: names. Runs with the same ``seed`` have the same world, start and noise sequences, for
+    all policies and estimators. Raises InputError for an unknown policy or estimator, for a start that is not free, and
+    for a sensor with a higher rate than the robot's control. Raises RunFailedError if the estimator fails.
     """
     loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()
@@ -308,8 +308,8 @@ def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings,
     gap = float(distance_to_walls(world, place)[0])
     if gap < settings.clearance or not plan.open(place)[0]:
         raise InputError(
-            f"{world.name}: start ({x:g}, {y:g}) is in a solid object, outside of the building, or {gap:.2f} m from a wall, "
-            f"expected a free place at least {settings.clearance:g} m from all walls"
+            f"{world.name}: start ({x:g}, {y:g}) is in a solid object, outside of the building, or {gap:.2f} m from a wall: "
+            f"set start to a free place at least {settings.clearance:g} m from all walls"
         )
     return np.array(settings.start)
 

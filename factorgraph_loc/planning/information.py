@@ -143,8 +143,8 @@ def expected_gain(
 
     ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is the entropy of
     its end pose. ``space``: a particle whose path leads into a wall stops there and makes no further measurements.
-    ``places`` (M,): the index of each particle's mode. If given, the entropy of this index is computed and not that of
-    the pose. ``noise``: the noise of the odometry on the path; None means no noise.
+    ``places`` (M,): the index of each particle's mode. If given, the entropy of this index replaces the entropy of the
+    pose. ``noise``: the noise of the odometry on the path; None means no noise.
     ``samples``: the number of particles that a scan weighs. ``scans``: the number of particles at which measurements are simulated.
     """
     if not paths:

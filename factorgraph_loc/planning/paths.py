@@ -103,7 +103,7 @@ def waypoint_paths(
 
     ``pose`` (3,): the start. ``targets`` (K, 2) [m]: both are in the world frame. The robot turns in place at the start
     and at corners. A start that is too close to a wall is replaced by the nearest free cell. Targets outside of free
-    space, and those in the cell of the robot, are left out. ``nearest``: the largest number of paths; those to the
+    space, and those in the cell of the robot, are left out. ``nearest``: if given, only the paths to this number of
     nearest targets are returned. ``beyond``, ``within`` [m]: only targets at distances between these values are used.
     """
     start = _nearest_cell(space, pose[:2])

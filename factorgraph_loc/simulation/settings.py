@@ -49,7 +49,7 @@ class WorldSettings(FileModel):
     @model_validator(mode="after")
     def _has_one_number(self) -> WorldSettings:
         if (self.tags is None) == (self.density is None):
-            raise ValueError("has both or neither of tags and density, expected exactly one of them")
+            raise ValueError("tags and density are both given or both missing, expected exactly one of them")
         if self.tag_count() > MOST_TAGS:
             raise ValueError(f"density results in {self.tag_count():,} tags, expected at most {MOST_TAGS:,}")
         return self

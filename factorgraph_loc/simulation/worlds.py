@@ -95,7 +95,7 @@ def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.ra
     """Return the plan of an office in ``outline``: rooms on both sides of a corridor along x. Each room has a door to
     the corridor and, if it is large enough, furniture in its two outer corners."""
     if width < 4.0 or depth < 6.0:
-        raise InputError(f"world: {width:g} x {depth:g} m is too small for an office, expected at least 4 x 6 m")
+        raise InputError(f"world: width and depth are {width:g} and {depth:g} m, an office needs at least 4 and 6 m")
     rooms = max(1, round(width / ROOM_WIDTH))
     low, high = (depth - CORRIDOR_WIDTH) / 2.0, (depth + CORRIDOR_WIDTH) / 2.0
     edges = np.linspace(0.0, width, rooms + 1)
@@ -151,8 +151,8 @@ def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np
     """
     if width < 4.0 * HALL_WIDTH or depth < 3.0 * HALL_WIDTH:
         raise InputError(
-            f"world: {width:g} x {depth:g} m is too small for corridors, expected at least "
-            f"{4.0 * HALL_WIDTH:g} x {3.0 * HALL_WIDTH:g} m"
+            f"world: width and depth are {width:g} and {depth:g} m, corridors need at least "
+            f"{4.0 * HALL_WIDTH:g} and {3.0 * HALL_WIDTH:g} m"
         )
     low, high = (depth - HALL_WIDTH) / 2.0, (depth + HALL_WIDTH) / 2.0
     count = max(1, round((width - 2.0 * HALL_WIDTH) / ROOM_WIDTH))
@@ -188,9 +188,7 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
             f"world: plan {settings.plan} of this size has no shelves for tags: add wall or floor to world.surfaces"
         )
     if plan.hanging and count > len(plan.hanging):
-        raise InputError(
-            f"world: tags is {count}, expected at most {len(plan.hanging)}, the number of places for tags in plan {settings.plan}"
-        )
+        raise InputError(f"world: tags is {count}, expected at most {len(plan.hanging)} in plan {settings.plan}")
     on_floor = 0
     if "floor" in settings.surfaces and not plan.hanging:
         on_floor = round(count / len(settings.surfaces)) if len(faces) else count

@@ -209,7 +209,7 @@ class Eye:
 
     def known(self, robot: RobotState, points: Array, covariances: Array | None) -> Sights:
         """Return the predicted pixels of map points at the state ``robot``. ``points`` (K, 3), ``covariances`` (K, 3,
-        3): their positions and the covariances of these; None means exact positions."""
+        3): their positions and covariances, None for exact positions."""
         position, rotation = self.pose(robot)
         pixels, by_camera, by_point = linearize_in_space(self.model, position, rotation, points)
         depths = (points - position) @ rotation[:, 2]

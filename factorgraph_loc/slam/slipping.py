@@ -37,7 +37,7 @@ def unless_slipped(
     The motion ``keyframe.from_previous`` since the previous keyframe then also gets a larger covariance, in place.
     ``guess``: the predicted pose and its covariance. ``slip``: a function of a motion. It returns the covariance (3, 3)
     that slip adds, and minus the logarithm of the probability of slip. ``observed``: the positions (K, 3) of observed
-    points, their pixels (K, 2), the covariances (K, 3, 3) of the positions, and those (K, 2, 2) of the pixels [px^2].
+    points, their pixels (K, 2), and the covariances of positions (K, 3, 3) and pixels (K, 2, 2) [px^2].
     """
     step = keyframe.from_previous
     if step is None or keyframe.factor is not None or len(observed[0]) < ENOUGH:

@@ -41,7 +41,7 @@ LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolut
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
-    """A factor on the robot's pose from K landmarks measured at one time. The pose may be that of a slightly earlier time.
+    """A factor on the robot's pose from K landmarks measured at one time. The pose may be a slightly earlier one.
 
     ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their heights above the sensor.
     ``ranges``, ``bearings``: measurements (K,) [m, rad], NaN where a value is missing.

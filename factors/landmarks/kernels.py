@@ -169,7 +169,7 @@ def linearize_all(
     ``ends`` (L,): the index behind the last row of each measurement.
     ``measured``: points, ranges and bearings, with K rows each.
     ``flags`` (L, 4): True where a measurement has an offset, an offset covariance, a velocity, and point covariances.
-    ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): those of each measurement; ignored where a flag is
+    ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): of each measurement, ignored where its flag is
     False. ``counts`` (L,): the number of landmarks that have the error of an offset in common.
     ``surveys`` (K, 2, 2): point covariances.
     ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): outputs, which must contain zeros before the call.

@@ -60,8 +60,8 @@ def mixture(
     ``slope``: the inverse of the standard deviation [1/m].
     ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``spread``: those of :class:`LateRanges`.
 
-    The information is that of a range known to be direct or late, averaged over both, minus the variance of the
-    derivative (Louis, Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
+    The information is the mean information of a direct and a late range, minus the variance of the derivative (Louis,
+    Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
     """
     widening = 1.0 + (slope * spread) ** 2
     beyond = error + slope * mean
@@ -88,7 +88,7 @@ def moments(
 
     The prediction is corrected by a direct and by a late range. The mixture of both results is replaced by a Gaussian
     with the same mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian
-    inference", 2001, 3.1). A variance above that of the prediction is reduced to it.
+    inference", 2001, 3.1). The variance is limited to that of the prediction.
 
     ``variance``: the variance of the predicted range divided by that of the noise. ``gate``: the noise is increased if
     a normalised innovation squared exceeds it. The other arguments are those of :func:`mixture`.

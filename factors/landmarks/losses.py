@@ -79,7 +79,7 @@ def resolve(
     ``error``, ``weights`` and ``squared`` in place. Returns True if there are such ranges.
 
     ``error`` (K, 2), ``jacobian`` (K, 2, D): whitened residuals at the prediction, and their Jacobian. ``columns``
-    (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): that of the state.
+    (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): of the state.
     ``weights`` (K,): the weights of the squared residuals. ``squared`` (K,): the normalised innovations squared.
     ``gate``: see :func:`factors.landmarks.late.moments`. ``model`` and ``slopes`` are those of :func:`loss`.
     """

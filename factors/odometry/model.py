@@ -36,7 +36,7 @@ LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m and rad per sqrt(s): minimum noi
 class Growth:
     """The standard deviation of one error component per square root of distance, of rotation, and of time.
 
-    The units are those of the component (m or rad) per sqrt(m), per sqrt(rad) and per sqrt(s).
+    The units are m or rad (the unit of the component) per sqrt(m), per sqrt(rad) and per sqrt(s).
     """
 
     per_distance: float = 0.0

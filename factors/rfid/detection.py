@@ -323,7 +323,7 @@ class RfidLikelihood:
         return alpha * nll, alpha * slope[:, 3:], alpha * curve[:, 3:, 3:]
 
     def expected(self, pose: Array, counts: TagReadCounts, parameters: Array) -> ExpectedReads:
-        """Observed and predicted reads at a pose (3,) with ``parameters`` (Q,), of the tags in reach and of those in ``counts``."""
+        """Observed and predicted reads at a pose (3,) with ``parameters`` (Q,), of tags in reach and tags in ``counts``."""
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:

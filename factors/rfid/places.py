@@ -180,7 +180,7 @@ class Places:
         )
 
     def work(self, counts: Counts) -> int:
-        """An estimate of the computing time for ``counts`` at one pose. The unit is that of one tag without reads."""
+        """An estimate of the computing time for ``counts`` at one pose, relative to one tag that was not read."""
         near = in_reach(self.points[:, :2], self.antennas.reach)
         _, antennas, _, hits, *_ = counts
         if not self.tables.gain.size:

@@ -95,8 +95,8 @@ def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, 
 
 
 class AtTheEnd:
-    """A backend that solves the graph only at the end of the run. During the run it has rough estimates like those of
-    an EKF, which become the initial values of the solution."""
+    """A backend that solves the graph only at the end of the run. During the run it has only rough estimates, as an EKF
+    has. They become the initial values of the solution."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
