@@ -255,10 +255,8 @@ def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float,
 
 
 def _ranks(differences: Array) -> Array:
-    """Return the ranks (N,) of the absolute values, where equal values have their mean rank. Zeros have the lowest rank.
-
-    This is ``scipy.stats.rankdata``, without the half second that the import of ``scipy.stats`` takes.
-    """
+    """Return the ranks (N,) of the absolute values, as ``scipy.stats.rankdata`` does. Its import takes half a
+    second."""
     _, which, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1.0))[which])
 

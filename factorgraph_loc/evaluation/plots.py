@@ -234,10 +234,7 @@ def _joined(segments: Array) -> Array:
 
 
 def _view(places: Array, reference: Trajectory | None) -> Array | None:
-    """Return the lower and the upper corner (2, 2) of a box around map and reference, with a margin. None without a reference.
-
-    Trajectories are not in the box by design, because dead reckoning may drift far away.
-    """
+    """Return the lower and the upper corner (2, 2) of a box around map and reference, or None without a reference."""
     if reference is None or not len(reference):
         return None
     points = np.concatenate((places, reference.poses[:, :2]))

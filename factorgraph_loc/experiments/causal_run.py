@@ -196,11 +196,7 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 
 @contextmanager
 def rare_garbage_collection() -> Iterator[None]:
-    """Collect garbage less often in this block, and exclude objects that exist already.
-
-    A collection over the objects of all loaded modules takes as long as many updates. No effect if the program has
-    called ``gc.freeze``.
-    """
+    """Collect garbage less often in this block, and never existing objects. No effect after ``gc.freeze``."""
     if gc.get_freeze_count():
         yield
         return

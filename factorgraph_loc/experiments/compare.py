@@ -122,7 +122,8 @@ def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]])
 def _experiment(
     logs: Sequence[Log], estimators: Mapping[str, Mapping[str, Any]], keys: Mapping[str, Any], *, rpe: bool
 ) -> Experiment:
-    """Return the comparison as an experiment. ``keys``: further keys of the experiment and their values."""
+    """Return the comparison as an experiment. ``keys``: its further keys. ``rpe``: whether to report relative
+    errors."""
     tables = further_tables([{"scoring.align": keys["align"]}] if keys["align"] != "none" else [], rpe=rpe)
     further = [key for keys in tables.values() for key in keys]
     content: dict[str, Any] = {

@@ -37,10 +37,8 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, 
 
 
 def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
-    """Return a warning about the error of a map that was made without a reference.
-
-    Such a map is distorted like the trajectory with which it was made. ``frame``: has the covariance of this error by position.
-    """
+    """Return a warning about the error of a map that was made without a reference. ``frame``: has the covariance of
+    this error at each pose. ``final``: the trajectory, along which the warning summarizes the error."""
     if frame.error is None or not len(final):
         return ()
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
@@ -72,7 +70,7 @@ def never_localized(
 ) -> tuple[Notice, ...]:
     """Return a warning with a likely reason if the start is unknown and the robot was never localized.
 
-    ``sensors``: the used sensors. ``status``: the status of each causal estimate.
+    ``sensors``: the used sensors. ``status``: of each causal estimate. ``final``: the final trajectory.
     """
     kinds_of_status = set(status)
     if "localized" in kinds_of_status or (len(final) and status[-1] == "unlocalized"):  # the latter: a batch estimator

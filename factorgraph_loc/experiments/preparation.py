@@ -127,7 +127,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
-    """Return warnings about sensors of the rig that are not among the used ``sensors``, and about missing odometry."""
+    """Return warnings about sensors of the rig that cannot be used, and about used ``sensors`` without odometry."""
     available = (*log.streams, *_filled_columns(log))
     sentence = "{log}: the rig lists the sensor {sensor}, the log has none"
     doubts = [notice("no_stream", sentence, log.name, s) for s in log.rig.sensors if s not in available]

@@ -80,7 +80,7 @@ def corners(shape: tuple[int, ...]) -> Array:
 
 
 def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
-    """Return zoom, rotation and tilt at the centre of the first image, which has ``shape``."""
+    """Return zoom, rotation and tilt of a ``homography`` at the centre of the first image, which has ``shape``."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
     left, axes, right = np.linalg.svd(local)
     turn = left @ right

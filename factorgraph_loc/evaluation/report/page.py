@@ -34,7 +34,7 @@ def write_report(
     damaged: Sequence[str] = (),
     versions: Mapping[str, str] | None = None,
 ) -> None:
-    """Write the report to the file ``out``.
+    """Write the report with the heading ``title`` to the file ``out``.
 
     ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional
     columns are label, sensors, kind (of a failure), warnings and ``sweep.*``.
