@@ -267,7 +267,7 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
 
 
 def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: Notice) -> LandmarkMap:
-    """Make a map in the frame of the run's start, if the given map cannot be aligned. ``note``: the reason, for the user."""
+    """Make a map of ``learnt`` in the frame of the run's start, without a comparison. ``note``: the reason for this."""
     notes = [note, *not_located(log, learnt)]
     return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
 
@@ -287,7 +287,7 @@ def _assemble(
 
     ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new
     map's frame. ``verdicts``: by name; others are "new". ``keep``: names of the landmarks with their given position.
-    ``flagged``: names of the landmarks whose given position is wrong.
+    ``flagged``: names of the landmarks whose given position is wrong. ``judged``, ``notes``: see :class:`LandmarkMap`.
     """
     entries, landmarks = [], {}
     sensors = [log.rig.of(BearingRangeSettings, name) for name in log.rig.names("bearing_range")]

@@ -162,7 +162,7 @@ def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCount
 def _lattice_search(
     model: RfidModel, counts: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> TagCandidates:
-    """Return the best candidates on a lattice of all places in reach of an antenna. ``read`` (T,): mask of the tags to search."""
+    """Return the best candidates of :func:`search` on a lattice of places in reach. ``read`` (T,): mask of searched tags."""
     cells = _cells(counts.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])
@@ -306,7 +306,7 @@ def reach(model: RfidModel) -> float:
 def refine(
     model: RfidModel, counts: TagReadCounts, heights: Array, candidates: TagCandidates
 ) -> tuple[TagCandidates, Array, Array]:
-    """Move C candidates to the nearest local optimum of the likelihood.
+    """Move C candidates to the nearest local optimum of the likelihood. ``counts``, ``heights``: see :func:`search`.
 
     Returns the moved candidates, their negative log-likelihoods (C,) and covariances (C, 2, 2).
     """

@@ -234,8 +234,8 @@ class _Problem:
         return out
 
     def add_located(self, posteriors: list[TagPosterior]) -> bool:
-        """Add located tags to the map, and move mapped tags whose new position differs significantly. Returns True if
-        any changed."""
+        """Add the tags located by the search results ``posteriors`` to the map, and move mapped tags if their new
+        position differs significantly. Returns True if the map changed."""
         changed = False
         for tag, posterior in enumerate(posteriors):
             if self._known[tag] or not posterior.is_located:

@@ -92,8 +92,8 @@ class Triangulated:
     parallax: Array
 
     def good(self, tracks: Tracks, model: CameraModel, parallax: float = PARALLAX) -> Truths:
-        """Return a mask (T,) of the points with two or more observations, an allowed depth in all their cameras, at
-        least ``parallax`` [rad], and small residuals."""
+        """Return a mask (T,) of the points with two or more observations, an allowed depth in all their cameras, a
+        parallax of at least ``parallax`` [rad], and small residuals."""
         invalid = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))

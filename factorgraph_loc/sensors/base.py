@@ -228,7 +228,7 @@ class Finder(Protocol):
         """Process a measurement ``m`` at the odometry state ``odometry``. Returns False if ``m`` is uninformative."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return poses (N, 3) at the last informative measurement, sampled from the hypotheses."""
+        """Return ``count`` poses (N, 3) at the last informative measurement, sampled from the hypotheses."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
         """Record an observation at the odometry state ``odometry``. ``view``: the prediction, not corrected yet."""

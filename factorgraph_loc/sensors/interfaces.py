@@ -141,7 +141,7 @@ def line(name: str, shift: float, than: str, setting: str, offset: float) -> Not
 
 
 def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
-    """Return the ``names`` that are in the map only with another upper or lower case."""
+    """Return the ``names`` that are in ``in_map`` only with other upper and lower case letters."""
     mapped = set(in_map)
     known = {name.casefold() for name in mapped}
     return [name for name in names if name not in mapped and name.casefold() in known]

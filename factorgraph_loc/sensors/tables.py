@@ -106,7 +106,7 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
 
 
 def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """Return the stream of a table's rows. Of repeated rows the last one is kept.
+    """Return the stream of a table's rows. Of repeated rows the last one is kept. ``warnings``: receives warnings.
 
     Rows are repeated if they have the same timestamp. If the rows of one timestamp form one measurement, repeated rows
     also have the same name. Raises InputError with file, row and column for values out of bounds, decreasing

@@ -259,8 +259,8 @@ class KnownPoints:
         return replace(factor, model=replace(factor.model, tilt=sigma))
 
     def _camera(self, expected: ReprojectionFactor, predicted: Predicted) -> CameraPose:
-        """Return the predicted pose of the camera at an image. Its covariance includes the uncertainty of the mounting
-        and of the time offset."""
+        """Return the pose of the camera at the image of the factor ``expected``, predicted from the robot's pose in
+        ``predicted``. Its covariance includes the uncertainty of the mounting and of the time offset."""
         pose, covariance = predicted.pose, predicted.covariance
         if expected.offset is not None:
             noise = np.zeros((3, 3)) if expected.offset_covariance is None else expected.offset_covariance

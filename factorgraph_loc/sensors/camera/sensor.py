@@ -291,7 +291,7 @@ class PixelFinder:
         return since if self._agree() else None
 
     def look(self, m: Pixels, odometry: ChainState) -> bool:
-        """Find the pose from an image alone. Returns False if no pose is found."""
+        """Find the pose from an image ``m`` at the odometry state ``odometry``. Returns False if no pose is found."""
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]

@@ -142,8 +142,8 @@ class SightingWindow:
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
     def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:
-        """Return the losses (N,) of present poses (N, 3): the robust losses of the sightings, plus the loss of the
-        known start. ``noise`` (3, 3): an additional body-frame covariance of the present pose, used for the start."""
+        """Return the losses (N,) of present poses (N, 3): robust losses of the sightings plus the loss of the known
+        start. ``whitener``: see :meth:`whitener`. ``noise`` (3, 3): a body-frame covariance, added for the start."""
         loss: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return loss if self._start is None else loss + self._start.loss(poses, self.now, noise)
 
@@ -164,8 +164,8 @@ class SightingWindow:
         return optima.states, np.asarray(np.linalg.inv(optima.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """Refine a present pose (3,) by Gauss-Newton with correlated odometry errors. Returns it and its body-frame
-        covariance (3, 3).
+        """Refine a present pose (3,) by ``iterations`` of Gauss-Newton with correlated odometry errors. Returns it and
+        its body-frame covariance (3, 3). ``whitener``: see :meth:`whitener`.
 
         The path since the sightings is marginalised. Residuals e in standard deviations of the sensor have the
         covariance R = I + J C J'. C is the covariance of the path, and J is the Jacobian of e by the path. On the most

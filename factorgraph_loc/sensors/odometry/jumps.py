@@ -41,8 +41,7 @@ class Jump(NamedTuple):
 
 def jumps(stream: Motion) -> list[Jump]:
     """Return the jumps of a stream of odometry or of a gyro in order of its rows. In a jump the speed or turn rate
-    differs from that of the two rows before and after by more than a robot can accelerate.
-    """
+    differs from that of the two rows before and after by more than a robot can accelerate."""
     if len(stream.t) < len(AROUND) + 1:
         return []
     if isinstance(stream, YawRateStream):

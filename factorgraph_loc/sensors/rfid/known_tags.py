@@ -207,7 +207,7 @@ class KnownTags:
         return counts.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
-        """Return the counts without the effect of tags that are clearly dead, weak or moved."""
+        """Return ``reads`` without the effect of tags that are clearly dead, weak or moved."""
         clear = self.states.odds[reads.tags] > CLEAR
         if not clear.any():
             return reads

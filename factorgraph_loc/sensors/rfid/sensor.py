@@ -93,7 +93,7 @@ class TagObservation:
         iterations: int = 1,
     ) -> Correction:
         """Correct the pose and the estimated parameters by Fisher scoring. Other components of the state are corrected
-        through their correlation."""
+        through their correlation. See :meth:`.Observation.correct`."""
         at, prior = [0, 1, 2], NO_VALUES
         for name in self.blocks:  # there is at most one block
             at, prior = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
@@ -109,8 +109,8 @@ class TagObservation:
         return self.factor.log_likelihood(poses, *(values[name] for name in self.blocks))
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        """Return the observation on the pose only, with the detection models fixed at the estimates ``values``. Their
-        uncertainty is neglected."""
+        """Return the observation on the pose only, with the detection models fixed at the estimates ``values``. The
+        covariances ``spreads`` of the estimates are not used."""
         if not self.blocks:
             return self
         return replace(self, factor=self.factor.fixed(values[self.blocks[0]]), blocks=())

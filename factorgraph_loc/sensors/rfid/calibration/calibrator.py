@@ -36,8 +36,8 @@ class RfidCalibrator(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return survey, mounting and models. With smoothed trajectories the survey is not estimated. Raises InputError
-        if the rig has no antennas or a log is too short."""
+        """Estimate survey, mounting and models, see :meth:`Calibrator.learn`. With smoothed trajectories the survey is
+        not estimated. Raises InputError if the rig has no antennas or a log is too short."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()

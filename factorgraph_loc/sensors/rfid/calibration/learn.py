@@ -282,7 +282,8 @@ def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> Surve
 def _with_models(
     settings: RfidSettings, models: Sequence[DetectionModel], which: Sequence[int], grids: Path, floor: Floor
 ) -> RfidSettings:
-    """Return the settings with fitted detection models. ``which``: the index of the model of each antenna."""
+    """Return the settings with fitted detection models, and write grids to files with the name prefix ``grids``.
+    ``which``: the index of the model of each antenna. ``floor``: the probabilities of false reads and misses."""
     antennas = dict(settings.all_antennas())
     names = [DEFAULT] * len(models)
     if len(models) > 1:  # each model has the name of its antenna

@@ -137,7 +137,7 @@ class _Focus:
         return np.asarray(result.x * unit)
 
     def _pose(self, state: Array) -> Array:
-        """Return the pose (3,) of the world in the frame of the survey."""
+        """Return the pose (3,) of the world in the frame of the survey, at a state."""
         return se2.inverse(self.survey(state).transform())
 
     def _likelihood(self, state: Array) -> PhaseLikelihood:
