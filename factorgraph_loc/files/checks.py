@@ -144,7 +144,7 @@ def last_in_order(
 
 
 def stamps(source: object, rows: Integers, t: Array) -> Integers:
-    """Convert timestamps ``t`` (N,) [s] to nanoseconds. Raises InputError if one exceeds the range of 64-bit integers."""
+    """Convert timestamps ``t`` (N,) [s] to nanoseconds. Raises InputError at a row with a time that is out of range."""
     SECONDS.require(source, rows, t, "time")
     return np.asarray(np.rint(t * 1e9).astype(np.int64))
 

@@ -134,7 +134,7 @@ def parse_toml(text: str, source: object) -> dict[str, Any]:
 
 
 def check_content(content: dict[str, Any], source: object) -> None:
-    """Raise InputError if the content of a TOML file is nested too deeply, has too many values, or an invalid value.
+    """Raise InputError if ``content`` of the file ``source`` is nested too deeply, or has too many or invalid values.
 
     Invalid values are dates, integers of more than 64 bits, text that is not UTF-8, and types that TOML does not have.
     """
@@ -235,9 +235,9 @@ def similar(word: str, known: list[str]) -> list[str]:
 
 
 def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> None:
-    """Set a value in nested tables. ``key``: the path to it, such as ``a.b.c``. Missing tables are created.
+    """Set the value at ``key``, a path such as ``a.b.c``, in the nested tables ``content``. Missing tables are created.
 
-    Raises InputError if a part of the path is not a table, or the key has more than :data:`DEEPEST` parts.
+    Raises InputError, with the file ``source``, if a part of the path is not a table, or if there are too many parts.
     """
     *tables, last = key.split(".")
     if len(tables) >= DEEPEST:
@@ -251,7 +251,7 @@ def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Return the values in nested tables with their keys. The key of a nested value is the path to it, such as ``a.b.c``."""
+    """Return the values in the nested tables ``content`` with their paths: ``prefix`` and keys, such as ``a.b.c``."""
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{key}.")
@@ -332,7 +332,7 @@ def write_toml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
-    """Return the values in nested tables and lists with their keys, except floats.
+    """Return the values in the nested tables and lists ``content`` with their keys, except floats.
 
     Raises InputError if there are more than :data:`MOST_ENTRIES` values, or they are nested deeper than :data:`DEEPEST`.
     """

@@ -58,7 +58,7 @@ class RowRules(FileModel):
         warnings: list[Notice],
         unread: Sequence[tuple[int, str]] = (),
     ) -> Integers:
-        """Return the indices of the rows without a fault, and append a warning with the number of invalid rows and the first error.
+        """Return the indices of the rows without a fault. Skipped rows add a warning to ``warnings``.
 
         ``rows`` (N,): row numbers in the file ``source``. ``faults``: the invalid cells. ``unread``: number and error
         of further rows that could not be split into cells. Raises InputError at the first fault if ``bad_rows`` is

@@ -175,7 +175,7 @@ def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
 
 
 def _nested(key: str, parts: list[_Part], value: Any) -> Iterator[Setting]:
-    """Return the settings of the models that a field may contain. ``value``: the default of the field."""
+    """Return the settings of the models that the field ``key`` may contain. ``value``: the default of the field."""
     for part in parts:
         if _is_model(part.type):
             yield from settings_in(part.type, f"{key}{part.path}.", value if isinstance(value, part.type) else None)

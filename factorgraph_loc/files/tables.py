@@ -68,7 +68,7 @@ def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = Non
     """Read a CSV file that contains one of several possible ``tables``.
 
     Returns the cells and the columns of the table that the header of the file fits best. Raises InputError with file
-    and row if the content is invalid.
+    and row if the content is invalid. ``rules``: what a manifest says about invalid rows, None without a manifest.
     """
     lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
     parsed = csv_rows(path, lines)
@@ -131,7 +131,7 @@ def read_parquet(path: Path) -> pl.DataFrame:
 
 
 def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None = None) -> pl.DataFrame:
-    """Return the table in the bytes of a Parquet file. ``columns``: columns to read, None for all. ``source``: name for messages.
+    """Return the table in ``content``, the bytes of the Parquet file ``source``, or only some ``columns`` of it.
 
     Raises InputError as :func:`read_parquet`.
     """
@@ -143,7 +143,7 @@ def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None 
 
 
 def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
-    """Return the column ``name`` of a table as texts. Integers are converted, and null becomes "".
+    """Return the column ``name`` of a table in the file ``source`` as texts. Integers are converted, null becomes "".
 
     Raises InputError if the column has another type, or its texts are too long in total.
     """

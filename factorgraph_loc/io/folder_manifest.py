@@ -125,7 +125,8 @@ def _needs_of_rig(roles: _Roles) -> list[str]:
 
 
 def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
-    """Return a remark with the lines of a world file, if the parent folder has a table that is a map. Else the list is empty."""
+    """Add a table of tags or landmarks in the parent folder of ``path`` to ``roles``. Return a remark with the lines of
+    a world file for it, or an empty list if there is no such table."""
     for table in _guesses(path.parent):
         role = _role(table)
         if role in MAPS:
@@ -141,7 +142,7 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 
 
 def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
-    """Return the settings that describe the map table with the ``role`` tags or landmarks in a world file.
+    """Return the settings for a world file that describe the table of ``roles`` with the ``role`` tags or landmarks.
 
     If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map.
     """
@@ -285,7 +286,7 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
 
 
 def _reference(roles: _Roles, path: Path) -> Trajectory | None:
-    """Return the reference trajectory of the folder ``path``. Returns None if there is none, or if it cannot be read."""
+    """Return the reference trajectory in the folder ``path``, or None if there is none, or if it cannot be read."""
     if (table := roles.tables.get("reference")) is None:
         return None
     with suppress(InputError):
@@ -327,7 +328,7 @@ def _turns_of(reference: Trajectory) -> Turns:
 
 
 def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
-    """Return the headings over time in the table of a role. Returns None if the table has no headings or turns."""
+    """Return the headings over time in the table with the ``role``. Returns None if it has no headings or turns."""
     table = roles.tables[role]
     if role == "reference":
         reference = _reference(roles, path)
@@ -344,9 +345,9 @@ def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
 
 
 def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
-    """Add clock offsets to tables whose time does not overlap that of most other tables.
+    """Add clock offsets to the ``options`` of tables with times that do not overlap the times of most other tables.
 
-    The offset aligns the turns of the robot in both tables. If no alignment is clear, it makes both begin at the same time.
+    The offset aligns the turns of the robot in two tables. If no alignment is clear, both begin at the same time.
     """
     starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}

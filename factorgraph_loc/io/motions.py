@@ -63,8 +63,8 @@ class WheelSizes(FileModel):
         """Return the motion (N, 3) of the robot ahead [m], to the left [m] and about the vertical [rad].
 
         ``wheels`` (N, 2 or 4): the distances [m] of the left and the right wheel, and of the rear left and the rear
-        right wheel. Speeds [m/s] give rates. Wheels that may be mecanum wheels add a warning about the file ``source``.
-        Formulas: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot", 2015, eq. 22 to 24.
+        right wheel. Speeds [m/s] give rates. Wheels that may be mecanum wheels add a warning about the file ``source``
+        to ``warnings``. Formulas: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot".
         """
         assert self.track is not None
         left, right, rear_left, rear_right = (wheels if wheels.shape[1] == 4 else np.hstack((wheels, wheels))).T
@@ -92,8 +92,8 @@ def between_poses(
     """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
     A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause or after
-    null poses. At a reset, the previous motion is continued, with a warning. ``lost_ns``: the timestamps of null poses,
-    which a device reports while it has lost its pose. ``source``: the file to name in the warning.
+    null poses. At a reset, the previous motion is continued, with a warning about the file ``source`` in ``warnings``.
+    ``lost_ns``: the timestamps of null poses, which a device reports while it has lost its pose.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -176,7 +176,8 @@ def between_wheels(
 def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[Notice]) -> Array:
     """Return the speed [m/s] and the turn rate [rad/s] (N, 2) of a robot from the speeds (N, 2 or 4) [m/s] of its wheels.
 
-    For mecanum wheels it returns increments (N, 3) instead. Each speed is assumed constant until the next timestamp.
+    For mecanum wheels it returns increments (N, 3) instead. A speed is assumed constant until the next timestamp. For
+    ``source`` and ``warnings`` see :meth:`WheelSizes.twists`.
     """
     twists = sizes.twists(source, speeds, warnings)
     if sizes.base is None:
@@ -229,10 +230,9 @@ def _largest_before(rates: Array, least: float) -> Array:
 
 
 def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
-    """Return the ``steps`` (N - 1, D), where the step at each reset is replaced by the previous motion. Adds a warning.
+    """Return the ``steps`` (N - 1, D), where the steps with indices ``resets`` are replaced by the previous motion.
 
-    ``resets``: the indices of the steps with a reset.
-    """
+    Adds a warning about the file ``source`` to ``warnings``."""
     durations = _durations(t_ns)
     for i in resets.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])

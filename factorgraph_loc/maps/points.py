@@ -81,7 +81,7 @@ class PointMap:
 
     @classmethod
     def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
-        """Return a map of points that are identified only by name. Without ``covariances``, positions are exact."""
+        """Return a map of named points without descriptors. Without ``covariances``, positions are exact."""
         spatial = np.zeros((len(names), 3, 3)) if covariances is None else covariances
         return cls(
             tuple(names),

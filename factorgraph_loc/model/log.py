@@ -133,7 +133,7 @@ class Log:
 
 
 def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]:
-    """Yield the rows from index ``first`` to before ``last`` in pieces. Each row with an index in ``late`` (L,) is a piece."""
+    """Yield ``rows`` from index ``first`` to before ``last`` in parts. A row with an index in ``late`` is a part alone."""
     for i in late[late.searchsorted(first) : late.searchsorted(last)].tolist() if len(late) else ():
         if first < i:
             yield rows.part(first, i)

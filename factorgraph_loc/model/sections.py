@@ -89,9 +89,9 @@ def kind_of(name: str) -> str:
 
 
 def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
-    """Select and rename sensors so that ``chosen`` is the only one of its kind. Return the old names by the new names.
+    """Return a dict from new to old names of sensors, in which ``chosen`` is the only sensor of its kind.
 
-    The new name of ``chosen`` is the name of its kind. Names of other kinds do not change.
+    The new name of ``chosen`` is the name of its kind. Other sensors of that kind in ``names`` are left out.
     """
     kind = kind_of(chosen)
     return {kind if name == chosen else name: name for name in names if name == chosen or kind_of(name) != kind}

@@ -226,7 +226,7 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
 
 
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """Return the function that computes the motion between consecutive poses of a topic of poses or tf."""
+    """Register a collector of poses or tf at ``listeners``. Return the function that computes the motion between them."""
     made = poses_of_topic(listeners, options, static)
 
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:
@@ -239,7 +239,7 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
 
 
 def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> Motion:
-    """Return the function that computes the motion from the angles, distances or speeds of wheels."""
+    """Register collectors of ``wheels`` at ``listeners``. Return the function that computes the motion of the robot."""
     bag = listeners.bag
     if (wheels.base is not None or len(wheels.joints) == 3) and len(wheels.joints) != 4:
         raise InputError(
@@ -275,7 +275,7 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
 
 
 def _wheel(bag: Bag, topic: str, path: str, rules: RowRules) -> TopicRows:
-    """Return a collector of the value of one wheel, the field ``path`` in each message of a topic."""
+    """Return a collector of the values of one wheel, the field ``path`` in the messages of a topic."""
     source = f"{bag.path} {topic}"
     known = bag.topic(topic)
     check_path(bag.store(topic), known, path, f"{bag.path}: topic {topic}: wheel")

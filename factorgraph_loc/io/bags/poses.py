@@ -100,7 +100,7 @@ def seven(pose: Any, position: str = "position", orientation: str = "orientation
 def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
     """Return the rotations (N, 3, 3) of a ``table`` (N, 7) of positions x, y, z and quaternions x, y, z, w.
 
-    ``rows`` (N,): the row numbers for errors. Raises InputError if a number is not finite, or a quaternion has not length 1.
+    Raises InputError, with ``source`` and the row of ``rows`` (N,), if a number is not finite or a norm is not 1.
     """
     checks.require_finite(source, rows, SEVEN, table)
     return rotations_of(source, rows, table[:, 3:])
@@ -110,8 +110,8 @@ def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = Tr
     """Return the poses of collected ``rows``.
 
     A row has x, y, z, then a quaternion unless ``has_rotations`` is False, then optionally the variances of x and y.
-    Null poses, which a device reports while it has lost its pose, are skipped with a warning. Of rows with equal
-    timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
+    Null poses, which a device reports while it has lost its pose, are skipped with a warning in ``warnings``. Of rows
+    with equal timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:
@@ -248,7 +248,7 @@ class FrameReference:
 
 
 def static_frames(listeners: Listeners, base: str) -> StaticFrames:
-    """Return a collector of static transforms, and register it if the bag has any. ``base``: the frame of the robot."""
+    """Return a collector of static transforms, registered at ``listeners`` if the bag has any. ``base``: robot frame."""
     bag, frames = listeners.bag, StaticFrames(base)
     if STATIC in bag.topics and bag.topics[STATIC].type in TF and bag.topics[STATIC].count:
         listeners.add(STATIC, frames)
@@ -258,7 +258,7 @@ def static_frames(listeners: Listeners, base: str) -> StaticFrames:
 def poses_of_topic(
     listeners: Listeners, options: PoseTopic, frames: StaticFrames
 ) -> Callable[[list[Notice]], PosePath]:
-    """Register a collector for a topic of poses or points, or of tf with two frames.
+    """Register a collector at ``listeners`` for the topic in ``options``: poses, points, or tf with two frames.
 
     ``frames``: the static transforms of the bag. Returns the function that makes the :class:`PosePath` once the bag is read.
     """

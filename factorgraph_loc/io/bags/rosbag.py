@@ -57,7 +57,7 @@ FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSettings:
     """Return the settings of a camera from its CameraInfo, and its mounting from tf_static.
 
-    Without a mounting in tf_static, the camera is at the robot's origin and points forward. A note says so.
+    Without a mounting in tf_static, the camera is at the robot's origin and points forward, with a note in ``notes``.
     """
     pose = frames.pose(info.frame)
     if pose is None:
@@ -72,7 +72,7 @@ def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSe
 def antennas_of(
     names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, notes: list[Notice]
 ) -> RfidSettings:
-    """Return the settings of RFID antennas, mounted where tf_static has their frames.
+    """Return the settings of the RFID antennas ``names``, mounted where tf_static has their frames.
 
     ``given``: the frame of each antenna that is not named like its frame. The x axis of a frame is the boresight. An
     antenna without a frame is at the robot's origin. Notes about the mountings are added to ``notes``.
@@ -177,14 +177,14 @@ def _read(bag: Bag, options: Options, stack: ExitStack) -> Log:
 
 
 def _left_out(bag: Bag, listeners: Listeners) -> str:
-    """Return the names and types of the topics that have messages but are not in the manifest, as one text."""
+    """Return, as one text, the names and types of the topics with messages that have no collector in ``listeners``."""
     unread = [topic for topic in bag.topics.values() if topic.count and topic.name not in (*listeners.topics, STATIC)]
     return ", ".join(f"{topic.name} ({topic.type})" for topic in unread)
 
 
 def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Any]:
-    """Register collectors at ``listeners`` for all sensors in the manifest except odometry. Returns the collectors by the names of
-    their streams. ``stack``: closes their temporary files at the end. ``frames``: the static transforms of the bag."""
+    """Register collectors at ``listeners`` for all sensors in ``options`` except odometry, and return them by the names
+    of their streams. ``stack``: closes temporary files at the end. ``frames``: the static transforms of the bag."""
     bag = listeners.bag
     out: dict[str, Any] = {}
     if options.imu:
@@ -202,7 +202,7 @@ def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack
 
 
 def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Images:
-    """Return a collector of images. It is registered only if the images are not in the cache folder yet."""
+    """Return a collector of images. It is registered at ``listeners`` unless the images are in the cache folder."""
     stamper = listeners.stamper(options.topic, options.clock)
     images = Images(listeners.bag, options.topic, stamper, stack)
     if images.known:
@@ -215,7 +215,7 @@ def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Ima
 def _rig(
     streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[Notice]
 ) -> Rig:
-    """Return a rig with the camera and the antennas of the bag, and the default noise. A rig in the manifest replaces it."""
+    """Return a rig with the camera, the antennas and the default noise. Adds notes about mountings to ``notes``."""
     camera = camera_of(info, frames, notes) if info else None
     reads = streams.get("rfid")
     rfid = None

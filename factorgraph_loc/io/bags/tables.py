@@ -277,7 +277,7 @@ class Landmarks(RowsOfTopic):
         super().__init__(bag, options.topic, fields, BEARING_RANGE, columns, rules=options)
 
     def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
-        """Return the ranges along the floor [m] and the bearings [rad] of landmarks.
+        """Return the ranges along the floor [m] and the bearings [rad] of landmarks. For arguments see the base class.
 
         Ranges and bearings that are computed from positions are in the robot frame if tf_static has the frame of the sensor.
         """
@@ -321,7 +321,7 @@ class Corners(RowsOfTopic):
 
 
 def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> RowsOfTopic:
-    """Return a collector for the topic of a table.
+    """Return a collector for the topic of a table. ``options``: the topic and the fields of its messages.
 
     The table is the first of ``tables`` that has default fields for the message type. If none has, it is ``tables[0]``.
     Corners of AprilTags need no fields. Raises InputError if the fields do not fit the table.

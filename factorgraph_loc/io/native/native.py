@@ -110,9 +110,8 @@ def world_of(run: RunFile, source: Path) -> World:
 
 
 def read_tables(folder: Path, warnings: list[Notice], rules: RowRules) -> dict[str, TableRows]:
-    """Return the non-empty tables in a folder by name, without the rows that ``rules`` skip. A table of an unknown
-    sensor is skipped with a warning.
-    """
+    """Return the non-empty tables in a folder by name, without the rows that ``rules`` skip. Skipped rows, and tables
+    of unknown sensors, add warnings to ``warnings``."""
     tables = {}
     stems = sorted(file.stem for file in folder.iterdir() if file.suffix in SUFFIXES)
     for name in dict.fromkeys((*native_tables(), *stems)):

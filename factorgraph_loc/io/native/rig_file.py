@@ -185,7 +185,7 @@ def _nested(sections: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _antennas(names: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return the settings of antennas that are evenly spaced around the robot, counter-clockwise from the front.
+    """Return the settings of antennas ``names``, evenly spaced around the robot, counter-clockwise from the front.
 
     Two antennas face to the left and to the right.
     """

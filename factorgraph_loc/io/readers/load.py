@@ -206,7 +206,7 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
 
 
 def _read(source: _Source, rig: Rig | None, world: World | None, options: Mapping[str, Any], naming: list[str]) -> Log:
-    """Read and check one log.
+    """Read and check one log from ``source``.
 
     ``rig``, ``world``: replace those of the reader if given. ``options``: one value per option. ``naming``: the options
     that are appended to the name of the log to make it unique.

@@ -234,7 +234,7 @@ def _epcs(mapped: Cells) -> tuple[list[str], list[Fault]]:
 
 
 def _from_base64(text: str) -> str:
-    """Return an EPC as upper-case hexadecimal digits, the notation of Impinj's readers; a question mark if it is not base64."""
+    """Return an EPC in base64 as upper-case hexadecimal digits. Return a question mark if ``text`` is not base64."""
     try:
         return base64.b64decode(text.translate(STANDARD) + "=" * (-len(text) % 4), validate=True).hex().upper()
     except ValueError:
@@ -242,8 +242,8 @@ def _from_base64(text: str) -> str:
 
 
 def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
-    """Return the rows of ``mapped`` whose last read is not before the first one. Raises InputError at other rows,
-    unless the options skip them."""
+    """Return the rows of ``mapped`` with a last read that is not before the first one. Raises InputError at other rows,
+    unless the options skip them with a warning in ``warnings``."""
     if "last" not in mapped.columns:
         return mapped
     wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)
@@ -265,7 +265,7 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[Notice]) -> TableRows:
     """Return the table with a second read for each row that summarizes several reads. The second read has a time, but no signal.
 
-    Warns about the reads between the first and the last one of a row, which are skipped.
+    Reads between the first and the last one of a row are skipped, with a warning in ``warnings``.
     """
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):

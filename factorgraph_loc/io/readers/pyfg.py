@@ -127,7 +127,7 @@ def _number(path: Path, row: int, name: str, cell: str) -> float:
 
 
 def _table(rows: TableRows, columns: str) -> Array:
-    """Return the numbers (N, K) of K columns. ``columns``: their names, separated by spaces."""
+    """Return the numbers (N, K) in K columns of ``rows``. ``columns``: their names, separated by spaces."""
     return np.column_stack([rows.numbers[name] for name in columns.split()])
 
 
