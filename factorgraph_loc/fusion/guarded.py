@@ -24,8 +24,7 @@ from factorgraph_loc.text import plain
 from factors import positive
 from factors.se2 import Array
 
-# The exceptions of numerical failures: singular matrices, overflows, divisions by zero, arguments out of range, all errors of
-# GTSAM.
+# The exceptions that numerical failures raise, such as singular matrices, overflows, and all errors of GTSAM.
 FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
 ROUNDING = 1e-6  # an eigenvalue of a correlation matrix between minus this value and 0 counts as a rounding error
 LEAST = 1e-9  # smaller eigenvalues of a correlation matrix are raised to this value

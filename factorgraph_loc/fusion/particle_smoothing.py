@@ -28,7 +28,7 @@ from factors.compiled import compiled
 from factors.motion import ChainState, Increment
 from factors.se2 import Array, Integers
 
-BREAK = 100.0  # a state with a larger squared Mahalanobis distance from its ancestor does not follow from it
+BREAK = 100.0  # squared Mahalanobis distance from its ancestor above which a particle cannot come from there
 
 
 @dataclass(frozen=True)

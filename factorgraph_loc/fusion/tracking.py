@@ -37,9 +37,9 @@ from factors.motion import ChainState, Increment
 from factors.se2 import Array
 from factors.update import Correction
 
-REFUTING = 8.0  # log-odds against a track that reject it; high, because robots are rarely carried
+REFUTING = 8.0  # the estimated track is rejected above these log-odds, which are high because robots are rarely carried
 BEFORE = 2.0  # s: the robot left the track at most this long before a sensor's first doubt or the first observation against it
-# times are possible for the departure from the track if their log-likelihood is within this difference of the highest
+# a time is a possible departure from the track if its log-likelihood differs by less from the highest one
 UNSURE = 5.0
 NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
 CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known if its variances of x and y have a smaller sum

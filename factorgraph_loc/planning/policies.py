@@ -29,7 +29,7 @@ from factors.se2 import Array
 
 NOTHING = 0.3  # nats: a smaller gain is not significant, because the expectation is noisy
 FEW = 0.6  # paths to distant places are evaluated if the few main modes have a larger total weight than this
-EACH, OF_MODES = 48, 96  # particles drawn from each mode, and number of all these that a simulated scan weighs
+EACH, OF_MODES = 48, 96  # number of particles drawn from each mode, and total number that a simulated scan weighs
 COMMITTED = 0.5  # fraction of an arc that is completed before the next choice
 FAR = "waypoint"  # kind of the paths to distant places
 FAR_PER_METRE = 0.02  # nats/m: small penalty, so that the shorter of equally informative paths is chosen

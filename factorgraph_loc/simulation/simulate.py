@@ -115,8 +115,8 @@ def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
 def simulate(settings: SimulationSettings, seed: int) -> Log:
     """Simulate a log. The same ``settings`` and ``seed`` give exactly the same log.
 
-    The log has the streams odometry and rfid, bearing_range if the world has landmarks, sightings if it has points, and streams of
-    sensors from plugins. Its reference is the true trajectory. Its stated start is the true start pose plus a random error with the
+    The log has the streams odometry and rfid, bearing_range if the world has landmarks, sightings if it has points, and
+    streams of sensors from plugins. Its reference is the true trajectory. Its start pose has a random error with the
     standard deviations :data:`START_SIGMAS`. Raises InputError if the world has no room for the tags or for the robot.
     """
     of_world = seed if settings.world_seed is None else settings.world_seed

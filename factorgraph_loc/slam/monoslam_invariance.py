@@ -41,8 +41,8 @@ def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
 
 
 def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
-    """Return the Jacobian (12 + P + D, 3) of the error state with respect to a rotation of the world, at ``posterior``
-    minus at ``prior``. The rows of the robot's rotation are zero."""
+    """Return the Jacobian (12 + P + D, 3) of the error state at ``posterior`` by a rotation of the world, minus the one
+    at ``prior``. The rows of the robot's rotation are zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros((len(posterior.covariance), 3))
     change[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)
@@ -58,8 +58,8 @@ def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
 
 
 def _by_scale(prior: SlamState, posterior: SlamState) -> Array:
-    """Return the derivative (12 + P + D,) of the error state with respect to the scale of the world, at ``posterior``
-    minus at ``prior``. The row of the scale itself is zero."""
+    """Return the derivative (12 + P + D,) of the error state at ``posterior`` by the scale of the world, minus the one
+    at ``prior``. The row of the scale itself is zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros(len(posterior.covariance))
     change[SHIFT] = ours.rotation.T @ (ours.position - own.position)

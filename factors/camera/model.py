@@ -195,8 +195,8 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 def folded(model: CameraModel) -> Array | None:
     """Find a pixel (2,) at which the lens model is not invertible, on a grid over the image. Returns None if there is none.
 
-    A lens is invertible at a pixel if a direction within the valid radius of the polynomial projects to the pixel, and
-    the determinant of the lens's Jacobian is positive there.
+    A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
+    determinant of the lens's Jacobian.
     """
     if not any(model.distortion) and not model.fisheye:
         return None

@@ -170,7 +170,7 @@ class LateShares:
 
 
 def _rounded(value: float) -> float:
-    """The value with two significant digits. Factors with equal models are linearised together."""
+    """Round to two significant digits. Models then are often equal, and their factors can be linearised together."""
     return float(f"{value:.2g}")
 
 

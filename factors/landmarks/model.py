@@ -234,8 +234,8 @@ def _whitened(
     ``sx``, ``sy``, ``height``: the vector from the sensor to the point, along the robot's axes [m]. ``turn``: heading
     of the sensor in the robot frame. ``ahead_x``, ``ahead_y``: unit vector of the depth axis in the robot frame.
 
-    Returns the errors of range and bearing (zero if missing), the point's distance along the floor, the derivatives of the
-    unscaled range by ``sx`` and ``sy``, the unscaled range, and the inverse standard deviation of the range (zero if missing).
+    Returns the errors of range and bearing, the point's distance along the floor, the derivatives of the unscaled range
+    by ``sx`` and ``sy``, the unscaled range, and the range's inverse standard deviation. Missing values are zero.
     """
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0

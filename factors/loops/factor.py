@@ -88,8 +88,8 @@ class LoopFactor:
 
     @cached_property
     def _whitener(self) -> Array:
-        """The matrix that whitens the residual. Where only positions are measured, it adds the mean variance of the odometry's two
-        coordinates, because the direction of the odometry's error in the earlier pose's frame is unknown."""
+        """The matrix that whitens the residual. If only positions are measured, it adds the mean variance of the
+        odometry's x and y, because the direction of the error is unknown."""
         covariances = [o.covariance for o in (self.offset, self.earlier_offset) if o is not None]
         if self.measured is None:
             added = sum(float(np.trace(covariance[:2, :2])) / 2.0 for covariance in covariances)

@@ -240,8 +240,8 @@ def _corrected(
     iterations: int,
 ) -> tuple[Array, Array, float, int, float, float, float]:
     """Compute :meth:`RfidFactor.correct`. Returns the correction (3 + P,), the covariance after it, the normalised
-    innovation squared and its degrees of freedom, the negative log-likelihood of the prediction minus its mean, the
-    variance of that, and the log-evidence."""
+    innovation squared and its degrees of freedom, the negative log-likelihood of the prediction minus its mean, its
+    variance, and the log-evidence."""
     size = len(covariance)
     nll, gradient, information, expected, variance = _score(tags, phase, strength, pose, values)
     prior_information = inverse(covariance)

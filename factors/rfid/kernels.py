@@ -27,8 +27,8 @@ MOST_COLUMNS = 8  # largest number of components of pose and parameters that one
 def tag_logit(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """The logit of a tag at (p, q, height) from the antenna, in axes rotated by the antenna's yaw but not by its pitch,
-    with facing cosine c, and its derivatives by p, q, height and c."""
+    """The logit of a tag at (p, q, height) from the antenna, and its derivatives by p, q, height and c. The axes have
+    the antenna's yaw but no pitch. ``c``: the facing cosine."""
     cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
     m = packed.which[antenna]
     x, z = cp * p + sp * height, cp * height - sp * p
@@ -83,7 +83,7 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
     the logarithm of ``rate``, a factor of the probability."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
     by_rate = packed.span * rate * sigmoid
-    # without false reads, a probability may be 0 or 1, and the logarithm of it or of its complement is infinite
+    # without false reads, a probability p may be 0 or 1, so that log(p) or log(1 - p) is infinite
     q = min(max(packed.false_read + by_rate, 1e-12), 1.0 - 1e-12)
     return q, by_rate * (1.0 - sigmoid), by_rate
 
@@ -157,8 +157,8 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
 
 @compiled
 def _unread(packed: Packed, rounds: Integers) -> Array:
-    """For each of K measurements, the negative log-likelihood that a tag out of range is not read, and the mean and
-    variance of the negative log-likelihood over all outcomes (K, 3)."""
+    """Three values for each of K measurements (K, 3): the negative log-likelihood that a tag out of range is not read,
+    and the mean and variance of the negative log-likelihood over all outcomes."""
     out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
     for k in range(len(rounds)):
         out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])

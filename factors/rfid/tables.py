@@ -216,8 +216,8 @@ def relevant(
     ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models adjusted to
     the first row of ``parameters``. ``near`` (T,): a mask of tags in reach.
 
-    The mask is True for near tags that were read, and for near tags that have a relevant read probability according to
-    the blocks of the tables. In a dense map most tags have none, which saves time.
+    The mask is True for near tags that were read, and for near tags with a relevant read probability in the blocks of
+    the tables. In a dense map this excludes most tags.
     """
     offsets, antennas, rounds = measured
     points, _, levels, hits = tags

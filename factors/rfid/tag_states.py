@@ -43,7 +43,7 @@ KEPT = 200.0  # s; the evidence of scans is stored for this time, and can be rem
 BELIEVED = 0.5  # a tag is reported as dead, weak or moved if the probability exceeds this value
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: spacing of the grid of displacements, and the largest displacement
-WORTH = 20.0  # the weight of the prior of the fraction of moved tags, as a number of tags that were read
+WORTH = 20.0  # the weight of the prior of the fraction of moved tags: it counts as this number of tags that were read
 # The largest estimate of the fraction of moved tags. If more tags seem to have moved, a wrong pose or model is more likely.
 MOST_MOVED = 0.15
 # The kinds of weak tags. Each row has the changes of the parameters a and b of a detection model (factors.rfid.parameters), which
