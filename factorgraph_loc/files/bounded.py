@@ -27,7 +27,7 @@ IMAGE = 2**28  # bytes of an image file
 GRID = 2**26  # bytes of an uncompressed occupancy grid
 PIXELS = 2**26  # pixels of an image; the limit of OpenCV is 2^30
 CELLS = 2**27  # rows times columns that a Parquet file declares
-MEMORY, MEMORY_PER_BYTE = 2**30, 32  # bytes that reading a file may take, and in addition for each byte of the file
+MEMORY, MEMORY_PER_BYTE = 2**30, 32  # a file of N bytes may take MEMORY + MEMORY_PER_BYTE * N bytes of memory
 CHECK_INTERVAL = 0.01  # s between checks of the memory
 LARGEST_POINTER = 1024  # bytes of a pointer file of Git LFS, by its specification
 

@@ -123,7 +123,7 @@ def _mapped(
 ) -> Cells:
     """Return the cells of a file by field.
 
-    ``columns``: cells by column of the file. ``available``: names of all its columns. For others see :class:`Cells`.
+    ``columns``: cells by column of the file. ``available``: all column names. For other arguments see :class:`Cells`.
     """
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}

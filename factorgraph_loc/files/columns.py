@@ -187,7 +187,7 @@ def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int,
 
 
 def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Integers]]) -> None:
-    """Raise InputError if timestamps of a log are more than :data:`MAX_SPAN` apart. The message has the worst outlier.
+    """Raise InputError, at the largest outlier, if timestamps of a log are more than :data:`MAX_SPAN` apart.
 
     ``tables``: for each table the file, the row numbers (N,) in the file, and the timestamps (N,) [ns].
     """
@@ -222,7 +222,7 @@ def number(
 
 
 def within(name: str, units: Mapping[str, float], most: float, doc: str) -> Column:
-    """Return the description of a column of numbers from ``-most`` to ``most``."""
+    """Return the description of a column of numbers from ``-most`` to ``most``. For the arguments see :class:`Column`."""
     return number(name, units, -most, most, doc)
 
 

@@ -109,12 +109,11 @@ def between_poses(
 
 
 def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Integers, Array]:
-    """Return timestamps (M,) [ns] and increments (M, 4) of odometry with null poses, which a device reports while it is lost.
+    """Return timestamps (M,) [ns] and increments (M, 4) of odometry with null poses, reported by a device that is lost.
 
-    An increment is the motion x, y [m], heading [rad], and the part [s] of its duration in which the motion is unknown.
     ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of null poses.
-    The motion is unknown from a valid pose, over null poses, to the next valid pose. Up to the last null pose the
-    previous motion is continued, for at most :data:`HOLD_TIME`. Without null poses the increments are (N, 3).
+    An increment is x, y [m], heading [rad], and the time [s] in which the motion is unknown, because of null poses. In
+    this time the previous motion is continued, for at most :data:`HOLD_TIME`. Without null poses increments are (N, 3).
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):

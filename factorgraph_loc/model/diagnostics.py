@@ -114,7 +114,7 @@ class Diagnostics:
         )
 
     def record(self) -> list[Addition]:
-        """Start to record additions, and return the list to which they are appended, for :meth:`take_back`.
+        """Start to record what is added to the diagnostics. Return the list of additions, for :meth:`take_back`.
 
         Recording ends when ``added`` is set to None. Late measurements and events are not recorded.
         """

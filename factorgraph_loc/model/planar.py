@@ -173,7 +173,7 @@ def about_z(source: object, rows: Integers, rates: Array, turned: Array) -> Arra
     """Return the turn rates (N,) about the robot's z axis from the ``rates`` (N, 3) about the axes of a sensor, in the same unit.
 
     ``turned`` (3, 3): the rotation from the sensor frame to the robot frame. ``source``, ``rows`` (N,): the file and
-    the row numbers for errors. Raises InputError if a rate that contributes is not finite.
+    the row numbers for errors. Raises InputError if a rate is not finite, unless its axis is perpendicular to z.
     """
     needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
     for i in needed.tolist():

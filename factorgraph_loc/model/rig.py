@@ -24,8 +24,8 @@ S = TypeVar("S", bound=FileModel)
 class Rig(FileModel):
     """A robot and its sensors. The settings of a sensor are an attribute with the name of its section, None if the robot lacks it.
 
-    Several sensors of a kind are a table of settings by name. ``bearing_range.front`` is then the name of one of them.
-    In ``sensors``, the name of a kind stands for all sensors of that kind.
+    If the robot has several sensors of a kind, the attribute is a dict of settings by name, and the full name of a
+    sensor is such as ``bearing_range.front``. In ``sensors``, the name of a kind stands for all sensors of that kind.
     """
 
     name: str = "rig"
@@ -99,11 +99,11 @@ class Rig(FileModel):
         return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy in which the names of files, such as those of learnt grids, are relative to ``folder``."""
+        """Return a copy in which the names of files, such as tables of RFID models, are relative to ``folder``."""
         return self.model_copy(update={name: settings.placed(folder) for name, settings in self._of_sensors().items()})
 
     def write_beside(self, folder: Path) -> None:
-        """Write the files that the rig names, such as learnt grids, into ``folder``."""
+        """Write the files that the rig names, such as tables of RFID models, into ``folder``."""
         for settings in self._of_sensors().values():
             settings.write_beside(folder)
 

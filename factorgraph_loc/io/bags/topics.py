@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 LIST = "[]"
 ELEMENT = re.compile(r"\[(\d+)\]$")  # matches the index at the end of a path such as covariance[0]
-BYTES = ("uint8", "byte", "char", "octet")  # types of which a list is one value, such as an EPC
+BYTES = ("uint8", "byte", "char", "octet")  # a list of these types is one value, such as an EPC
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 HEADER = "std_msgs/msg/Header"
 DEPTH = 6  # maximum nesting level of messages in which fields are listed

@@ -155,7 +155,7 @@ def read(path: Path | None, options: Options) -> Log:
 def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) -> TableRows:
     """Read the file in ``folder`` that ``mapping`` names, as a table of the native format.
 
-    The format is the first of ``tables`` with required fields that ``mapping`` has all.
+    The table is the first of ``tables`` for which ``mapping`` has all required fields.
     """
     shapes = tuple(_fields(table, mapping) for table in tables)
     columns = {column.name: column for table in tables for column in table.columns}

@@ -139,7 +139,7 @@ def read_all_reads(folder: TableFolder, options: RfidFile) -> TableRows:
 
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
-    """Join tables of reads to one that is sorted by time, because readers report in batches in any order.
+    """Join tables of RFID reads to one table that is sorted by time.
 
     ``path``: the name of the joined table in errors.
     """
