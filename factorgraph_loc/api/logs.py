@@ -88,8 +88,8 @@ def simulate(
     """Simulate a log with known ground truth. The same seed gives the same bytes.
 
     ``what``: a preset, a TOML file, or settings. ``changes``: changed settings as nested tables, such as ``{"drive":
-    {"duration": 60.0}}``. ``images``: render the images of the camera into ``out``. ``out``: a new folder in which to
-    write the log in the native format.
+    {"duration": 60.0}}``. ``images``: render the images of the camera into ``out``. ``out``: a new folder for the log
+    in the native format. ``progress`` is called with the numbers of rendered and of all images.
     """
     if isinstance(what, SimulationSettings) and changes:
         raise InputError("changes apply to a preset or a file, but settings are given: change the settings themselves")

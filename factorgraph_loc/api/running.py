@@ -62,7 +62,7 @@ def run(
     """Run one estimator on one log and score the result.
 
     ``learn``: estimate the constants of the rig from the log itself, for the final trajectory only.
-    ``align``: an alignment with the reference, after which scores are computed again.
+    ``align``: unless it is "none", there are also scores after this alignment with the reference.
     ``out``: a folder in which to write the files of ``fgloc run``.
     ``progress`` is called with the fraction of the work that is done.
     For the other arguments see :class:`~factorgraph_loc.model.scoring.RunConfig`.

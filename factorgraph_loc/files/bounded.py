@@ -199,7 +199,7 @@ def quiet() -> Iterator[None]:
     """Discard all output to descriptor 2 (stderr) in this block. No effect outside of the main thread.
 
     All threads share the descriptor, so messages of other threads are discarded too. Therefore the block should contain
-    only the call that reads one file. If several threads did this at once, the descriptor could stay redirected.
+    only the call that reads one file. If several threads redirected it at the same time, it could stay redirected.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -142,7 +142,7 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 
 
 def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
-    """Return the settings for a world file that describe the table of ``roles`` with the ``role`` tags or landmarks.
+    """Return the settings for a world file that describe the map table with the ``role`` tags or landmarks.
 
     If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map.
     """
@@ -244,7 +244,7 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
     """Add the distance between the wheels, and the distance per encoder count, to the ``settings`` of odometry.
 
     ``table``: the table of odometry. ``sides``: its fields of the wheels. ``roles``: the tables of all roles, and remarks.
-    Both are estimated from the reference. If that is impossible, they are examples, and a remark asks to replace them.
+    The two distances are estimated from the reference, or else are examples that a remark asks the user to replace.
     """
     settings["track"] = TRACK
     if sides[0] != "left":

@@ -112,8 +112,8 @@ def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Int
     """Return timestamps (M,) [ns] and increments (M, 4) of odometry with null poses, reported by a device that is lost.
 
     ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of null poses.
-    An increment is x, y [m], heading [rad], and the time [s] in which the motion is unknown, because of null poses. In
-    this time the previous motion is continued, for at most :data:`HOLD_TIME`. Without null poses increments are (N, 3).
+    An increment is x, y [m], heading [rad], and the time [s] in which the motion is unknown, because of null poses. At
+    null poses the previous motion is continued, for at most :data:`HOLD_TIME`. Without them, increments are (N, 3).
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):

@@ -72,10 +72,10 @@ class Log:
         return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))
 
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """Return the measurements of ``sensors`` in order of arrival, with the time offsets of the rig added to their timestamps.
+        """Return the measurements of ``sensors`` in order of arrival. Time offsets in the rig are added to timestamps.
 
-        A late measurement keeps its timestamp and follows the measurements that arrived before it. Measurements with
-        equal times are ordered by the rank of their streams.
+        A measurement that is older than another one before it in its stream arrives directly after that one. Others
+        arrive at their timestamps, and at equal timestamps in order of the ranks of their streams.
         """
 
         return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))

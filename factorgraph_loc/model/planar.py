@@ -141,9 +141,9 @@ def on_floor(
 ) -> Array:
     """Return planar poses (N, 3) of ``positions`` (N, 3) and ``rotations`` (N, 3, 3): x, y and the direction of the x axis.
 
-    ``turned``: the axes of the recorded poses, and how their frame is mounted on the robot. Without ``rotations``, headings are 0.
-    Adds a warning if heights differ by more than :data:`RISE`, or if the robot tilts by more than :data:`TILT`. Raises InputError
-    if heights differ by more than :data:`MOST` and no axes are set, because y and z may be swapped.
+    ``turned``: the axes of the recorded poses, and how their frame is mounted on the robot. Without ``rotations``,
+    headings are 0. Adds a warning about the file ``source`` to ``warnings`` if heights or tilts are too large. Raises
+    InputError if heights differ by more than :data:`MOST` and no axes are set, because y and z may be swapped.
     """
     places = positions @ turned.standing().T
     poses = np.column_stack((places[:, :2], np.zeros(len(places))))

@@ -39,7 +39,7 @@ class RunConfig:
     ``seed``: the seed of the estimator's random generator.
     ``max_gap``: the longest gap between two estimates in which scoring interpolates poses [s].
     ``tick_gap``: the longest gap between measurements in which estimates are recorded [s].
-    ``align``: an alignment with the reference, after which scores are computed again. Estimates do not change.
+    ``align``: unless it is "none", there are also scores after this alignment with the reference.
     """
 
     estimator: str

@@ -180,10 +180,10 @@ def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) 
 
 
 def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRows:
-    """Return the rows of a table with names translated to those of the map.
+    """Return the rows of ``table`` with names translated to names in the map.
 
-    ``naming`` describes the table of the translations. Rows with a name that it lacks are skipped with a warning.
-    """
+    ``naming``: the description of the table of translations. Rows with a name that this table lacks are skipped, with a
+    warning in ``folder.warnings``."""
     path = folder.file(naming.file)
     known = _names(path, naming)
     ((column, names),) = table.names.items()

@@ -100,9 +100,9 @@ def _read(
 def read_pose_file(path: Path, kind: Format | None = None, rules: RowRules | None = None) -> PosePath:
     """Return the poses of a file in TUM, KITTI or EuRoC format.
 
-    ``kind``: the expected format, by default any. The first row determines the format. Of poses with equal timestamps, the last
-    is kept. Null poses are skipped with a warning. Poses of a KITTI file have no timestamps. ``rules``: what a manifest says
-    about invalid and late rows, None without a manifest. Raises InputError with file and row of an invalid value.
+    ``kind``: the expected format, by default any. The first row determines the format. Of poses with equal timestamps,
+    the last is kept. Null poses, recorded while the pose was lost, are skipped with a warning. ``rules``: what a manifest
+    says about invalid and late rows, None without a manifest. Raises InputError with file and row of an invalid value.
     """
     row, first = _first_row(path)
     detected = _format(first)
