@@ -256,7 +256,7 @@ class Sensor:
     follows_constants: ClassVar[bool] = False  # True if `observe` needs the covariance of the constants
     keyframe_every: ClassVar[float] = 0.09  # s between the keyframes of a graph
     gathers: ClassVar[bool] = False  # True if a graph must merge the observations of a keyframe by `gathered`
-    links: ClassVar[bool] = False  # True if its observations are links between two poses, of which many may be false
+    links: ClassVar[bool] = False  # True if its observations are links between two poses; many links may be false
     evidence_every: ClassVar[float] = 1.0  # s between the measurements that a search of the pose uses
     work: int = 10  # approximate cost to add a measurement to a graph, in units of one RFID tag
     solve_every: float = 0.0  # s; longest delay of a solver update of a graph

@@ -170,7 +170,7 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
 
 
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
-    """Yield the descriptions of a stream's numeric fields. Each has the name of its field."""
+    """Yield the descriptions of a stream's numeric fields, each named as the field instead of the file's column."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):
         if table.stream and load(table.stream) is type(stream):
             measured = [column.measured for column in table.columns if column.kind == "number"]

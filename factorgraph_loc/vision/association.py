@@ -37,8 +37,8 @@ CELL = 20.0  # px, cells for sorting features
 # px: value that is added to the radius of each gate, because the prediction is not exact, and largest radius
 SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
 MARGIN = 20.0  # px: points that are predicted this far outside the image are still searched
-SAME_PIXEL = 4.0  # px: closer points and features may be the same
-SAME_POINT = 0.15  # m: closer points may be the same
+SAME_PIXEL = 4.0  # px: points or features with closer pixels may show the same point
+SAME_POINT = 0.15  # m: closer points of the map may be the same point
 CHANCE = 0.02  # a match must be so similar that only this fraction of pairs of different map points is more similar
 MANY = 5000  # views of a map: with more, only the most similar keyframes are compared with an image
 # least number of matches, and least fraction of the visible points that must match. In an office that the map does not contain,

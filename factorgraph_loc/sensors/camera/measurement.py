@@ -119,8 +119,8 @@ SIGHTINGS = Table(
     (
         STAMP,
         named("landmark", "the name of a landmark", field="point"),
-        within("u", PIXELS, LARGEST_PIXEL, "column; may lie outside of the image"),
-        within("v", PIXELS, LARGEST_PIXEL, "row; may lie outside of the image"),
+        within("u", PIXELS, LARGEST_PIXEL, "column of the point; may lie outside of the image"),
+        within("v", PIXELS, LARGEST_PIXEL, "row of the point; may lie outside of the image"),
     ),
     stream="factorgraph_loc.sensors.camera.measurement:SightingStream",
     is_scan=True,

@@ -44,7 +44,7 @@ def looks(settings: Any) -> dict[str, float]:
     """Return {"landmarks": the largest number of simulated sightings per second}. Raises ValueError if the world has
     landmarks, but the rig has no landmark sensor."""
     if settings.world.landmarks and settings.rig.find(BearingRangeSettings) is None:
-        raise ValueError("the world has landmarks, expected a rig with bearing_range")
+        raise ValueError("the world has landmarks, expected a rig with a section [bearing_range]")
     return {"landmarks": settings.sightings.rate * settings.world.landmarks}
 
 

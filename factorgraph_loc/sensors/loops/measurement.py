@@ -64,7 +64,7 @@ _TOLD = (
         for name in "xy"
     ),
     number("heading", ANGLE, -FULL_TURN, FULL_TURN, "heading in the frame of the earlier pose", may_lack=True),
-    number("score", PURE, 0.0, 1.0, "confidence of the other program; 1 if empty", may_lack=True),
+    number("score", PURE, 0.0, 1.0, "confidence that the loop is correct; 1 if empty", may_lack=True),
 )
 _OPTIONAL = (("x", "y", "heading"), ("score",))
 

@@ -180,10 +180,7 @@ WAYS = Table(
     "odometry",
     (
         STAMP,
-        *(
-            within(side, LENGTH, 1e9, "distance of that wheel so far; counters have 32 bits")
-            for side in ("left", "right")
-        ),
+        *(within(side, LENGTH, 1e9, "distance that the wheel has travelled so far") for side in ("left", "right")),
     ),
 )
 # measured speeds or turns of wheels, which are converted to velocities or increments
@@ -191,9 +188,9 @@ WHEELS = Table(
     "odometry",
     (
         STAMP,
-        *(within(f"{side}_speed", SPEED, FASTEST, "speed of that wheel") for side in ("left", "right")),
-        *(within(f"{side}_angle", ANGLE, 1e9, "rotation of that wheel") for side in ("left", "right")),
-        *(within(f"{side}_rate", RATE, 1e4, "turn rate of that wheel") for side in ("left", "right")),
+        *(within(f"{side}_speed", SPEED, FASTEST, "speed of the wheel") for side in ("left", "right")),
+        *(within(f"{side}_angle", ANGLE, 1e9, "rotation of the wheel") for side in ("left", "right")),
+        *(within(f"{side}_rate", RATE, 1e4, "turn rate of the wheel") for side in ("left", "right")),
     ),
 )
 

@@ -28,7 +28,7 @@ VARIANCES = ("var_x", "cov_xy", "var_y")
 _POINT = {axis: f"pose.position.{axis}" for axis in "xy"}
 _COVARIANCE = dict(zip(VARIANCES, ("covariance[0]", "covariance[1]", "covariance[7]"), strict=True))
 _SPREAD = tuple(
-    number(name, AREA, -LARGEST, LARGEST, "element of the covariance; not used if implausible", may_lack=True)
+    number(name, AREA, -LARGEST, LARGEST, "element of the position's covariance; ignored if implausible", may_lack=True)
     for name in VARIANCES
 )
 POSITIONS = Table(

@@ -22,7 +22,7 @@ SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; a suspicion begins above the
 SCANS = 4  # minimum number of scans in a test
 BLOCK, POSSIBLE = 10.0, 0.01  # s, length of a block of time; minimum probability of a read that is counted
 INDEPENDENT = 1.5  # a ratio of variances up to this is treated as 1
-PRIOR = 50.0  # prior sum of the variances of reads, at the ratio 1
+PRIOR = 50.0  # initial value of the sums of both variances, so that their ratio is 1 at first
 REMEMBERED = 0.95  # weight of the sums of earlier blocks after each block
 NO_TAGS = np.empty(0, dtype=np.int64)
 SILENT = 8.0  # log odds above which missing reads are attributed to a failure instead of a wrong pose

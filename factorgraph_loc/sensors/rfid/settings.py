@@ -134,7 +134,7 @@ class RssiSettings(FileModel):
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)]
     """coefficients of the RSSI [dBm] for the features 1, -10 log10 of the distance, w, w^2, c and c^2; w is 1 minus the
-    cosine of the bearing, c is the cosine of the facing"""
+    cosine of the bearing, c is the cosine of the angle between the tag's facing and the direction to the antenna"""
     sigma: Annotated[float, Field(ge=0.01, le=30.0), InUnit("dB")]
     """scale of the Student-t noise"""
     dof: Annotated[float, Field(ge=0.1, le=1000.0)]
@@ -200,8 +200,7 @@ class RfidSettings(SensorSettings):
     """An RFID reader. Its antennas are given either by ``antennas`` or by a ``preset``."""
 
     preset: Literal["rackham"] | None = None
-    """instead of antennas: eight antennas named 1 to 8 around the body, the first to the front, the next ones
-    counter-clockwise"""
+    """replaces antennas; rackham has eight antennas around the body, named 1 to 8 counter-clockwise from the front"""
     preset_z: Offset = 1.0
     """height of the antennas of the preset"""
     antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
