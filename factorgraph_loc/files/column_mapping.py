@@ -106,7 +106,7 @@ def read_mapped(
     read = _read_json_lines if path.suffix.lower() in JSON_SUFFIXES else _read_csv
     cells = read(path, mapping, needed)
     if not len(cells.rows):
-        raise InputError(f"{path}: contains no rows{' that where selects' if mapping.where else ''}")
+        raise InputError(f"{path}: contains no rows{' with the values in where' if mapping.where else ''}")
     return cells
 
 

@@ -67,7 +67,7 @@ def _in_bag(text: str) -> tuple[Path, str] | None:
 def _reference(log: str) -> PosePath:
     loaded = read_log(log)
     if loaded.reference is None:
-        raise InputError(f"{log}: is a log without a reference, expected one with a reference, or a trajectory")
+        raise InputError(f"{log}: is a log without a reference, expected a log with a reference, or a trajectory")
     return loaded.reference.path(log, loaded.t0_ns)
 
 

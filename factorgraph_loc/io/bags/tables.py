@@ -307,7 +307,7 @@ class Corners(RowsOfTopic):
         topic = bag.topic(name, CORNERS)
         known = leaves(bag.store(name), topic.type)
         if lacking := [path for path in CORNER_FIELDS if path not in known]:
-            raise InputError(f"{bag.path}: topic {name} ({topic.type}) lacks {listed(lacking)}")
+            raise InputError(f"{bag.path}: topic {name} ({topic.type}) lacks the fields {listed(lacking)}")
         super().__init__(bag, name, {}, SIGHTINGS, rules=options)
 
     def add(self, item: Stamped, t_ns: int) -> None:

@@ -170,7 +170,7 @@ def _find(log: str, data_root: str | Path | None, named: str | None) -> _Source:
         require_metadata(path)
         raise InputError(
             f"{log}: has no {RUN_FILE}, so it is not in the native format: write a manifest with `fgloc manifest {log}`, "
-            "or name the reader of its format"
+            "or name the reader of its format with --reader"
         )
     raise InputError(f"{log}: is neither a file, nor a folder, nor a known data set{nearest(log, list(known))}")
 
@@ -189,7 +189,7 @@ def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
         )
     if path.suffix.lower() in TABLES:
         raise InputError(f'{log}: is a table: describe its columns in a manifest with reader = "mapped"')
-    raise InputError(f"{log}: is not a manifest (.toml): name the reader of its format")
+    raise InputError(f"{log}: is not a manifest (.toml): name the reader of its format with --reader")
 
 
 def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
