@@ -26,8 +26,7 @@ from factors.se2 import Array, Integers
 
 # The largest number of variables of a `gtsam.JacobianFactor` in Python. A `gtsam.GaussianConditional` may have any number.
 MOST_TERMS = 3
-# Added to the diagonal of an information matrix before its decomposition, so that it is invertible: a fraction of the mean diagonal
-# element, and a constant.
+# A fraction of the mean diagonal and a constant, which are added to an information matrix so that it is invertible.
 RELATIVE_RIDGE, RIDGE = 1e-9, 1e-10
 LEAST = 1e-12  # minimum of twice a cost, against division by zero
 Values = dict[int, Array]
@@ -167,8 +166,8 @@ def jacobian_factors(
     ``on_failure``: is called with the reason if a residual or Jacobian is not finite or has a wrong shape. The linear
     factor is then zero. If ``on_failure`` is None, nothing is checked.
 
-    Some factors have an attribute ``alike``. Those with equal values of it are linearised together by ``linearize_all`` of their
-    class, for speed. It returns residuals (N, m) and a Jacobian (N, m, d) for each variable. These factors are never checked.
+    Factors with an attribute ``alike`` of equal value are linearised together by the method ``linearize_all`` of their
+    class. It returns residuals (N, m) and a Jacobian (N, m, d) for each variable. These factors are never checked.
     """
     out: list[Any] = []
     alike: defaultdict[Hashable, list[int]] = defaultdict(list)

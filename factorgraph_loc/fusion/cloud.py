@@ -103,8 +103,7 @@ class Cloud:
         weights = self.weights
         middle, _ = self.moments
         errors, mean, covariance = self._errors()
-        # The covariance of a weighted sample is too small by the factor 1 - sum(w^2), and even smaller if particles have few
-        # ancestors. Without a correction the variance of the constants would shrink at each resampling.
+        # A sample's covariance is too small by the factor 1 - sum(w^2), and would shrink at each resampling
         lost = float(weights @ weights)
         diagonal = range(3, len(covariance))
         covariance[diagonal, diagonal] += LEAST_VARIANCE

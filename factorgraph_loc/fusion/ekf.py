@@ -32,8 +32,7 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 NOWHERE = slice(POSE, POSE)  # the slice of a block that does not exist
-# Maximum number of components of the error state. When it is reached, uncertain landmarks of the map are no longer estimated; their
-# covariances are added to the noise instead.
+# Size of the error state above which uncertain landmarks are no longer estimated: their covariances are added to the noise.
 MOST = 150
 # At an unknown heading, a search with particles finds the heading. The filter then starts with this heading as its prior, with the
 # standard deviation multiplied by this factor, and processes the measurements of the search again. So 1/16 of their information
@@ -148,8 +147,7 @@ class Ekf(Filter):
         self._constants = constants_of(self._motion, self._sensors)
         finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
         slow = {name for name, sensor in finders.items() if sensor.finder and not sensor.finder.at_once}
-        # The search for a start or a lost pose uses sensors that find a pose from one measurement, and sensors that weigh
-        # particles.
+        # sensors that find a start or a lost pose, from one measurement or by particles
         fast = {n: s for n, s in self._sensors.items() if n not in slow}
         self._search = Tracking(fast, self._motion, setup.rng, self.diagnostics)
         if self._search.possible:

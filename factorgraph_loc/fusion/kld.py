@@ -7,8 +7,7 @@ from factorgraph_loc.fusion.cloud import cell_numbers
 from factors import se2
 from factors.se2 import Array
 
-# The largest allowed Kullback-Leibler divergence, and the 99 % quantile of the normal distribution: with this probability the
-# divergence is smaller.
+# Bound of the Kullback-Leibler divergence, and the normal quantile of the probability (99 %) that the divergence is smaller.
 ERROR, QUANTILE = 0.05, 2.326
 CELL = np.array((0.3, 0.3, 0.2))  # m, m, rad; size of the cells that are counted
 KERNEL = 0.25  # standard deviation of a kernel as a fraction of the distance between particles

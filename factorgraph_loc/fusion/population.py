@@ -35,8 +35,7 @@ DENSITY = 25.0  # initial number of particles per m^2 and rad
 # numbers of particles: the minimum at the start of a search, the maximum, and the minimum after a resampling
 FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
 GROWTH = 4  # largest factor by which one resampling increases the number of particles
-# Effective sample sizes as fractions of the number of particles: resampling starts below the first. Each step of a correction keeps
-# at least the second.
+# Effective fractions of the particles: resampling starts below the first, and a step of a correction keeps at least the second.
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2
 FRESH, ELSEWHERE = 2000, 1e-3  # number of additional particles at each resampling, and their total weight
 # how many of the FRESH particles are drawn near existing particles, and their standard deviations from these: m, m, rad
@@ -44,8 +43,8 @@ ASTRAY, BESIDE = 500, np.array((0.7, 0.7, 0.3))
 NOISE = 2.0  # factor on the covariance of odometry, because these particles do not estimate its constants
 OUTSIDE = -1.0  # change of the log-weight, at each motion, of a particle outside of free space
 
-# The search rejects a pose found by a sensor if the particles within REACH standard deviations of it have less total weight
-# than NEGLIGIBLE. The covariance of the pose is first increased by WIDENED (standard deviations in m, m, rad).
+# A pose found by a sensor is rejected if particles within REACH standard deviations weigh less than NEGLIGIBLE together.
+# WIDENED (standard deviations in m, m, rad) is first added to the covariance of the pose.
 NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2
 REACH = 5.0
 

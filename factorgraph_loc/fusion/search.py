@@ -28,7 +28,7 @@ from factors.se2 import Array
 
 DURATION = 60.0  # s: observations of this duration are kept
 SLICE = 2_500_000  # computing cost of one slice of the search, in the unit of the module `population`
-PAUSE = 0.05  # s: minimum time between two slices, because a measurement and a tick often arrive together
+PAUSE = 0.05  # s: minimum time between two slices, so that a measurement and a tick at one time cause only one
 
 
 class Search:

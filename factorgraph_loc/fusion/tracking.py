@@ -44,8 +44,7 @@ UNSURE = 5.0
 NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
 CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known if its variances of x and y have a smaller sum
 PROBATION = 5.0  # s; for this time after a rejection the new track is not yet reported as localized
-# Covariance of a pose from the search, as a prior (standard deviations in m, m, rad). It is large, because the same measurements
-# are also factors of a graph, and because the odometry that moved the search's particles may have failed.
+# m, m, rad: covariance of the prior at a pose from the search, large because the same measurements are processed again.
 FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 APART = 16.0  # squared Mahalanobis distance above which a pose of the search differs from the track
 WINDOW = 3.0  # s: the observations of the last WINDOW seconds are compared with the odometry

@@ -101,7 +101,7 @@ def waypoint_paths(
 ) -> list[Path]:
     """Return the shortest paths through free space to targets (Dijkstra, 1959). The paths are straightened.
 
-    ``pose`` (3,): the start. ``targets`` (K, 2) [m]: both are in the world frame. The robot turns in place at the start
+    ``pose`` (3,), ``targets`` (K, 2) [m]: start and targets in the world frame. The robot turns in place at the start
     and at corners. A start that is too close to a wall is replaced by the nearest free cell. Targets outside of free
     space, and those in the cell of the robot, are left out. ``nearest``: if given, only the paths to this number of
     nearest targets are returned. ``beyond``, ``within`` [m]: only targets at distances between these values are used.

@@ -24,8 +24,7 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
-# Images are JPEG files, because PNG is five times as large and ten times as slow. The colours are not subsampled, because colour
-# features use them.
+# JPEG, because PNG is ten times as slow, and without subsampled colours, because colour features use them.
 JPEG = (
     cv2.IMWRITE_JPEG_QUALITY,
     95,

@@ -13,8 +13,7 @@ from factorgraph_loc.slam.monoslam_state import Eye, MapPoint, SlamState
 from factors.camera import inverse_depth
 from factors.se2 import Array, Integers
 
-# 1/m: mean and standard deviation of the prior inverse depth of a new point. The prior is so wide that many points together do not
-# determine the scale of the map.
+# 1/m: mean and standard deviation of the prior inverse depth of a point, so wide that it does not determine the map's scale.
 INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 1.0
 # A point is deleted if it was expected in at least FEWEST_TRIALS images and matched in a smaller fraction of them than LEAST_FOUND.
 FEWEST_TRIALS, LEAST_FOUND = 8, 0.5

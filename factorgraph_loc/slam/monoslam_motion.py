@@ -21,8 +21,7 @@ ROBOT = 12  # number of values of the robot's error state
 TURN, SHIFT, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 UPRIGHT = [0, 1, 5]  # the components bounded by the floor: roll, pitch, height
 NO_VELOCITY = [8, 9, 10]  # the velocities of height, roll and pitch
-# s: time constants with which roll, pitch and height return to zero. SETTLING: the standard deviation of the tilt is fixed. UNEVEN:
-# it is estimated from images.
+# s: time constants of roll, pitch and height if the standard deviation of the tilt is fixed, and if it is estimated.
 SETTLING, UNEVEN = 1.0, 3.0
 SHORTEST = 1e-3  # s, shortest interval for the computation of a velocity
 

@@ -12,8 +12,7 @@ NEAREST = 0.05  # m; points with a smaller depth are projected as if at this dep
 MOST_STEPS, ENOUGH = 50, 1e-14  # maximum steps of Newton's method, and norm of the residual at convergence
 BLOCK = 256  # number of poses whose likelihoods are computed together, so that their data fit into the cache
 BEHIND = 100.0  # residual of a point behind the camera, in standard deviations
-# The columns of a full Jacobian are the pose (3), roll and pitch (2), the point (3), and the camera's constants (8). These are the
-# first columns of the last three groups, and the number of columns.
+# Columns of a full Jacobian: the pose (3), the tilt (2) from TILT on, the point (3) from POINT on, the camera's constants (8).
 TILT, POINT, CONSTANTS, WIDTH = 3, 5, 8, 16
 
 # The elements of a lens are fx, fy, cx, cy, k1, k2, p1, p2, and 1 / r^2, where the distortion is valid for x^2 + y^2 < r^2. A lens

@@ -297,8 +297,7 @@ def lens_of(model: CameraModel) -> Lens:
     return (*lens[:8], 1.0 / falls[0] if falls else lens[8], *lens[9:])
 
 
-# The standard deviation of the robot's tilt is one of these values. It is the same in most images, and depends on how level the
-# floor is. In a few images, such as those on a door sill, it may be any of these values.
+# Possible standard deviations of the robot's tilt. Most images have the same, but an image on a door sill may have any of them.
 SCALES = 0.0005 * 2.0 ** (0.5 * np.arange(15))  # rad: from half a millimetre per metre up to 0.064
 VAGUE = math.log(3.0)  # standard deviation of the logarithm of the initial guess
 MEMORY = 60.0  # number of images after which old images are forgotten

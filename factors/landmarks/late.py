@@ -123,7 +123,7 @@ _PARTS = len(MEANS) * len(SPREADS)  # number of successive hypotheses with equal
 
 @lru_cache(maxsize=16)
 def _prior(probability: float) -> Array:
-    """The log priors (noises, 1 + H) of all hypotheses, first no late range. ``probability``: of late ranges."""
+    """The log priors (noises, 1 + H) of no late range (first column) and of H distributions of late ranges."""
     biased = BIASED * (1.0 - probability)
     excess = np.where(_IS_LATE, probability, biased) / _MEANS
     for group in (_IS_LATE, ~_IS_LATE):

@@ -23,8 +23,7 @@ from factors.se2 import Array
 # The constants of a sensor that can be estimated. The first five belong to the model; the last is the offset of the timestamps [s].
 PARAMETERS = ("x", "y", "bearing_bias", "range_scale", "depth_axis", "time_offset")
 TIME_OFFSET = PARAMETERS.index("time_offset")
-# The columns of a full Jacobian are the pose (3), a point (2) and all PARAMETERS (6). POINT and CONSTANTS are the first columns of
-# the point and of PARAMETERS, and WIDTH is the number of columns.
+# Columns of a full Jacobian: the pose (3), a point (2) from POINT on, and all PARAMETERS (6) from CONSTANTS on.
 POINT, CONSTANTS, WIDTH = 3, 5, 11
 EXACT = np.empty((0, 2, 2))  # covariances of exactly known points
 # indices in ``BearingRangeModel.packed``, which begins with the first five PARAMETERS

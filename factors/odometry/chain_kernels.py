@@ -20,8 +20,7 @@ VELOCITY, INCREMENT, GYRO = 0.0, 1.0, 2.0
 T, X, Y, HEADING, PATH, TURN, UNKNOWN, STILL, _VX, _VY, _W, _UX, _UY, _UW, _STANDS, _GYRO_T = range(16)
 KNOT, STATE = 16, 8
 
-# Limits in m/s and rad/s, after subtraction of the biases. Wheels with smaller velocities are at rest. A gyro with a smaller rate
-# is consistent with rest.
+# Wheels below the first limit [m/s, rad/s], and a gyro below the second [rad/s], are at rest. Biases are subtracted first.
 _REST, _GYRO_REST = 1e-3, 0.02
 
 # Indices in the array of the model's constants. The first six are scales, biases and other constants, in the order of `integrate`.

@@ -16,12 +16,10 @@ from factors.se2 import (
     wrap_scalar,
 )
 
-# Where the variance of the position exceeds FAR [m^2], ROUNDING times this variance is added in both directions. Otherwise a
-# covariance with a standard deviation of a hundred metres in one direction could be numerically singular.
+# If the variance of the position exceeds FAR [m^2], the fraction ROUNDING of it is added, so that the covariance is invertible.
 ROUNDING, FAR = 1e-12, 1e4
 
-# s; while wheels slip, the robot moves an unknown fraction of its reported way. The fraction has a uniform distribution of width 1,
-# whose variance is 1/12, and changes every second.
+# s; in each second of a slip, the robot moves another fraction of its reported way. The variance of a uniform fraction is 1/12.
 SHARE_VARIANCE = 1.0 / 12.0
 SHORTEST = 1e-6  # s; minimum of a duration, against division by zero
 

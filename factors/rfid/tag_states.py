@@ -49,8 +49,7 @@ MOST_MOVED = 0.15
 # The kinds of weak tags. Each row has the changes of the parameters a and b of a detection model (factors.rfid.parameters), which
 # are the logarithm of the range and the logit of the read rate, and the fraction of weak tags of this kind.
 WEAKNESSES = np.array(((0.0, -2.4, 0.5), (0.0, -3.7, 0.1), (-0.5, 0.0, 0.2), (-0.5, -1.0, 0.2)))
-# The columns of the weights are the states: as surveyed, dead, each kind of weak, and moved by each displacement. These are the
-# first columns of the last three.
+# Columns of the weights: as surveyed, dead, each kind of weak from WEAK on, and each displacement from MOVED on.
 DEAD, WEAK, MOVED = 1, 2, 2 + len(WEAKNESSES)
 COLUMNS = {"dead": slice(DEAD, WEAK), "weak": slice(WEAK, MOVED), "moved": slice(MOVED, None)}
 

@@ -103,8 +103,7 @@ class Addition:
         self.nodes += nodes
 
 
-# Largest plausible squared Mahalanobis distance of a solved pose from its prediction. Gauss-Newton steps may diverge if points
-# contain little information.
+# Squared Mahalanobis distance of a solved pose from its prediction above which the solver is assumed to diverge.
 JUMPED = 50.0
 
 

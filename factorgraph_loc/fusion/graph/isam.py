@@ -38,8 +38,7 @@ class Incremental:
 
     def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
-        # True if factors of measurements between two keyframes wait until the next keyframe, because updates of the solver are slow
-        # when landmarks are estimated
+        # True if factors wait until the next keyframe, because updates of the solver with landmarks are slow
         self._waits = settings.landmarks != "known"
         self._maps = graph.mapper.estimates
         self._margin = WITH_POINTS if self._maps else MARGIN
@@ -324,8 +323,7 @@ class Incremental:
     def _new_solver(self, *, failed: bool = False) -> FullHistory | Window:
         """An empty solver. ``failed``: True if the previous solver failed."""
         parameters = gtsam.ISAM2Params()
-        # QR is the default, because Cholesky fails in long dead reckoning, which is numerically indeterminate. With points,
-        # Cholesky is used because it takes half the time of QR.
+        # Cholesky fails in long dead reckoning, but is twice as fast as QR if there are points
         parameters.setFactorization("CHOLESKY" if self._maps and not failed else "QR")
         # points move far from their initial positions, so every update checks which factors to linearise again
         parameters.relinearizeSkip = 1 if self._maps else CHECKED_EVERY

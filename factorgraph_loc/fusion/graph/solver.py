@@ -44,8 +44,7 @@ from factors.graph import (
 )
 from factors.se2 import Array
 
-# A pose may stay in a window longer than the lag by this time [s]. Several poses then leave together, which saves time. The
-# second value is for windows with points, which are large.
+# s; poses stay longer in a window than the lag, so that several leave together. The second value is for windows with points.
 MARGIN, WITH_POINTS = 2.0, 1.0
 FOREVER = 1e300  # s; with this lag only variables with the time minus infinity leave a window
 
