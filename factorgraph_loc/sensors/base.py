@@ -258,7 +258,7 @@ class Sensor:
     gathers: ClassVar[bool] = False  # True if a graph must merge the observations of a keyframe by `gathered`
     links: ClassVar[bool] = False  # True if its observations are links between two poses; many links may be false
     evidence_every: ClassVar[float] = 1.0  # s between the measurements that a search of the pose uses
-    work: int = 10  # approximate cost to add a measurement to a graph, in units of one RFID tag
+    work: int = 10  # approximate time to add a measurement to a graph, relative to one RFID tag
     solve_every: float = 0.0  # s; longest delay of a solver update of a graph
     finder: Finder | None = None  # localizes the robot without a prediction
     bounds: Array | None = None  # (2, 2) [m]: corners of the area where the robot may be; for a sensor without finder
@@ -322,7 +322,7 @@ class Sensor:
         """Prepare for a new track at ``t`` [s]. Measurements after ``t`` will be processed again."""
 
 
-WORK = 20  # cost of one residual and its robust loss, in units of one RFID tag
+WORK = 20  # computing time of one residual and its robust loss, relative to one RFID tag
 
 
 @dataclass(frozen=True)

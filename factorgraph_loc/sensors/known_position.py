@@ -23,7 +23,7 @@ START_KEPT = 300.0  # s; if the heading is found within this time, the final tra
 class KnownPosition:
     """A start at a known position with unknown heading.
 
-    ``prior``: the start pose with its covariance, whose heading is not used. ``motion``: the odometry of the run.
+    ``prior``: the start pose with its covariance; the heading is not used. ``motion``: the odometry of the run.
     """
 
     prior: PosePrior
@@ -58,8 +58,8 @@ class KnownPosition:
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Return candidates (N, 3) of the pose at the odometry state ``now``, after starts at the mean position with
-        evenly spaced headings."""
+        """Return candidates (N, 3) of the pose at the odometry state ``now``: the poses after starts at the mean
+        position with evenly spaced headings."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)

@@ -113,7 +113,7 @@ class Motion(OdometryChain):
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
         """Return the logarithm (3,) of an increment's motion, corrected for ``constants`` (P,), and its Jacobian (3, P)
-        by them."""
+        by the constants."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
 

@@ -101,7 +101,7 @@ def _best_of_samples(
         rotation = np.repeat(camera.rotation[None], ROUND, axis=0)
         total = np.zeros((ROUND, 6))
         for _ in range(3):
-            # Gauss-Newton in the whitened perturbation, whose prior is the unit Gaussian
+            # Gauss-Newton in the whitened perturbation, which has a unit Gaussian as prior
             residual, jacobian = _whitened(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
             flat = jacobian @ root
             normal = flat.transpose(0, 2, 1) @ flat

@@ -18,7 +18,7 @@ from factorgraph_loc.vision.images import Image
 from factors.se2 import Array
 
 REACH = 3.0  # px: an edge is searched within this distance of its previous position
-MIN_REACH = 1.5  # px: a shorter range does not cover a blurred edge
+MIN_REACH = 1.5  # px: least search distance; a shorter one does not cover a blurred edge
 STEP = 0.25  # px between samples across an edge
 INSIDE = (0.12, 0.88)  # fractions of an edge's length between which it is sampled: not near the corners
 FARTHEST = 3.0  # px: largest shift of a corner per iteration

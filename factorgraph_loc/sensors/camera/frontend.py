@@ -254,7 +254,7 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
     if not isinstance(stream, ImageStream) or not len(stream.t):
         raise InputError(f"{log.name}: has no images to detect markers in")
     if "sightings" in log.streams:
-        raise InputError(f"{log.name}: already has sightings, expected either sightings or [markers] in the manifest")
+        raise InputError(f"{log.name}: already has sightings: remove them, or [markers] from the manifest")
     kept = FeatureCache(cache_folder())
     t: list[float] = []
     names: list[str] = []

@@ -54,8 +54,7 @@ class PixelObservation(ResidualObservation):
 
     @classmethod
     def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
-        """Return the observation of a factor ``seen``, whose values after the pose are these ``blocks``. ``expected``
-        (3,): the predicted pose."""
+        """Return the observation of a factor ``seen`` on the pose and on ``blocks``. ``expected`` (3,): predicted pose."""
         return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(

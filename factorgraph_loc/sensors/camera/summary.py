@@ -202,7 +202,7 @@ def mounting_problems(log: Log) -> list[Notice]:
 
 def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
     """Yield the rotations [rad] of robot and image between pairs of consecutive images with large rotations. Pairs
-    whose image rotation cannot be estimated are skipped."""
+    are skipped if the rotation of the images cannot be estimated."""
     assert log.reference is not None
     headings = log.reference.at(stream.t + log.rig.time_offset("camera"))[:, 2]
     turns = se2.wrap(np.diff(headings))

@@ -121,7 +121,7 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
 
 
 def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
-    """Replace images by frames without features, whose timestamps still define start and end of the run. Add a warning."""
+    """Replace images by frames without features, and add a warning. Their timestamps still begin and end the run."""
     nothing = CameraFrame(0.0, "", np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64))
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
     sentence = "{log}: {estimator} does not use images: all {images} are ignored"

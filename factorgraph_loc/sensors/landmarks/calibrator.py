@@ -112,7 +112,7 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
 def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
     """Return the constant and the relative part of the standard deviation of ``errors`` (K,) with ``weights`` (K,).
 
-    One step of Fisher scoring from ``start``, the previous two parts (Nelder and Pregibon, "An extended
+    One step of Fisher scoring from ``start``, the previous values of both (Nelder and Pregibon, "An extended
     quasi-likelihood function", Biometrika 74(2), 1987).
     """
     design = np.column_stack((np.ones(len(errors)), ranges**2))

@@ -92,7 +92,7 @@ class Candidate:
         return len(self.sightings) >= self.due
 
     def tried(self) -> Candidate:
-        """Return the candidate after a failed attempt, whose next attempt requires more sightings."""
+        """Return the candidate after a failed attempt. The next attempt requires more sightings."""
         return replace(self, due=min(GROWTH * len(self.sightings), MOST))
 
     def position(

@@ -40,7 +40,7 @@ DURATION = 60.0  # s; older sightings are not used
 INTERVAL = 1.0  # s; sightings of one landmark that are closer have nearly equal errors, so only one is used
 ROWS = 60  # largest number of sightings in a search
 REFINED = 24  # number of candidates that are refined
-# squared Mahalanobis distances: hypotheses below SAME are equal; one whose refined pose is beyond DIVERGED is rejected
+# squared Mahalanobis distances: hypotheses closer than SAME are equal; one is rejected if refinement moves it by DIVERGED
 SAME, DIVERGED = 9.0, 25.0
 NEGLIGIBLE = 1e-3  # hypotheses with a smaller weight are discarded
 MARGIN = 5.0  # m; largest assumed distance of the robot from the bounding box of the map's landmarks

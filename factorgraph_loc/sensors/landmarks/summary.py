@@ -93,8 +93,8 @@ def summarize(log: Log) -> Summary:
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
-    """Return the landmarks whose position by sightings from reference poses differs from the map. The difference
-    exceeds both ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
+    """Return the landmarks with another position in the map than by their sightings from reference poses. The
+    difference exceeds both ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
     implied: dict[str, tuple[Array, int]] = {}
     for name, sightings in _seen_from_reference(log).items():
         passes = len(np.unique(sightings.t // PASS))
@@ -240,7 +240,7 @@ def _shifted(log: Log) -> list[Notice]:
         return np.column_stack((far, aside if reference.has_heading else np.full_like(far, np.nan)))
 
     def fitted(shift: float) -> tuple[float, float]:
-        """Return the cost at a time shift [s] with the best mounting and height, and the magnitude of that height [m]."""
+        """Return the error :func:`_cost` at a time shift [s] with the best mounting and height, and |height| [m]."""
         start = np.array(MOUNTING if reference.has_heading else MOUNTING[:1])
         fit = scipy.optimize.least_squares(
             lambda mounting: np.nan_to_num(errors(shift, *mounting)).ravel(), start, loss="soft_l1"

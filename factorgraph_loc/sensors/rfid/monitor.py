@@ -182,14 +182,14 @@ def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
     return squares, variances
 
 
-BAND, BANDS = 1.0, 50  # m, width of a band of distance; number of bands, of which the last has no upper end
+BAND, BANDS = 1.0, 50  # m, width of a band of distance; number of bands. The last band has no upper end
 FEWEST = 30.0  # minimum number of predicted reads of a group
 SHOWN = 4  # number of groups that a message names
 DIFFERENT = 0.15  # a model is doubted only if the relative error of its predicted reads exceeds this
 TINY = 1e-9  # replaces zero reads in a logarithm
 WINDOW = 15.0  # s; the weight of reads falls to 1/e in this time
 DOUBTED, TRUSTED = 1e-5, 1e-3  # a doubt begins below the first, and ends above the second, p-value of the counts
-# an antenna is dead if at least MANY reads are predicted, and it makes a fraction below NEARLY_NONE of them
+# an antenna is dead if at least MANY reads are predicted, and a smaller fraction than NEARLY_NONE is observed
 MANY, NEARLY_NONE = 12.0, 0.05
 KNOWN = BAND / 4.0  # m; scans are only counted if the standard deviation of the position is below this
 

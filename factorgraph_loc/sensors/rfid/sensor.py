@@ -32,7 +32,7 @@ from factors.se2 import Array
 from factors.update import Correction
 
 PLACED = 5.0  # m; with a larger standard deviation of the position, a scan is no evidence on the states of tags
-SCAN = 50  # cost of a scan in units of one RFID tag, besides the tags in range
+SCAN = 50  # computing time of a scan without tags, relative to the time for one tag
 # messages of events
 DEAD_ANTENNA = "antenna {antenna} reads no tag although reads are expected: it is ignored until it reads a tag"
 DOUBTED_MODEL = "reads are not as the detection models predict: {shares}"
@@ -73,7 +73,7 @@ class TagObservation:
 
     def at_its_time(self) -> Self | None:
         """Return the reads and misses on the pose at their own time, with the detection models of the rig instead of estimated
-        ones, which a wrong track may have corrupted. Returns None for strength and phase, whose likelihoods are multimodal."""
+        ones, which a wrong track may have corrupted. Returns None for strength and phase (multimodal likelihoods)."""
         likelihood = self.factor.likelihood
         if self.here is None or not isinstance(likelihood, RfidLikelihood):
             return None

@@ -32,7 +32,7 @@ from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.rfid.parameters import MOST_CERTAIN, rate_of
 from factors.se2 import Array, Integers, wrap_scalar
 
-STOPPED = 10.0  # s; an antenna whose last round is earlier than this before the end has stopped
+STOPPED = 10.0  # s; an antenna has stopped if its last round is earlier than this before the end
 CLOCK_STEP = 1.0  # s; a larger step back of timestamps, or a larger offset to the odometry, causes a warning
 SHOWN = 5  # number of names that a line or a warning lists
 UNKNOWN_ANTENNA = "antenna {antenna} is not on the rig: {reads} reads, {rounds} rounds"

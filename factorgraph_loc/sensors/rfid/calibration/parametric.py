@@ -38,7 +38,7 @@ BEAM = {"p0": (0.05, 0.999), "r_max": (0.3, 2.0 * REACH), "s_r": (0.05, 5.0), "s
 SURVEY = {"survey.x": 0.1, "survey.y": 0.1, "survey.heading": 0.05}  # m, rad; standard deviations of the priors
 # m, rad; standard deviations of the priors of changes of mounting that all antennas have in common
 COMMON = {"antennas.x": 0.05, "antennas.y": 0.05, "antennas.yaw": 0.15}
-APART = 0.7  # standard deviations of additional changes of each antenna, as a fraction of COMMON
+APART = 0.7  # standard deviations of the additional change of each antenna's mounting, as a fraction of COMMON
 NO_FOCUS: Mapping[str, tuple[float, float]] = {}
 
 
