@@ -161,7 +161,7 @@ def refusal(trials: Sequence[Trial]) -> str:
     for log in dict.fromkeys(t.log for t in trials):
         if (own := growth([t for t in trials if t.log == log])) > WORST:
             return f"errors on {log}, held out, are {own:.2f} times those with the input rig"
-    # standard deviations may be worse by the factor WORST, and ANEES by its square, because it is a ratio of squares
+    # the limit for standard deviations is the factor WORST, and for ANEES, a ratio of squares, the square of WORST
     if (away := _ratio(trials, _anees_factor)) > WORST**2 and pooled_growth > 1.0 / WORST:
         ratio = f"{pooled_growth:.2f} times those with the input rig"
         return f"errors on held-out logs are {ratio}, but ANEES is {away:.2f} times as far from its ideal"

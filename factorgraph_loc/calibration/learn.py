@@ -59,7 +59,7 @@ class Knowledge:
 
 
 def calibrators(rig: Rig) -> Mapping[str, Calibrator]:
-    """Return the calibrators of the sensors that can be calibrated, by sensor. Each of several sensors of a kind has its own."""
+    """Return a calibrator for each sensor of the rig that can be calibrated, by the name of the sensor."""
     return {
         name: calibrator if kind_of(name) == name else OneOfSeveral(calibrator, name)
         for name, calibrator in functions("calibrator", rig)

@@ -87,8 +87,8 @@ class Contrast:
 def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) -> Pooled | None:
     """Pool a score over seeds, and then over logs with equal weights. Return None if there are no scores.
 
-    ``scores``: by log and seed. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``: for
-    logs that are variants of the same log, a common name. Together they count as one log.
+    ``scores``: by log and seed. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``: by
+    log, a name that the variants of a log have in common. Logs with the same name count as one log.
     """
     known = {log: np.array([[v] for v in seeds.values() if v is not None]) for log, seeds in scores.items()}
     clusters = _clusters(known, alike)

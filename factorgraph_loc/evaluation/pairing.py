@@ -48,8 +48,8 @@ class Pairs:
 
 
 def thinned(t: Array) -> Integers:
-    """Return the indices of those timestamps (N,) [s] at which poses are scored. They are the first timestamp, and then
-    each first timestamp that is at least 0.1 s after the previously selected one. ``t`` is ascending."""
+    """Return the indices of the ascending timestamps ``t`` (N,) [s] at which poses are scored: the first one, and each
+    next one that is at least 0.1 s after the previously selected one."""
     kept: list[int] = []
     stamps, i = t.tolist(), 0
     while i < len(stamps):

@@ -260,8 +260,8 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Return the upper end of the y axis of a panel of :func:`_band`, whose lower end is its negative. Half a percent
-    of the errors and band limits are larger."""
+    """Return the limit y of the symmetric y axis (-y to y) of a panel of :func:`_band`. Half a percent of the errors
+    and band limits are larger."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))

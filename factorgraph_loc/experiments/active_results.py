@@ -41,12 +41,12 @@ ARROW = 0.7  # m; length of the line that shows the robot's heading
 
 
 def cases(rows: Sequence[Row]) -> list[Case]:
-    """Return the pairs of world and estimator of the runs, in order of appearance."""
+    """Return the different pairs (world, estimator) of the runs, in the order of their first runs."""
     return list(dict.fromkeys((row["world"], row["estimator"]) for row in rows))
 
 
 def policies(rows: Sequence[Row]) -> list[str]:
-    """Return the policies of the runs, in order of appearance."""
+    """Return the different policies of the runs, in the order of their first runs."""
     return list(dict.fromkeys(row["policy"] for row in rows))
 
 

@@ -46,9 +46,9 @@ class _Made:
 
 
 class Cluster(Executor):
-    """Executes runs on the cluster of a scheduler. ``scheduler``: its address.
+    """Executes runs on the cluster of a scheduler. ``scheduler``: address of the scheduler.
 
-    The time of a run is limited by this class, and its memory by the cluster. Used as a context manager, the executor
+    This class limits the time of a run, and the cluster limits the memory. Used as a context manager, the executor
     raises InputError if ``distributed`` is not installed, the scheduler does not answer or has no workers, or a worker
     has other code or libraries. It raises RunFailedError if the connection to the scheduler is lost.
     """

@@ -156,10 +156,10 @@ def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Simila
 
     - "none": the identity.
     - "origin": moves the first pose onto the first pose.
-    - "se2": a motion in the plane. It minimises the squared distances of the positions, like the following ones.
-    - "yaw": a motion in space that turns only about the vertical.
-    - "se3": any motion in space.
-    - "sim3": any motion in space, with a scale.
+    - "se2": the motion in the plane with the least sum of squared distances between the positions.
+    - "yaw": the same for a motion in space that turns only about the vertical.
+    - "se3": the same for any motion in space.
+    - "sim3": the same for any motion in space, with a scale.
 
     Raises InputError if the poses do not determine the transformation.
     """

@@ -252,7 +252,8 @@ def _relative(
 
 
 def _motions(path: PosePath, begins: Integers, ends: Integers) -> tuple[Array, Array]:
-    """Return the rotations (K, 3, 3) and translations (K, 3) between poses ``begins`` and ``ends``, in the frame of the former."""
+    """Return rotations (K, 3, 3) and translations (K, 3) from poses ``begins`` to ``ends``, in the frames of
+    ``begins``."""
     back = path.rotations[begins].transpose(0, 2, 1)
     shifts = path.positions[ends] - path.positions[begins]
     return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, shifts)
