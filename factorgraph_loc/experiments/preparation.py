@@ -107,9 +107,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     for sensor in asked or ():
         parent = parent_of(sensor)
         if parent and parent not in (asked or ()):
-            raise InputError(
-                f"{log.name}: the sensor {sensor} is a column of {parent}: add {parent} to the sensors (--sensors)"
-            )
+            raise InputError(f"{log.name}: {sensor} is a column of {parent}: add {parent} to the sensors (--sensors)")
         if parent and sensor not in available:
             raise InputError(f"{log.name}: has no sensor {quoted(sensor)}: this column of {parent} is missing or empty")
         if sensor not in available:
