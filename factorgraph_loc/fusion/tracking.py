@@ -311,9 +311,9 @@ class SlipMonitor:
         return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the exact start time that they
-        assume. This is the time of the first observation from ``begin`` on that is not surprising. The log-odds are
-        zero with too few observations or too little motion."""
+        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the assumed start of the error:
+        the time of the first observation from ``begin`` on that is not surprising. The log-odds are zero with too few
+        observations or too little motion."""
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > 1.0:
             del rows[0]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from factorgraph_loc.simulation import pictures
 from factorgraph_loc.simulation.pictures import Canvas, Draw
 
-# objects on walls: function that draws it, probability, ranges of width and height [m], range of the height of its centre [m]
+# objects on walls: function that draws the object, probability, ranges of width, of height, and of the height of the centre [m]
 HANGING: tuple[tuple[Draw, float, tuple[float, float], tuple[float, float], tuple[float, float]], ...] = (
     (pictures.poster, 0.28, (0.4, 0.9), (0.5, 1.1), (1.2, 1.7)),
     (pictures.painting, 0.2, (0.4, 1.2), (0.35, 0.9), (1.2, 1.8)),

@@ -23,7 +23,7 @@ from factors.se2 import Array
 
 FEWEST, MAX_WAITING = 3, 10  # least number of sightings to triangulate a point; most sightings stored of a point
 MAX_SPREAD = 0.15  # largest standard deviation of a new point, relative to its least depth in the images
-GATE = 0.999  # probability of the chi-square test of the residuals
+GATE = 0.999  # probability that correct residuals pass the chi-square test
 PATIENCE = 20  # number of keyframes without a sighting after which a point is dropped
 UPRIGHT = np.zeros(2)
 

@@ -197,7 +197,7 @@ class UnknownPoints(Mapper):
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
-        gone = self._points.keys() - set(tracks)  # a point has its own track again if that track appears again
+        gone = self._points.keys() - set(tracks)  # points that are not visible in the track of their name
         self._names_by_track = {track: name for track, name in self._names_by_track.items() if name in gone}
         names: list[Hashable] = [self._names_by_track.get(track, track) for track in tracks]
         assigned = set(names)

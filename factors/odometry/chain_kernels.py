@@ -96,8 +96,8 @@ def insert(
     """Insert one row among the ``count`` existing rows, in order of time and after rows of equal time.
 
     ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`, with the values ``a``, ``b``, ``c`` and, for an
-    increment, the time ``unknown`` [s] of unknown motion. The states ``knots`` are updated. If the new row is the
-    newest, rows older than ``horizon`` [s] are deleted. Returns the new count.
+    increment, the time ``unknown`` [s] of unknown motion. The states ``knots`` are updated with the model
+    ``constants``. If the new row is the newest, rows older than ``horizon`` [s] are deleted. Returns the new count.
     """
     i = count
     if count and t < knots[count - 1, T]:

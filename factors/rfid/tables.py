@@ -214,7 +214,8 @@ def relevant(
     """A mask (K, T) of measurements and tags that change the likelihood of any particle noticeably.
 
     ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models adjusted to
-    the first row of ``parameters``. ``near`` (T,): a mask of tags in reach.
+    the first row of ``parameters``. ``near`` (T,): a mask of tags in reach. ``measured``, ``tags``: the reads of K
+    measurements and the data of T tags.
 
     The mask is True for near tags that were read, and for near tags with a relevant read probability in the blocks of
     the tables. In a dense map this excludes most tags.

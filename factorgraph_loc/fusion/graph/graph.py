@@ -357,8 +357,8 @@ class Graph:
             del self.values[key]  # the tilt of a removed keyframe
 
     def forget_landmarks(self, known: Collection[int]) -> None:
-        """Remove landmarks and biases that no remaining keyframe observes. ``known``: the keys of variables on which
-        marginalised keyframes left information; these are kept."""
+        """Remove landmarks and biases that no remaining keyframe observes. ``known``: the keys of variables that are
+        kept, because marginalised keyframes gave information on them."""
         observed = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
         for name, key in list(self.keys.items()):
             if name not in self.constants and key not in observed and key not in known:

@@ -181,8 +181,8 @@ class Chained:
         return chain.normal(len(poses), self._first, jacobian, residual)
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """One step of Levenberg and Marquardt, with a relative ``damping``. Returns the new state and the largest
-        component of the step. Returns None if the problem is nearly singular."""
+        """One step of Levenberg and Marquardt. ``damping``: relative to the diagonal of the Hessian. Returns the new
+        state and the largest component of the step. Returns None if the problem is nearly singular."""
         try:
             is_solved, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
@@ -303,8 +303,8 @@ class Problem:
         return Solution(*descended(self.cost, self._moved, values, max_iterations)[:2])
 
     def _moved(self, values: Values, damping: float) -> tuple[Values, float] | None:
-        """One step of Levenberg and Marquardt, with a relative ``damping``. Returns the new values and the largest
-        component of the step. Returns None if the problem is nearly singular."""
+        """One step of Levenberg and Marquardt. ``damping``: relative to the diagonal of the Hessian. Returns the new
+        values and the largest component of the step. Returns None if the problem is nearly singular."""
         linear = self.linearize(values)
         curvature = {key: np.full(len(value), LEAST) for key, value in values.items()}
         for i in range(linear.size()):

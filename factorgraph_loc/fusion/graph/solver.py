@@ -244,7 +244,7 @@ class LinearFactors:
         self._held: Values = {}
         # the factors on each variable, by their identity
         self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)
-        self._slots: set[int] = set()  # the slots of the factors in the solver
+        self._slots: set[int] = set()  # the indices (slots) of these factors in the solver's graph
         self._added: list[_Linear] = []  # the factors of the last update
 
     def added(
@@ -318,7 +318,7 @@ class LinearFactors:
 
     @property
     def slots(self) -> frozenset[int]:
-        """The slots of these factors in the solver."""
+        """The indices (slots) of these factors in the graph of the solver."""
         return frozenset(self._slots)
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
