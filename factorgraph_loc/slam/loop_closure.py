@@ -114,7 +114,7 @@ class LoopClosure:
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """Return the old points that one image shows, or None if it shows none. The arguments are those of ``compare``."""
+    """Return the old points that one image shows, or None. The arguments are those of :meth:`LoopClosure.compare`."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:

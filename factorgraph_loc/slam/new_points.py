@@ -164,8 +164,9 @@ def agreed(
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
     """Triangulate a point without outliers. Returns the point and its consistent sightings.
 
-    ``places``: the camera pose of each of the ``sightings``. While the residuals are too large, the sighting is removed
-    whose removal leaves the smallest residuals. Returns None if the remaining sightings do not determine the point.
+    ``places``: the camera pose of each of the ``sightings``. While the residuals are too large, one more sighting is
+    removed, so that the remaining residuals are smallest. Returns None if the remaining sightings do not determine the
+    point.
     """
     sightings, places = list(sightings), list(places)
     point = triangulate(model, sightings, places)

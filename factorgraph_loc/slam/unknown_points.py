@@ -220,7 +220,7 @@ class UnknownPoints(Mapper):
         self._names_by_track[track] = name
 
     def _revisited(self, image: _NewImage, guess: Guess, rows: Sequence[int], names: list[Hashable]) -> set[int]:
-        """Recognize points last observed long ago (loop closure). Returns their rows, and changes ``names`` in place."""
+        """Recognize points last observed long ago (loop closure). Returns their rows, and enters their names in ``names``."""
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
         if frame is None or not self._loops.is_due(image.m.t):
             return set()
@@ -257,8 +257,9 @@ class UnknownPoints(Mapper):
         keyframe: int,
         guess: Guess,
     ) -> None:
-        """Store the views of the points ``names`` in the ``rows`` of a frame. ``right``: mask of the inliers. ``keyframe``: key of
-        the keyframe's pose. If an outlier is not in the point's first track, its track is separated from the point."""
+        """Store the views of the points ``names`` in the ``rows`` of a frame. ``right``: mask of the inliers.
+        ``keyframe``, ``guess``: key and estimate of the keyframe's pose. If an outlier is not in the point's first
+        track, its track is separated from the point."""
         for row, name, agrees in zip(rows, names, right.tolist(), strict=True):
             if agrees:
                 point = self._points[name].key

@@ -286,7 +286,8 @@ def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) ->
 def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
     """Convert whitened residuals to innovations. ``residual`` (K, 2): whitened, predicted minus measured.
 
-    Returns measured minus predicted ranges [m] and measured minus predicted bearings [rad]. Missing measurements are left out.
+    ``ranges``, ``bearings`` (K,): measured, NaN if missing. Returns measured minus predicted ranges [m] and bearings
+    [rad], without missing ones.
     """
     by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
     r = b = 0

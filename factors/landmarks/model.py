@@ -300,8 +300,8 @@ def _losses(
     ``constants`` (N, 5): sensor constants for each pose. ``turn``: heading of the sensor in the robot frame. ``noise``:
     range sigma, relative range sigma, bearing sigma. ``tails``: scale of the robust loss, and the late ranges.
     ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
-    ``losses`` (N, K): output. With covariances it contains half the logarithm of the determinant of the noise
-    covariance with the points' part relative to that without.
+    ``losses`` (N, K): output. With covariances it includes half the log-determinant of the noise covariance, minus its
+    value without the points' part.
     """
     robust, share, mean, spread = tails
     range_sigma, range_sigma_relative, bearing_sigma = noise

@@ -141,8 +141,7 @@ def place_antennas(
     """Compute the antennas' poses and the models' adjustments for N robot poses.
 
     ``poses`` (N, 3), ``parameters`` (N or 1, Q): the robot poses and the parameters of each.
-    ``placed`` (Q,): the parameters to which ``packed`` is adjusted. Yaws in ``parameters`` must be within 0.5 rad of
-    it.
+    ``placed`` (Q,): the parameters to which ``packed`` is adjusted. Other yaws must be within 0.5 rad of its yaws.
     ``at`` (K, 4, N): output, x, y, cosine and sine of the heading of each measurement's antenna in the world.
     ``models`` (M, 2, N): output, the inverse range scale, and the rate times the span of :class:`~factors.rfid.model.Packed`.
     """

@@ -43,8 +43,9 @@ NOTHING_KNOWN = np.zeros(0)  # the empty array of the odometry's estimated const
 
 @dataclass(frozen=True)
 class Node:
-    """A factor of the graph. ``keys``: the keys of its variables. ``factor``: the factor, with ``rows`` residuals. ``native``: an
-    equivalent factor of GTSAM, which solvers prefer. At least one of both is set. ``sensor``: the name of the factor's sensor."""
+    """A factor of the graph. ``keys``: the keys of its variables. ``factor``: the factor, with ``rows`` residuals.
+    ``native``: an equivalent factor of GTSAM, which solvers prefer. At least one of these two is set. ``sensor``: the
+    name of the sensor."""
 
     keys: tuple[int, ...]
     factor: Factor | None = None

@@ -25,8 +25,9 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class MarginalSummary:
-    """The information that marginalised variables and priors give on a window, without the measurements in the window. ``factors``:
-    marginal factors and priors. ``keys``: the keys of all variables of the window. ``at``: their linearisation points."""
+    """The information of marginalised variables and priors on the variables of a window, without the measurements in
+    it. ``factors``: marginal factors and priors. ``keys``: the keys of all variables of the window. ``at``: their
+    linearisation points."""
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     keys: frozenset[int]
