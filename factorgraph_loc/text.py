@@ -40,7 +40,7 @@ class Notice:
         return hash(str(self))
 
     def about(self, name: str) -> "Notice":
-        """Return the notice with a ``name``, such as that of its log or file, in front of the sentence."""
+        """Return the notice with a ``name``, such as the name of a log or file, in front of the sentence."""
         return Notice(self.kind, "{about}: " + self.sentence, {"about": name, **self.fields})
 
 
@@ -177,6 +177,6 @@ def shortened(text: str, limit: int) -> str:
 
 
 def _escape(character: str) -> str:
-    """Return the escape sequence of a character: that of Python for ASCII, and that of JSON and TOML for other characters."""
+    """Return the escape sequence of a character: of Python for ASCII, of JSON and TOML for other characters."""
     code = ord(character)
     return repr(character)[1:-1] if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

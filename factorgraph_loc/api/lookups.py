@@ -136,7 +136,7 @@ def new_rig(
     """Return a first rig of a robot with some sensors. If ``out`` is given, the rig is also written to this file, with comments.
 
     ``odometry``: the drive. ``imu``: True if the robot has a gyro. ``landmarks``: standard deviation of ranges to landmarks
-    [m], or that of each of several sensors by name. ``antennas``: number or names of RFID antennas. ``camera``: width and
+    [m], or a dict of values by sensor name. ``antennas``: number or names of RFID antennas. ``camera``: width and
     height of its images [px], or the file of a camera chain of Kalibr. ``position``: standard deviation of measured positions
     [m]. Raises InputError if a value is out of bounds, or if the file exists and ``overwrite`` is false.
     """

@@ -255,7 +255,7 @@ def _times(t: Array) -> list[rr.TimeColumn]:
 
 
 def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
-    """Return the layout of the viewer: a view from above and, beside it, the camera, errors and events, if there are any."""
+    """Return the layout of the viewer: a view from above, and if they exist, the camera, errors and events."""
     past = rrb.VisibleTimeRanges(
         timeline=TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
     )

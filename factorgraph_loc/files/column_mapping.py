@@ -26,12 +26,12 @@ JSON_SUFFIXES = (".jsonl", ".ndjson", ".json")
 COMMENT = ("#", "//")
 
 EpcCase = Literal["as written", "upper", "lower", "ascii-hex"]
-Alternatives = tuple[str, ...]  # names of columns, of which a file must have at least one
+Alternatives = tuple[str, ...]  # names of columns; a file must have at least one of them
 Value = bool | int | str
 
 
 class ReadNames(FileModel):
-    """How names of antennas and EPCs in a table or topic of RFID reads are converted to those of the rig and the map."""
+    """How names of antennas and EPCs in RFID reads are converted to the names in the rig and in the map."""
 
     antenna: str | None = None
     """name of the only antenna, if the reads do not name it"""
@@ -134,7 +134,7 @@ def _mapped(
 
 
 def _rules(mapping: ColumnMapping) -> RowRules | None:
-    """Return the rules for invalid rows of a mapped table. Return None for tables of names and maps, whose rows must be valid."""
+    """Return the rules for invalid rows of a mapped table, or None for tables of names and maps."""
     return mapping if isinstance(mapping, TimedMapping) else None
 
 

@@ -61,7 +61,7 @@ class _Part:
 def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | None = None) -> list[Setting]:
     """Return the settings of a model and of the models nested in it, in the order of their definition.
 
-    ``prefix``: start of all keys. ``default``: a model whose values are the defaults, None for the defaults of the fields.
+    ``prefix``: start of all keys. ``default``: a model with the default values, None for the defaults of the fields.
     """
     settings: dict[str, Setting] = {}
     for name, field in model.model_fields.items():

@@ -13,7 +13,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def one_or_several(kind: type[BaseModel]) -> Any:
-    """Return the type annotation of a field whose value is one model of class ``kind``, a dict of such models by name, or None.
+    """Return the type annotation of a field that contains a model of class ``kind``, a dict of models by name, or None.
 
     In TOML the field is a table with the keys of the model, or a table of named tables with these keys.
     """

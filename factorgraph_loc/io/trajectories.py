@@ -148,7 +148,7 @@ def from_ros(messages: Any) -> PosePath:
     """Return the poses of a ``nav_msgs/Path`` message, or of a sequence of messages.
 
     Their types may be ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``, ``TransformStamped`` or
-    ``PointStamped``, which has no rotation. Messages of rclpy and of rosbags are accepted. Times are those of the
+    ``PointStamped``, which has no rotation. Messages of rclpy and of rosbags are accepted. Times are from the
     headers. Raises InputError with the number of an invalid message.
     """
     given: Iterable[Any] = getattr(messages, "poses", messages)
@@ -186,7 +186,7 @@ def _seven(message: Any) -> tuple[float, ...]:
 
 
 def _messages() -> Any:
-    """Return a function that makes a message from its package, its type and its fields. Its types are those of ROS 2 or rosbags."""
+    """Return a function that makes a message of ROS 2 or rosbags from its package, type and fields."""
     try:
         import nav_msgs.msg  # type: ignore[import-not-found] # noqa: F401, PLC0415
     except ImportError:

@@ -159,7 +159,7 @@ def dense(corners: Array, spacing: float = SPACING) -> Array:
 def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
     """Return the distances (K, K) [m] between neighbouring free cells, as a sparse matrix.
 
-    A cell has up to eight neighbours. A diagonal neighbour counts only if both cells beside the diagonal are free.
+    A cell has up to eight neighbours. A diagonal neighbour counts only if both cells next to the diagonal are free.
     """
     rows, columns, weights = [], [], []
     for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):

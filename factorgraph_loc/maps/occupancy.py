@@ -73,7 +73,7 @@ def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
         # the grey level of a colour is the mean of its channels, as in map_server
         mode = "RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB"
         out = np.empty((image.height, image.width), dtype=bool)
-        for top in range(0, image.height, STRIP):  # converting the whole image at once needs much memory
+        for top in range(0, image.height, STRIP):  # converting the whole image in one step needs much memory
             strip = image.crop((0, top, image.width, min(top + STRIP, image.height))).convert(mode)
             out[top : top + STRIP] = _are_occupied(np.asarray(strip, dtype=np.uint8), stated)
     return out

@@ -99,7 +99,7 @@ class Learnt:
     """Estimates of an estimator other than poses.
 
     ``values``: constants of sensors by name, each as (value, standard deviation) in SI units. Constants of odometry
-    have plain names (``scale_distance``), those of other sensors have the sensor as a prefix (``bearing_range.x``).
+    have plain names (``scale_distance``), other constants have the sensor as a prefix (``bearing_range.x``).
     ``landmarks``: estimated landmarks by name.
     ``points``: estimated points in space that the map lacks, or None.
     """

@@ -60,7 +60,7 @@ class Log:
         return f"Log({self.name!r}, {last - first:.1f} s: {streams or 'no streams'})"
 
     def span(self) -> tuple[float, float]:
-        """Return the first and the last timestamp [s] of all streams. Without streams, they are those of the reference.
+        """Return the first and the last timestamp [s] of all streams, or of the reference if there are no streams.
 
         Returns (0, 0) if there are no timestamps.
         """

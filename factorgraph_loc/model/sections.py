@@ -79,7 +79,7 @@ def sections_of_channels() -> dict[str, str]:
 
 @cache
 def several() -> frozenset[str]:
-    """Return the kinds of sensors of which a rig may have several, each with a name."""
+    """Return the kinds of sensors that a rig may have several times, each with another name."""
     return frozenset(name for name, section in sections().items() if section.several)
 
 

@@ -71,7 +71,7 @@ class Estimated:
 
     @staticmethod
     def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
-        """Return the constants among ``names`` whose standard deviation in ``uncertainty`` is above zero."""
+        """Return the constants among ``names`` with a standard deviation in ``uncertainty`` that is above zero."""
         return Estimated.among(names, np.array([getattr(uncertainty, name, 0.0) for name in names]))
 
     @staticmethod

@@ -149,7 +149,7 @@ class YawRates:
         topic = bag.topic(options.topic, IMU)
         if options.frame is not None and options.is_given():
             raise InputError(
-                f"{bag.path} {topic.name}: frame is given, so the axes are those of tf_static: remove axes and mounting"
+                f"{bag.path} {topic.name}: frame is given, so tf_static gives the axes: remove axes and mounting"
             )
         self._options, self._frames = options, frames
         paths = [f"angular_velocity.{axis}" for axis in "xyz"]

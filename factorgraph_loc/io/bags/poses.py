@@ -43,7 +43,7 @@ WORLD = ("mocap", "vicon", "optitrack", "world", "map")  # frames of measured po
 
 
 class PoseTopic(RowTopic, Turned):
-    """The settings of a topic of poses, or of tf. In tf, the poses are those of the frame ``child`` in the frame ``parent``."""
+    """The settings of a topic of poses, or of tf with the poses of the frame ``child`` in the frame ``parent``."""
 
     parent: str | None = None
     """frame in which the poses are given, if the topic is tf"""

@@ -242,7 +242,7 @@ class Reads(RowsOfTopic):
 
 
 class LandmarkTopic(RowTopic, Turned):
-    """The settings of a topic with observations of landmarks, such as that of a marker detector."""
+    """The settings of a topic with observations of landmarks, such as the topic of a marker detector."""
 
     fields: dict[LandmarkField, str] | None = None
     """paths of the landmark's name, and of its range and bearing, or of its position x, y, z in the sensor frame; not

@@ -79,7 +79,7 @@ def load(
 
     ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a log.
     With ``reader``, any path that the reader can read.
-    ``options``: options of the reader, which override those of a manifest. A list, or a text with commas, gives one log
+    ``options``: options of the reader, which override the options in a manifest. A list or text with commas, gives one log
     per value. ``rig``, ``world``: values or files that replace the rig and the world of the log.
     ``data_root``: the folder of data sets; by default the environment variable FGLOC_DATA.
     Raises InputError with a message of one line about what is invalid.
@@ -115,7 +115,7 @@ def load(
 def load_all(
     logs: LogLike | Sequence[LogLike], rig: RigLike | None = None, world: WorldLike | None = None
 ) -> list[Log]:
-    """Return the logs that one or several ``logs`` refer to. ``rig`` and ``world`` replace those of the logs, see :func:`load`."""
+    """Return the logs that one or several ``logs`` refer to. For ``rig`` and ``world`` see :func:`load`."""
     several = [logs] if isinstance(logs, (Log, str, Path)) else logs
     return [loaded for log in several for loaded in load(log, rig=rig, world=world)]
 

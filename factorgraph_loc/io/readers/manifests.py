@@ -60,7 +60,7 @@ class Manifest(FileModel):
 
 @dataclass(frozen=True)
 class Dataset:
-    """A shipped data set. ``present``: True if its files exist. The other fields are those of its manifest."""
+    """A shipped data set. ``present``: True if its files exist. The other fields are from its manifest."""
 
     name: str
     title: str
