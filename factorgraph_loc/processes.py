@@ -116,7 +116,7 @@ def run_each(
 ) -> Iterator[tuple[int, Value | Exception]]:
     """Call ``function`` on each job in at most ``workers`` parallel processes.
 
-    Yields the index of a job and its value, or the exception that it raised, in the order in which jobs finish. Each
+    Yields the index of a job and its value, or the exception that it raised, as soon as the job finishes. Each
     job runs in a new process. Thus a crash affects only one job, and peak memory can be measured per job. ``beat`` is
     called about every :data:`BEAT` seconds. Closing the iterator ends the processes. Function, jobs and values must be
     picklable, and defined in modules that can be imported.

@@ -24,7 +24,7 @@ CUT = "..."  # replaces the middle of a text that is too long
 
 @dataclass(frozen=True)
 class Notice:
-    """A warning or note. ``str(notice)`` is the ``sentence``, in which the names in braces are replaced by ``fields``.
+    """A warning or note. ``str(notice)`` is the ``sentence`` after the names in braces are replaced by ``fields``.
 
     ``kind``: identifies the warning for programs, such as ``late_rows``.
     """

@@ -19,7 +19,7 @@ from factors.se2 import Array, Integers
 POSE = 3
 LEAST = 1e-11  # if elimination reduces a diagonal element to a smaller fraction, the rest counts as a rounding error
 
-# The normal equations as four blocks of the information matrix, two of which contain the gradient in their last column:
+# The normal equations as four blocks of the information matrix. Two of them contain the gradient in their last column:
 # - each pose with itself (N, 3, 3);
 # - each pose with the next pose (N, 3, 3);
 # - each pose with the parameters, and the gradient by the pose (N, 3, P + 1);

@@ -17,7 +17,7 @@ class Increment:
     """The relative motion of the robot between two times.
 
     ``delta`` (3,): the pose at the end in the frame of the pose at the start. ``covariance`` (3, 3): covariance of its body-frame
-    perturbation. ``duration`` [s]: the time between both. ``still`` [s]: the part of the duration in which the robot is at rest.
+    perturbation. ``duration`` [s]: the time between both. ``still`` [s]: the time at rest.
     """
 
     delta: Array
@@ -27,7 +27,7 @@ class Increment:
 
     @property
     def moving(self) -> float:
-        """The part [s] of the duration in which the robot moves."""
+        """The part [s] of the duration with motion."""
         return self.duration - self.still
 
 

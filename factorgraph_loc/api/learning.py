@@ -94,7 +94,7 @@ def features(
 ) -> pl.DataFrame:
     """Evaluate point features on ``images`` of planar scenes, and write the scores to the folder ``out``.
 
-    ``images``: folders of image sequences, or photographs, from which image sequences with a known homography are made.
+    ``images``: folders of image sequences, or photographs. Known homographies warp photographs to image sequences.
     ``features``: names of the features to compare.
     ``count``: maximum number of features in an image. ``progress`` is called with the numbers of done and of all images.
     """

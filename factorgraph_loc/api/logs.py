@@ -95,7 +95,7 @@ def simulate(
         raise InputError("changes apply to a preset or a file, but settings are given: change the settings themselves")
     settings = what if isinstance(what, SimulationSettings) else named_settings(str(what), changes)
     if images and out is None:
-        raise InputError("images is true, but out is missing: give a folder in which to write the log")
+        raise InputError("images is true, but out is missing: give a new folder for the log as out")
     log = make_log(settings, seed)
     if out is None:
         return log

@@ -41,7 +41,7 @@ def view(
     ``results``: folders of runs or comparisons, or only a log. The log of the runs must be given too, unless
     :func:`~factorgraph_loc.api.logs.datasets` lists it.
     ``rrd``: a file to write for the viewer instead of opening it.
-    ``bind``: the IP address on which the viewer listens, without password. Only this machine reaches the default address.
+    ``bind``: the IP address of the viewer, which asks for no password. Only this machine reaches the default address.
     Raises InputError if ``rerun-sdk`` is not installed, if the viewer does not start, or if the file cannot be written.
     """
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
@@ -168,7 +168,7 @@ def score(
     """Score a trajectory against another. The field ``figures`` of the returned score has the errors, in metres and radians.
 
     ``estimate``, ``reference``: trajectories with times of the same clock, or texts that name trajectories as in
-    ``fgloc score``. ``out``: a folder in which to write the files of ``fgloc score``. For the other arguments see
+    ``fgloc score``. ``out``: a folder for the files of ``fgloc score``. For the other arguments see
     :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. Raises InputError if a trajectory cannot be
     read, or if no poses of the two can be paired.
     """

@@ -61,9 +61,9 @@ def run(
 ) -> Run:
     """Run one estimator on one log and score the result.
 
-    ``learn``: estimate the constants of the rig from the log itself, for the final trajectory only.
+    ``learn``: estimate the constants of the rig from the log itself. Only the final trajectory uses these estimates.
     ``align``: unless it is "none", there are also scores after this alignment with the reference.
-    ``out``: a folder in which to write the files of ``fgloc run``.
+    ``out``: a folder for the files of ``fgloc run``.
     ``progress`` is called with the fraction of the work that is done.
     For the other arguments see :class:`~factorgraph_loc.model.scoring.RunConfig`.
     """

@@ -96,7 +96,7 @@ def presets(name: Annotated[str | None, _name("settings", completion.preset)] = 
 
 
 def policies(json: Json = False) -> None:
-    """List the policies by which `fgloc active` chooses paths, and the settings of `fgloc active`.
+    """List the policies and the settings of `fgloc active`. A policy chooses the paths of the robot.
 
     Example: fgloc policies
     """

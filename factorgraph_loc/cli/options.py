@@ -39,7 +39,7 @@ LogNames = Annotated[
 DataRoot = Annotated[
     Path | None,
     typer.Option(
-        help="Data folder, to which paths in manifests and experiments may lead. Default: the variable FGLOC_DATA."
+        help="Data folder. Paths in manifests and experiments may lead into it. Default: the variable FGLOC_DATA."
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document and nothing else on stdout.")]
@@ -224,7 +224,7 @@ def nested_changes(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
-    """Parse the value of an option: ``a.b=3`` becomes ("a.b", 3). ``option``: the name of the option, for the error."""
+    """Parse the value of an option: ``a.b=3`` becomes ("a.b", 3). ``option``: the option that an error names."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or not value.strip() or text != well_formed(text):
         raise InputError(f"{option} is {quoted(text)}, expected KEY=VALUE")

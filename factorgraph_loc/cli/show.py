@@ -93,7 +93,7 @@ def table(
 
 
 def _terminal_width() -> int:
-    """Return the width of the terminal to which stdout is connected, in characters. ``sys.stdout`` may have been replaced."""
+    """Return the width of the terminal of stdout, in characters. ``sys.stdout`` may have been replaced."""
     try:
         return os.get_terminal_size(sys.stdout.fileno()).columns
     except OSError:

@@ -34,7 +34,7 @@ def view(
         str,
         typer.Option(
             metavar="ADDRESS",
-            help="IP address on which the viewer listens without a password. The default is reachable from this machine only.",
+            help="IP address of the viewer. The viewer has no password. Only this machine reaches the default address.",
         ),
     ] = LOOPBACK,
     *,

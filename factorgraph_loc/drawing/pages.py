@@ -88,7 +88,7 @@ def _without_controls(value: Any) -> Any:
     """Return a text with its control characters escaped, because a terminal would execute them. Return other values unchanged."""
     if not isinstance(value, str) or not CONTROL.search(value):
         return value
-    return type(value)(CONTROL.sub(lambda found: plain(found[0]), value))
+    return type(value)(CONTROL.sub(lambda match: plain(match[0]), value))
 
 
 def _digest(content: str) -> str:

@@ -218,7 +218,7 @@ def landmark_figures(
         pair = pairs(trajectory, log.reference, max_gap)
         pose = se2.align_points(pair.poses[:, :2], pair.truth[:, :2])
     if names and np.isfinite(pose).all():
-        # errors in the frame of the estimate, in which the covariances are given
+        # errors in the frame of the estimate, which is the frame of the covariances
         error = positions - se2.transform_to(pose, truth)
         figures["landmarks.rmse"] = rms(np.hypot(error[:, 0], error[:, 1]))
         covariances = np.array([landmarks[name].covariance for name in names])

@@ -229,7 +229,7 @@ def _room(log: Log) -> tuple[Array | None, float]:
 
 
 def _joined(segments: Array) -> Array:
-    """Convert W segments (W, 2, 2) to one polyline (3 W, 2) with a row of NaN after each segment, to plot them at once."""
+    """Convert W segments (W, 2, 2) to one polyline (3 W, 2) with a row of NaN after each segment."""
     return np.insert(segments, 2, np.nan, axis=1).reshape(-1, 2)
 
 

@@ -91,7 +91,7 @@ def _weights(seeds: tuple[int, ...]) -> Array:
 class McNemar:
     """The result of McNemar's test.
 
-    ``only_a``, ``only_b``: number of cases in which the event occurred only with method a, or only with b. ``p``:
+    ``only_a``, ``only_b``: number of cases that have the event only with method a, or only with b. ``p``:
     two-sided p value of the hypothesis that the event is equally frequent with both.
     """
 
@@ -112,7 +112,7 @@ class Interval:
 def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
     """Compare the frequencies of an event with two methods in the same N cases by McNemar's exact test.
 
-    ``a``, ``b`` (N,): masks of the cases in which the event occurred with each method.
+    ``a``, ``b`` (N,): masks of the cases that have the event with method a, and with method b.
     """
     first, second = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     only_a, only_b = int(np.sum(first & ~second)), int(np.sum(second & ~first))

@@ -65,7 +65,7 @@ def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[li
 
 
 def unscored(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each log on which successful runs have no errors, with the reason."""
+    """Return a sentence with the reason for each log whose successful runs have no errors."""
     lines = []
     for log in dict.fromkeys(row["log"] for row in rows):
         runs = [row for row in rows if row["log"] == log and row["status"] == "ok"]

@@ -100,19 +100,16 @@ def active(
 ) -> Done:
     """Simulate robots that drive from an unknown start until they are localized, for each policy, estimator and seed.
 
-    ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings.
-    ``out``: folder for the results. ``overwrite``: whether existing results in it may be replaced.
-    ``changes``: nested tables of settings of robot, policy or world, such as ``{"policy": {"horizon": 8}, "max_metres":
-    50}``. ``jobs``: number of parallel processes, None for one per core.
-    ``progress``: called with the number of finished runs and of all runs.
+    ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``out``: folder for the
+    results. ``overwrite``: True to replace results in it. ``changes``: nested settings of robot, policy or world, such
+    as ``{"policy": {"horizon": 8}}``. ``jobs``: number of parallel processes, None for one per core. ``progress``:
+    called with the number of finished runs and of all runs.
 
     The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
     :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and
     ``plots/comparison.png``. For each policy and estimator there is a plot of the run with the first seed. A failed run
-    has a row with the reason, and does not stop other runs. The same call resumes an interrupted experiment.
-
-    Raises InputError before any run if a policy or an estimator is unknown or repeated, or if ``out`` contains results
-    and ``overwrite`` is not set. Also raises InputError if every run rejects its input.
+    has a row with the reason. The same call resumes an interrupted experiment. Raises InputError if a name is unknown
+    or repeated, if ``out`` contains results and ``overwrite`` is false, or if every run rejects its input.
     """
     simulation, settings = _settings(world, changes or {})
     seeds, out = list(seeds), Path(out)
@@ -182,7 +179,7 @@ def _settings(
 
 
 def figures_of(run: ActiveRun) -> dict[str, float | None]:
-    """Return the numerical results of a run by name, such as ``metres`` and ``planning_ms``, for the stored table of results."""
+    """Return the columns of a run in the table of results by name, such as ``metres`` and ``planning_ms``."""
     times = run.planning_ms
     return {
         "localized": run.localized,
@@ -198,7 +195,7 @@ def figures_of(run: ActiveRun) -> dict[str, float | None]:
 
 
 def _check_names(what: str, names: Sequence[str], known: Sequence[str]) -> None:
-    """Raise InputError if there are no names, or a name is unknown or repeated. ``what``: the kind of names, for the message."""
+    """Raise InputError if there are no names, or if one is unknown or repeated. ``what``: the kind of names."""
     if not names:
         raise InputError(f"no {what} is given; known: {', '.join(known)}")
     for name in names:

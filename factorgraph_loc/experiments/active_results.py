@@ -106,7 +106,7 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
     - ``difference``, ``low``, ``high`` [m]: median distance of a minus that of b, and its 95 % interval.
     - ``ratio``, ``ratio_low``, ``ratio_high``: median distance of a divided by that of b, and its 95 % interval.
-    - ``failed_only_a``, ``failed_only_b``: number of seeds on which only one policy failed.
+    - ``failed_only_a``, ``failed_only_b``: number of seeds with a failure of a only, and of b only.
     - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of common seeds.
     """
     results = []
@@ -237,7 +237,7 @@ def run_picture(run: ActiveRun) -> Figure:
 def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
     """Plot the distances until localization of the runs of ``case`` (world, estimator): a box for each policy, a dot for each run.
 
-    Runs in which the robot was never localized are drawn at the largest distance, with their number.
+    Runs that never localized the robot are drawn at the largest distance, with their number.
     """
     names = policies(rows)
     top = _farthest(rows, case)

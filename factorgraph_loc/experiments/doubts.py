@@ -51,7 +51,7 @@ def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, .
 
 
 def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[Notice, ...]:
-    """Return a warning about gaps between measurements in which there are no estimates.
+    """Return a warning about gaps between measurements that have no estimates.
 
     ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap.
     """

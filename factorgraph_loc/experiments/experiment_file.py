@@ -1,4 +1,4 @@
-"""The experiment file: which estimators run on which logs, with which sensors, seeds and swept settings."""
+"""The experiment file: lists of logs, estimators, sets of sensors, seeds and swept settings to combine."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ class Experiment(FileModel):
 
     ``name``: name of the experiment. ``out``: folder of the results, None for out/NAME.
     ``logs``, ``estimators``: every estimator runs on every log.
-    ``sensors``: sets of used sensors, where None stands for the sensors of each log's rig. Runs are made with each set.
+    ``sensors``: sets of used sensors. None means all sensors of the log's rig. Runs are made with each set.
     ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     ``seeds``: random seeds of the estimators.
     ``max_gap`` [s]: for scores, estimates are not interpolated across longer gaps.

@@ -1,6 +1,6 @@
 """Keys of runs, and cached facts about logs and estimators, which the planning of an experiment needs.
 
-The key of a run is a hash of everything on which its results depend: log, configuration, code and libraries. A fact is for instance
+The key of a run is a hash of all inputs of its results: log, configuration, code and libraries. A fact is for instance
 the duration of a log. Facts are cached, because their computation reads the log or imports numerical libraries.
 """
 

@@ -68,7 +68,7 @@ class LogSource(ABC):
 
     @abstractmethod
     def files(self) -> dict[str, Path]:
-        """Return the files from which the log is read, by names that do not depend on their location."""
+        """Return the files of the log, by names that do not depend on their location."""
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:

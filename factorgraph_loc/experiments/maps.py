@@ -48,7 +48,7 @@ POINTS = "points"
 KINDS = (POINTS, "landmarks", "tags")  # kinds of maps; by default the first kind that a log has is mapped
 FLAGS: dict[
     str, tuple[str, tuple[str, ...]]
-] = {  # by field of MapOptions, its option on the command line, and the kinds of maps to which it applies
+] = {  # by field of MapOptions, its option on the command line, and the kinds of maps that have it
     "estimator": ("--estimator", ("landmarks",)),
     "settings": ("--set", ("landmarks",)),
     "height": ("--height", ("landmarks", "tags")),

@@ -144,7 +144,7 @@ def map_of(result: RunResult, log: Log) -> World | None:
 
 
 def with_ending(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
-    """Return the path ``out`` with its ``suffix`` replaced by ``ending``, for a second file next to ``out``.
+    """Return the path of a second file next to ``out``: its ``suffix`` is replaced by ``ending``.
 
     Raises InputError if the name of ``out`` has another suffix, if its folder is missing, or if either file exists and
     ``overwrite`` is not set.

@@ -81,7 +81,7 @@ def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) ->
 
 
 def _scene(run: PlannedRun, kept: Path) -> Scene | None:
-    """Return the map and reference of a run's log. ``kept``: file in which they are cached. None if the log cannot be read."""
+    """Return the map and reference of a run's log, cached in the file ``kept``. None if the log cannot be read."""
     with suppress(OSError, ValueError):
         return Scene.model_validate_json(kept.read_bytes())
     try:

@@ -60,7 +60,7 @@ def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
     """Show a log and its runs in the Rerun viewer. A viewer that is open is used.
 
-    ``bind``: the IP address on which a new viewer listens. Only this machine reaches the default address. Raises
+    ``bind``: the IP address of a new viewer. Only this machine reaches the default address. Raises
     InputError if an image cannot be read, if there is no display, or if the viewer does not start.
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):

@@ -21,7 +21,7 @@ from factors.se2 import Array
 
 STORE = "store"  # the folder of the runs of a comparison or an experiment
 COMPLETE = results.FILES[-1]  # the file that is written last, so that its presence marks a complete run
-MARGIN = 60.0  # s by which an estimate may be before the start or after the end of its log
+MARGIN = 60.0  # s: maximum time of an estimate before the start or after the end of its log
 
 
 class _Landmark(FileModel, extra="ignore"):

@@ -1,7 +1,7 @@
 """Checks that all readers of logs apply to the rows of their files.
 
 Each check raises an InputError that names the invalid row. If the data can be corrected, it adds a warning instead. In this module
-``rows`` (N,) are the row numbers in the file ``source``, and ``warnings`` is a list to which warnings are appended.
+``rows`` (N,) are the row numbers in the file ``source``, and ``warnings`` is a list that warnings are appended to.
 """
 
 from collections.abc import Hashable, Iterable, Sequence
@@ -22,7 +22,7 @@ ROUNDING = 1e-6  # s; tolerance of comparisons of time differences
 def require_finite(source: object, rows: Integers, names: Sequence[str], table: Array) -> None:
     """Raise InputError at the first number of ``table`` (N, K) that is NaN or infinite.
 
-    ``names``: names of the K columns. ``rows`` (N,): row numbers in the file ``source``, for the message.
+    ``names``: names of the K columns. ``rows`` (N,): row numbers in the file ``source`` that the message names.
     """
     require_none(source, rows, not_finite(names, table))
 
@@ -38,7 +38,7 @@ def in_order(
 ) -> Integers:
     """Return the indices (M,) of the rows to keep: the last of all rows with equal timestamps ``t_ns`` (N,).
 
-    ``rows`` (N,): row numbers in the file ``source``. ``rules``: keys of the manifest, for the error message. Skipped
+    ``rows`` (N,): row numbers in the file ``source``. ``rules``: keys of the manifest that the message names. Skipped
     rows add a warning to ``warnings``. Raises InputError if a timestamp is older than the one before it.
     """
     _require_order(source, rows, t_ns, rules)
@@ -60,7 +60,7 @@ def increments_in_order(
     """Merge the odometry increments that have equal timestamps ``t_ns`` (N,), by composition of their motions.
 
     ``moves`` (N, 3 or 4): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there, and
-    optionally the time [s] in which the motion is unknown. Returns distinct timestamps (M,) and the motion (M, 3 or 4)
+    optionally the time [s] of unknown motion. Returns distinct timestamps (M,) and the motion (M, 3 or 4)
     since the timestamp before. For errors and the other arguments see :func:`in_order`.
     """
     _require_order(source, rows, t_ns, rules)

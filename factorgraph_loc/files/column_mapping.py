@@ -164,7 +164,7 @@ class TableFolder:
     def noted(
         self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
     ) -> Cells:
-        """Record the rows and columns from which ``cells`` were read. Return the cells without the rows that the mapping skips.
+        """Record the rows and columns of ``cells``. Return the cells without the rows that the mapping skips.
 
         ``columns``: the description of each field. ``more``: further invalid cells, whose rows are skipped too.
         """

@@ -84,7 +84,7 @@ class Column:
 
     @property
     def unit(self) -> str:
-        """The unit to which values of files are converted. Empty for dimensionless numbers and names."""
+        """The unit of values after conversion. Empty for dimensionless numbers and names."""
         return "" if self.units is PURE else next(iter(self.units), "")
 
     @property

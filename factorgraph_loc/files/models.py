@@ -265,7 +265,7 @@ def inside(root: Path, name: str, source: object, *others: Path, expected: str =
     ``name``: the path. ``source``: the file that contains it, for messages. ``root`` and ``others``: the permitted
     folders. ``expected``: end of the message if the path leaves them.
 
-    A relative path is taken from the first of the folders in which it exists, or else from ``root``. Links are
+    A relative path is taken from the first of the folders that contains it, or else from ``root``. Links are
     resolved. The path need not exist. Raises InputError if the path leaves all folders (by dots, as an absolute path or
     by a link), or is neither a regular file nor a folder. Raises NoFileNameError if no file can have that name.
     """

@@ -42,7 +42,7 @@ class Fault:
 
 
 class RowRules(FileModel):
-    """What a reader does with invalid rows, and with rows that are out of order. ``PLACE``: the file that has these keys."""
+    """Rules of a reader for invalid rows, and for rows out of order. ``PLACE``: the file that has these keys."""
 
     PLACE: ClassVar[str] = "the manifest"
     bad_rows: Literal["refuse", "skip"] = "refuse"
@@ -85,7 +85,7 @@ class RowRules(FileModel):
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
         """Return indices (N,) that sort the rows by timestamp ``t_ns`` (N,), or 0 to N - 1 if ``order`` is "refuse".
-        Sorted rows add a warning to ``warnings``. ``rows`` (N,): row numbers in the file ``source``, for the warning."""
+        Sorted rows add a warning to ``warnings``. ``rows`` (N,): row numbers in the file ``source`` that the warning names."""
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))

@@ -27,7 +27,7 @@ _NAME = re.compile(rf"\..*{re.escape(MARK)}([0-9a-f]{{8}})-([1-9][0-9]*)-[0-9a-f
 _NAMED, _SUFFIX = 150, 60  # maximum bytes kept of a target's name and of its suffix; file systems allow 255 in total
 _MACHINE = f"{zlib.crc32(socket.gethostname().encode()):08x}"
 MAX_AGE = 7 * 86_400.0  # s after which a file of another machine is removed; whether its process runs is unknown
-_swept: set[Path] = set()  # folders from which this process has removed old temporary files
+_swept: set[Path] = set()  # folders that this process has cleared of old temporary files
 _own: set[Path] = set()  # paths created by this process and not yet removed
 
 

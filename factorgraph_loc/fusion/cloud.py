@@ -267,7 +267,7 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
     """Replace values of a log-likelihood (N,) that are not finite by ``-inf``, which gives these particles no weight.
 
-    ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement, for the message. Raises
+    ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement. Raises
     RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """
     possible = np.isfinite(likelihood)

@@ -92,8 +92,8 @@ class _State(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A prediction step, for the smoother. ``pose`` (3,): the predicted pose. ``transition`` (3, 3+R): the rows of the transition
-    matrix for the pose; its other rows equal an identity matrix. ``noise`` (3, 3): the covariance added to the pose."""
+    """A prediction step that the smoother reads. ``pose`` (3,): the predicted pose. ``transition`` (3, 3+R): the pose's
+    rows of the transition matrix; other rows equal an identity matrix. ``noise`` (3, 3): the pose's added covariance."""
 
     pose: Array
     transition: Array
@@ -109,7 +109,7 @@ class _Record(NamedTuple):
 
 
 class _View(FilterView):
-    """Read access to the EKF's state, for the sensors."""
+    """Gives sensors read access to the EKF's state."""
 
     localized = True
     _filter: Ekf

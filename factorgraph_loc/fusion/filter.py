@@ -51,7 +51,7 @@ class _Checkpoint(NamedTuple):
 
 
 class FilterView:
-    """Read access to a filter's present state, for the sensors. ``offset`` is None and ``newest`` True, because a
+    """Gives sensors read access to a filter's present state. ``offset`` is None and ``newest`` True, because a
     measurement always belongs to the present pose."""
 
     offset = None

@@ -79,7 +79,7 @@ class ParticleFilterSettings(FilterSettings):
 
 
 class _CloudView(FilterView):
-    """Read access to the particle filter's state, for the sensors."""
+    """Gives sensors read access to the particle filter's state."""
 
     _filter: ParticleFilter
 
@@ -130,7 +130,7 @@ class ParticleFilter(Filter):
         self._search = Tracking(self._sensors, self._motion, setup.rng, self.diagnostics)
         self._search.remember()
         self._lost = False
-        # times [s] at which the estimated pose was rejected, each with the interval in which the robot was carried
+        # times [s] of rejections of the estimated pose, each with the interval when the robot was carried
         self._changes: list[tuple[float, Change]] = []
 
     def belief(self, t: float | None = None) -> Belief:
@@ -323,7 +323,7 @@ class ParticleFilter(Filter):
         view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:
-            # mark the records since the estimated pose became wrong, for the final trajectory
+            # the final trajectory has to know the records since the estimated pose became wrong
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, "lost", LOST, why=refuted.why, since=refuted.since)
             self._lost = True

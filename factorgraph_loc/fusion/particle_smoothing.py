@@ -57,7 +57,7 @@ class BackwardSimulation:
     ``increment(start, end)``: returns the odometry between two records.
     ``moved(cloud, increment)``: returns the poses (N, 3) of a cloud after an increment, without noise, and their
     transition (3, 3+P) from body-frame perturbation and constants.
-    ``changes``: the intervals [s] in which the robot was carried to another place.
+    ``changes``: the intervals [s] when the robot was carried to another place.
     """
 
     def __init__(

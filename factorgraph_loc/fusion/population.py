@@ -86,8 +86,8 @@ class WeighedObservation(NamedTuple):
 class Population:
     """The particles of a global search. See the module.
 
-    ``motion``: the odometry. ``bounds`` (2, 2) [m]: the lower and upper corner of the area in which the robot is.
-    ``start``: a known start position, or None. ``space``: the free space in which the robot is, or None.
+    ``motion``: the odometry. ``bounds`` (2, 2) [m]: the lower and upper corner of the area that contains the robot.
+    ``start``: a known start position, or None. ``space``: the free space that contains the robot, or None.
     ``fewest``: the minimum number of particles, at least :data:`ASTRAY`.
 
     Attributes: ``log_evidence``: the log-probability of all observations if the robot's start pose is unknown.

@@ -34,7 +34,7 @@ PAUSE = 0.05  # s: minimum time between two slices, so that a measurement and a 
 class Search:
     """A global search for the robot's pose. See the module.
 
-    ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space in which the robot may be; None means the
+    ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space; None means the
     bounds of the sensors' maps. ``fewest``: the minimum number of particles. ``work``: the computing cost of one slice.
     """
 
@@ -72,7 +72,7 @@ class Search:
         return sensor.name in self._sensors
 
     def remember(self) -> None:
-        """Keep odometry for longer than usual, for a later search."""
+        """Keep odometry for longer than usual. A later search needs it."""
         self._motion.horizon = self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:

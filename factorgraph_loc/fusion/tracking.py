@@ -94,8 +94,8 @@ class Tracked(NamedTuple):
 class Refuted(NamedTuple):
     """The rejection of a track (the estimated poses since the last start), because observations contradict it.
 
-    ``why``: the reason, for messages. ``since`` [s]: the track is wrong from this time on. ``change``: the interval in which the
-    robot left the track. ``extra_covariance`` (3, 3): must be added to the body-frame covariance of the new pose.
+    ``why``: the reason, for messages. ``since`` [s]: the track is wrong from this time on. ``change``: the interval
+    when the robot left the track. ``extra_covariance`` (3, 3): is added to the body-frame covariance of the new pose.
     """
 
     why: str
@@ -240,7 +240,7 @@ class Tracking(Search):
 
 
 class _Compared(NamedTuple):
-    """An observation that has corrected the estimated pose, for the comparison of alternative motions.
+    """An observation that has corrected the estimated pose. Alternative motions are compared on these observations.
 
     ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation on the pose at that time,
     or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``: the
@@ -344,7 +344,7 @@ class SlipMonitor:
 
 
 def surprise(correction: Correction) -> float:
-    """The number of standard deviations by which the innovation of a correction exceeds its expected size."""
+    """The excess of a correction's innovation over its expected size, in standard deviations."""
     if correction.dof:
         return (correction.nis - correction.dof) / math.sqrt(2.0 * correction.dof)
     return correction.excess_nll / math.sqrt(correction.variance) if correction.variance > 0.0 else 0.0

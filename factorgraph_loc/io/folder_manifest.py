@@ -1,6 +1,6 @@
-"""Proposes a manifest, the description of a log, for a folder of tables.
+"""Proposes a manifest (the description of a log) for a folder of tables.
 
-The manifest states which file is the table of which sensor, and its columns, units and clock offset.
+The manifest assigns files to sensors, and states the columns, units and clock offset of each file.
 """
 
 import os

@@ -112,7 +112,7 @@ def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Int
     """Return timestamps (M,) [ns] and increments (M, 4) of odometry with null poses, reported by a device that is lost.
 
     ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of null poses.
-    An increment is x, y [m], heading [rad], and the time [s] in which the motion is unknown, because of null poses. At
+    An increment is x, y [m], heading [rad], and the time [s] of unknown motion because of null poses. At
     null poses the previous motion is continued, for at most :data:`HOLD_TIME`. Without them, increments are (N, 3).
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
@@ -120,14 +120,14 @@ def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Int
         return t_ns, after_rest(moves)
     every = np.union1d(t_ns, lost)
     at, durations = np.searchsorted(every, t_ns), np.append(0.0, np.diff(every) / 1e9)
-    out, before = np.zeros((len(every), 4)), np.zeros(3)
+    out, velocity = np.zeros((len(every), 4)), np.zeros(3)
     for i, (first, last) in enumerate(pairwise([*at.tolist(), len(every)])):
         elapsed = np.cumsum(durations[first + 1 : last])
-        ways = se2.exp(np.vstack((np.zeros(3), np.minimum(elapsed, HOLD_TIME)[:, None] * before)))
-        out[first + 1 : last, :3] = se2.between(ways[:-1], ways[1:])
+        poses = se2.exp(np.vstack((np.zeros(3), np.minimum(elapsed, HOLD_TIME)[:, None] * velocity)))
+        out[first + 1 : last, :3] = se2.between(poses[:-1], poses[1:])
         if last < len(every):
-            out[last, :3] = se2.between(ways[-1], moves[i])
-            before = se2.log(moves[i]) / max(float(durations[first + 1 : last + 1].sum()), 1e-3)
+            out[last, :3] = se2.between(poses[-1], moves[i])
+            velocity = se2.log(moves[i]) / max(float(durations[first + 1 : last + 1].sum()), 1e-3)
         if last > first + 1:
             out[first + 1 : last + 1, 3] = durations[first + 1 : last + 1]
     return every, out

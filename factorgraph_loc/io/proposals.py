@@ -23,7 +23,7 @@ class Proposal:
     """A proposed manifest.
 
     ``content``: its keys and values. ``text``: the manifest as TOML, with ``remarks`` as comments. ``folder``: the
-    folder in which to save it; paths in the manifest are relative to this folder.
+    folder to save it in; paths in the manifest are relative to this folder.
     """
 
     content: Mapping[str, Any]

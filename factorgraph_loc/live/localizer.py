@@ -36,7 +36,7 @@ from factorgraph_loc.text import quoted
 
 LAG = 10.0  # s: default lag of the smoother
 HISTORY = 60.0  # s: default length of the past that is kept
-TIDY_INTERVAL = 5.0  # s by which timestamps advance before the estimator again removes data older than ``history``
+TIDY_INTERVAL = 5.0  # s between removals of data older than ``history``, by the timestamps of measurements
 ROWS_KEPT = 1000  # maximum number of rows in each list of diagnostics
 AHEAD = 3600.0  # s: a timestamp that exceeds all others by more than this is from another clock
 

@@ -31,7 +31,7 @@ CENTRE_SIGMA = 0.01  # standard deviation of an unknown principal point, relativ
 LENS_SIGMA = (0.1, 0.1, 0.003, 0.003)  # standard deviations of an unknown distortion
 FIXED = 1e-5  # standard deviation of the known calibration constants
 POINT_SIGMA = 1000.0  # m, prior standard deviation of a point
-CHUNK = 500  # number of points whose covariances are computed at once, to limit the memory
+CHUNK = 500  # number of points in one computation of covariances, to limit the memory
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ VERDICTS = {
 }
 MIN_COMMON = 3  # least number of landmarks in both maps: with two, a wrong landmark could not be detected
 UNJUDGED = ": the maps are not compared, and the new map is in the frame of the run's start"  # end of a note
-FACTORS = (0.01, 4.0)  # bounds of the factor by which covariances are scaled
+FACTORS = (0.01, 4.0)  # bounds of the scale of covariances
 MAX_PAIRS = 5000  # if there are more pairs of landmarks, this many are drawn at random
 MAX_ITERATIONS = 20
 CONVERGED = 1e-9  # m and rad

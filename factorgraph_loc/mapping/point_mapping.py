@@ -43,8 +43,8 @@ from factors.positive import worst_sigma
 from factors.se2 import Array, Integers
 
 MOST_KEYFRAMES = 600
-WIDER = 1.3  # factor by which the distance between keyframes is increased while there are more than MOST_KEYFRAMES
-DEPTH = 2.0  # m: typical depth of points, for the pixel error that a wrong camera position causes
+WIDER = 1.3  # the distance between keyframes is multiplied by this while there are more than MOST_KEYFRAMES
+DEPTH = 2.0  # m: typical depth of points; gives the pixel error of a wrong camera position
 GATE = 3.0  # matches must be nearer to the epipolar line than so many standard deviations
 NARROW, WIDE = 3.0, 25.0  # px: bounds of this gate
 MAX_GAP = 0.5  # s: a reference is not interpolated between stamps that are farther apart
@@ -76,7 +76,7 @@ class PointSettings(FileModel):
     lens: bool = False
     """whether to adjust focal length, principal point and distortion"""
     observations: Annotated[int, Field(ge=2, le=1000)] = 3
-    """least number of keyframes in which a point must be observed"""
+    """least number of keyframes that must observe a point"""
     parallax: Annotated[float, Field(ge=1e-4, le=3.0), InUnit("rad")] = PARALLAX
     """least angle between two rays to a point"""
     sigma: Annotated[float, Field(ge=1e-6, le=100.0), InUnit("m")] = 0.2

@@ -22,7 +22,7 @@ from factors.se2 import Array, Integers
 GATE = 16.27  # 99.9 % of chi-square with three degrees of freedom
 FARTHEST = 0.5  # m: largest distance of two estimates of the same point
 PERCENTILE = 90.0  # of the differences between views of one point: views that differ more show different points
-COMPARED = 2000  # number of points from which this percentile is estimated
+COMPARED = 2000  # number of points in the estimate of this percentile
 CELL = 0.5  # m: size of the cells of space; thinning keeps points in as many cells as possible
 LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact points can be compared
 
@@ -30,7 +30,7 @@ LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact
 def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
     """Merge two maps. Returns the merged map, and the number of points that both maps have in common.
 
-    A view is a descriptor of a point, with the camera position from which it was observed. Common points are recognised by their
+    A view is a descriptor of a point with the position of the observing camera. Common points are recognised by their
     views and keep the names of ``first``. The other points of ``second`` get new names, unless they have no view. Raises InputError
     if the maps have features of different kinds, or if a point of ``second`` without a view has the name of a point of ``first``.
     """
@@ -84,7 +84,7 @@ def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers
     named = {second.names[i] for i in np.setdiff1d(added, second.owners).tolist()}
     if double := sorted(named & set(first.names)):
         raise InputError(
-            f"the point {double[0]} is in both maps but has no view by which to compare it: rename it in one of the maps"
+            f"the point {double[0]} is in both maps but has no view to compare: rename it in one of the maps"
         )
     taken, number, names = {*first.names, *named}, 0, list(first.names)
     for i in added.tolist():

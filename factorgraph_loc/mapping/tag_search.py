@@ -43,8 +43,8 @@ ITERATIONS = 30
 CONVERGED = 1e-3  # m
 LARGEST_STEP = 0.5  # m
 CURVATURE_STEP = 0.02  # m: step of the numerical derivatives
-CHUNK = 256  # candidates that are refined at once, to limit the memory
-PER_EVALUATION = 2000  # observations that are evaluated on the lattice at once, to limit the memory
+CHUNK = 256  # number of candidates in one refinement, to limit the memory
+PER_EVALUATION = 2000  # number of observations in one evaluation of the lattice, to limit the memory
 
 
 @dataclass(frozen=True, eq=False)

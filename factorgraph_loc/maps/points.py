@@ -209,7 +209,7 @@ def _check_covariances(
 ) -> None:
     """Raise InputError at the first of ``covariances`` (N, 3, 3) that is not positive semi-definite.
 
-    ``columns``: the names of the columns with their elements. ``names`` (N), ``rows`` (N,): the points and rows, for the error.
+    ``columns``: the columns with their elements. ``names`` (N), ``rows`` (N,): the points and rows that an error names.
     """
     least, _, most = np.linalg.eigvalsh(covariances).T
     if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(most))):
@@ -267,7 +267,7 @@ class CommonError:
     ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): unit vectors from the
     camera to the points. ``covariances`` (K, 3, 3): the shared error of (x, y, heading) about each place.
 
-    Such a map is distorted like the estimated trajectory from which it was made. A robot that localizes in the map has
+    Such a map is distorted like the estimated trajectory of its recording. A robot that localizes in the map has
     the same error, however many points it observes. The error is therefore added to the covariance of its pose.
     """
 

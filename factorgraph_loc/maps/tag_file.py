@@ -1,4 +1,4 @@
-"""Markers from ``tags.yaml``, the file in which apriltag_ros describes standalone tags and bundles of tags.
+"""Markers from ``tags.yaml``, the file of standalone tags and bundles of tags of apriltag_ros.
 
 The axes of a tag point right, up and out of the tag, as somebody in front of it sees them.
 """

@@ -112,7 +112,7 @@ class Log:
         return replace(self, rig=self.rig.alone(sensor), streams=streams)
 
     def _in_order(self, sensors: Sequence[str]) -> list[str]:
-        """Return the names of the streams of ``sensors``, in the order in which measurements with equal times are processed."""
+        """Return the names of the streams of ``sensors``. Measurements with equal times are processed in this order."""
         return sorted((s for s in self.streams if s in sensors), key=lambda s: (self.streams[s].rank, s))
 
     def _arrivals(

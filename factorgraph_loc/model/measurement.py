@@ -132,7 +132,7 @@ class Stream:
         return map(self._made, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
 
     def rows(self, offset: float) -> Rows:
-        """Return all rows joined to one measurement, for a stream with ``joins``. ``offset`` [s] is added to the timestamps."""
+        """Return all rows of a stream with ``joins`` as one measurement. ``offset`` [s] is added to the timestamps."""
         return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
 
     @property
@@ -145,7 +145,7 @@ class Stream:
         return (column for name, column in columns_of(self).items() if name != "t")
 
     def begun_anew(self) -> Self:
-        """Return the stream with zero motion in its first row, for a log in which the robot is carried to the pose of
+        """Return the stream with zero motion in its first row, because the robot is carried to the pose of
         this row. Streams that do not measure motion are returned unchanged."""
         return self
 
@@ -156,7 +156,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class ScanStream(Stream):
-    """A stream in which K successive rows with equal timestamps form one measurement. Its fields have K values each."""
+    """A stream with K values of each field in a measurement, read from K successive rows with equal timestamps."""
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         """Yield one measurement per timestamp. ``offset`` [s] is added to the timestamps."""

@@ -92,8 +92,8 @@ AS_IT_IS = Turned()
 
 
 def not_unit(quaternions: Array) -> Fault:
-    """Return a :class:`Fault`, from which readers make an error message, with a mask of the ``quaternions`` (N, 4)
-    whose length is not 1."""
+    """Return a :class:`Fault` with a mask of the ``quaternions`` (N, 4) whose length is not 1. Readers make an error
+    message of it."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")

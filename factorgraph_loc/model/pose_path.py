@@ -19,7 +19,7 @@ from factors.se2 import Array, Integers
 if TYPE_CHECKING:
     import polars as pl
 
-_FLAT = 1e-9  # differences of heights [m] and sines of tilts up to which poses are planar
+_FLAT = 1e-9  # maximum differences of heights [m] and sines of tilts of planar poses
 
 
 class Exchange:

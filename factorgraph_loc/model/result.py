@@ -88,7 +88,7 @@ class RunResult:
 
     @property
     def max_gap(self) -> float:
-        """The longest gap [s] between two estimates in which scoring interpolates poses."""
+        """The longest gap [s] between two estimates that scoring interpolates."""
         return float(self.config.get("max_gap", MAX_GAP))
 
     def first_localized(self) -> int | None:

@@ -99,7 +99,7 @@ class Rig(FileModel):
         return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy in which the names of files, such as tables of RFID models, are relative to ``folder``."""
+        """Return a copy whose names of files, such as tables of RFID models, are relative to ``folder``."""
         return self.model_copy(update={name: settings.placed(folder) for name, settings in self._of_sensors().items()})
 
     def write_beside(self, folder: Path) -> None:

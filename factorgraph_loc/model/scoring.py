@@ -13,7 +13,7 @@ from factorgraph_loc.errors import InputError
 from factorgraph_loc.text import quoted
 
 KINDS = ("causal", "final")  # kinds of estimates of a run
-MAX_GAP = 0.5  # s: longest gap between two estimates in which scoring interpolates poses
+MAX_GAP = 0.5  # s: longest gap between two estimates that scoring interpolates
 MAX_DIFF = 0.01  # s: largest difference of two timestamps that scoring treats as equal
 Alignment = Literal["none", "origin", "se2", "yaw", "se3", "sim3"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "origin", "se2", "yaw", "se3", "sim3")
@@ -37,8 +37,8 @@ class RunConfig:
     ``sensors``: names of the sensors to use, None for those in the rig; ``rssi`` and ``phase`` are optional parts of
     ``rfid``. ``prior``: the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     ``seed``: the seed of the estimator's random generator.
-    ``max_gap``: the longest gap between two estimates in which scoring interpolates poses [s].
-    ``tick_gap``: the longest gap between measurements in which estimates are recorded [s].
+    ``max_gap``: the longest gap [s] between two estimates that scoring interpolates.
+    ``tick_gap``: the longest gap [s] between measurements that estimates are recorded in.
     ``align``: unless it is "none", there are also scores after this alignment with the reference.
     """
 

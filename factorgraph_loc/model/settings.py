@@ -115,7 +115,7 @@ class SensorSettings(FileModel):
         return None
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy in which names of files are relative to ``folder``, the folder of the rig's file."""
+        """Return a copy whose names of files are relative to ``folder``, the folder of the rig's file."""
         return self
 
     def write_beside(self, folder: Path) -> None:

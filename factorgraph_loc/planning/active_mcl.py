@@ -51,7 +51,7 @@ class ProximityReading:
 
 
 class ActiveMcl:
-    """The estimator ActiveMCL: a particle filter in the free ``space`` of a building, for an unknown start.
+    """The estimator ActiveMCL: a particle filter in the free ``space`` of a building. The start is unknown.
     ``particles``: the least number of particles."""
 
     deterministic = False

@@ -41,9 +41,9 @@ NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes with smaller differences are merg
 SHOWN = 300  # number of particles of a belief that are stored in the result
 SAMPLES = 2000  # number of particles that are drawn from a belief without particles
 WRONG = 3.0  # a localized estimate counts as wrong if an error exceeds this multiple of its limit in the settings
-MODES, LIKELY = 3, 0.05  # largest number and least weight of the modes from which paths to distant places are planned
+MODES, LIKELY = 3, 0.05  # paths to distant places start at this many modes at most, each with at least this weight
 WAYPOINTS = 40  # number of places that are spread over free space
-TAGS, PLACES = 8, 6  # numbers of nearest tags and of nearest waypoints to which paths are planned
+TAGS, PLACES = 8, 6  # paths are planned to this many nearest tags and nearest waypoints
 READING_DISTANCE = 0.5  # m driven between two readings of the proximity sensor
 PAUSE = 1.0  # s that the robot waits if no path is free
 SLACK = 0.2  # m: particles may be nearer to walls than the robot by this distance, the size of a cell of free space
@@ -110,9 +110,9 @@ def run_active(
 ) -> ActiveRun:
     """Simulate a robot that drives from an unknown start until it is localized or gives up.
 
-    ``policy``, ``estimator``: names. Runs with the same ``seed`` have the same world, start and noise sequences, for
-    all policies and estimators. Raises InputError for an unknown policy or estimator, for a start that is not free, and
-    for a sensor with a higher rate than the robot's control. Raises RunFailedError if the estimator fails.
+    ``policy``, ``estimator``: the names of both. Runs with the same ``seed`` have the same world, start and noise
+    sequences. Raises InputError if policy or estimator is unknown, if the start is not free, or if a sensor has a
+    higher rate than the robot's control. Raises RunFailedError if the estimator fails.
     """
     loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()

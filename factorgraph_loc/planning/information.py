@@ -43,7 +43,7 @@ from factors.se2 import Array
 POSITION, POSE = 2, 3  # number of leading coordinates of a pose (x, y, heading) whose entropy is computed
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; a full turn has 20 cells
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: a standard deviation below these values is not counted as a gain
-# m: distance along a path between two stations. Measurements are predicted at stations only, for the whole distance to the next.
+# m: distance along a path between two stations. The measurements of a station stand for the whole distance to the next.
 STATION_DISTANCE = 1.5
 MOST_STATIONS = 10  # largest number of stations; on a longer path they are farther apart
 SAMPLES, SCANS = 256, 48  # number of particles that a scan weighs, and number of scans that are simulated
@@ -56,7 +56,7 @@ METRES_PER_RADIAN = 0.5  # m: a robot with a turn rate of 1 rad/s drives this fa
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
-    """The sensor models of a robot, for the prediction of measurements along a path.
+    """The sensor models of a robot. They predict the information of measurements along a path.
 
     ``odometry``: the noise of the motion. ``forecasts``: a forecast for each sensor that observes objects in the map.
     ``metres_per_radian``: the distance [m] that the robot drives in the time of a turn by one radian.
@@ -247,7 +247,7 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
 
 
 def fisher_gain(mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors) -> Array:
-    """Return the expected reduction of entropy (C,) [nats] on each of C paths, for a Gaussian belief (:func:`expected_covariance`).
+    """Return the expected reduction of entropy (C,) [nats] of a Gaussian belief on each of C paths.
 
     Standard deviations below :data:`~factorgraph_loc.planning.information.FINEST` are not counted as a gain.
     """

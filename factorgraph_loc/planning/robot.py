@@ -113,7 +113,7 @@ class SimulatedRobot:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The names of the channels on which the robot reports measurements."""
+        """The names of the channels of the robot's measurements."""
         return (IncrementOdometry.sensor, *(channel for channel, _ in self._order))
 
     @property
@@ -139,7 +139,7 @@ class SimulatedRobot:
         return self.proximity.read(self.pose, self._lengths)
 
     def drive(self, path: Array, metres: float) -> Iterator[Measurement]:
-        """Follow a path for at most ``metres`` [m], and stop before a wall. Yields the measurements on the way.
+        """Follow a path for at most ``metres`` [m], and stop before a wall. Yields the measurements.
 
         ``path`` (S, 3): poses in the frame of the robot at the start of the path.
         """

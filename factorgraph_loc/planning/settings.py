@@ -1,4 +1,4 @@
-"""Settings of an active run, in which a simulated robot chooses its paths: robot, limits of localization, and policy."""
+"""Settings of robot, limits of localization and policy in an active run. The simulated robot chooses its paths."""
 
 import math
 from typing import Annotated

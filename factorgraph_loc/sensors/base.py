@@ -312,7 +312,7 @@ class Sensor:
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
-        """Return the number, at least 1, by which the scale of the loss of ``factor`` must grow to make it convex at ``values``."""
+        """Return the multiple (at least 1) of the scale of ``factor``'s loss that makes it convex at ``values``."""
         return 1.0
 
     def rewind(self, t: float) -> None:

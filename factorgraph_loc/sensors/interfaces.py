@@ -149,7 +149,7 @@ def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """What plots and viewers show of one ``layer`` of the map.
+    """The marks of one ``layer`` of the map in plots and viewers.
 
     ``names`` (K) and ``positions`` (K, 3) [m]: the elements of the layer. ``t`` (N,) and ``seen`` (N): time [s of the
     log] and element name of each detection. ``marker``, ``size``: matplotlib style. ``order``: layers with a higher

@@ -174,7 +174,7 @@ def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
     """Yield the name and the function of each sensor that registers a function ``kind``, a field of :class:`SensorType`.
 
     If the ``rig`` has several sensors of one type, each is yielded by its own name, such as ``bearing_range.front``.
-    The function then expects a rig or log in which the sensor is the only one of its type
+    The function then expects a rig or log that has no other sensor of its type
     (:meth:`~factorgraph_loc.model.rig.Rig.alone`).
     """
     for name, sensor in sensors().items():

@@ -36,7 +36,7 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """The context in which the rows of a log are read. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``:
+    """The context of a reader of rows. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``:
     receives warnings. ``shared``: values that several sensors have in common by name, such as the origin of latitudes.
     """
 
@@ -48,7 +48,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Writing:
-    """The context in which a stream is written. ``log``: the name of its log. ``t0_ns``: the absolute time of t = 0
+    """The context of a writer of one stream. ``log``: the name of its log. ``t0_ns``: the absolute time of t = 0
     [ns]. ``folder``: the folder of the tables."""
 
     log: str

@@ -19,7 +19,7 @@ from factors.se2 import Array
 BINS = 2048  # horizontal directions
 LEVELS = 7  # mip levels of a texture, including the original
 TAPS = 4  # largest number of texture samples on an oblique surface
-STEEPEST = 1e3  # largest ratio by which the footprint of a pixel is stretched on an oblique surface
+STEEPEST = 1e3  # largest ratio of length to width of a pixel's footprint on an oblique surface
 SLACK = 1e-9  # m: overlap of adjacent faces
 NEAREST = 1e-3  # m: a face is invisible if the camera is nearer to its plane
 

@@ -1,4 +1,4 @@
-"""Camera poses of the keyframes of a graph, for the triangulation of points that are not in the graph yet ("waiting" points).
+"""Camera poses of the keyframes of a graph. They triangulate points that are not in the graph yet ("waiting" points).
 
 The pose of a keyframe in the graph is the pose at the stamp of its image. If the time offset of the camera is estimated, the image
 was taken later than its stamp. The camera pose then includes the motion of the robot with the odometry's velocity at the stamp.
@@ -214,7 +214,7 @@ def _turned(
 
 
 class KeyframeCameras:
-    """Computes the camera poses of keyframes of a graph, for the triangulation of points.
+    """Computes the camera poses of keyframes of a graph. The caller triangulates points with these poses.
 
     ``estimated``: the estimated constants of the camera. ``twists``: the velocity (3,) of the robot at each keyframe,
     by number of the keyframe; empty if the time offset of the camera is not estimated. ``anchored``, by number of the

@@ -116,7 +116,7 @@ class Origin:
 
 
 def standstill(robot: RobotState) -> Step:
-    """Return the step of a robot that does not move, for a second measurement at the same time."""
+    """Return the step of a robot that does not move. A second measurement at the same time needs it."""
     return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
 
 
@@ -144,7 +144,7 @@ def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: A
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
-    """Return ``step`` with height, roll and pitch then drawn back towards zero, for a robot on a floor and small tilts.
+    """Return ``step`` with height, roll and pitch then drawn back towards zero. Valid on a floor with small tilts.
 
     Height, roll and pitch follow a stationary process about zero and have no velocity. ``height_sigma`` [m] and ``tilt_sigma``
     [rad] are its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: the duration of ``step``.

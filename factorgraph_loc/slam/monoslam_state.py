@@ -46,7 +46,7 @@ class MapPoint:
 
     ``ray``: True if the point has six values (inverse depth), False if it has three (x, y, z).
     ``descriptor``: the descriptor of a feature, None for a point with a name only. ``t`` [s]: the last time it was matched.
-    ``expected``, ``matched``: the number of images in which it should have been matched, and in which it was matched.
+    ``expected``, ``matched``: the number of images with an expected match, and with a match.
     """
 
     name: str
@@ -254,7 +254,7 @@ class Eye:
 
 @dataclass(frozen=True)
 class Innovation:
-    """The covariance of K predicted pixels, for a Kalman update.
+    """The covariance of K predicted pixels in a Kalman update.
 
     ``carried`` (12 + P + D, 2K): the covariance between the error state and the predicted pixels.
     ``jacobian`` (2K, C), ``columns`` (C,): the Jacobian of the pixels, and the indices of its columns in the error

@@ -192,8 +192,8 @@ class UnknownPoints(Mapper):
         return pose
 
     def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
-        """Return the name of the point in each row of the image. A point of a feature has the number of the feature
-        track in which it was first observed. Lost points are searched from ``camera``, and keep their name."""
+        """Return the name of the point in each row of the image. A point of a feature has the number of its
+        first feature track. Lost points are searched from ``camera``, and keep their name."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()

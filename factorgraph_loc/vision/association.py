@@ -44,7 +44,7 @@ MANY = 5000  # views of a map: with more, only the most similar keyframes are co
 # least number of matches, and least fraction of the visible points that must match. In an office that the map does not contain,
 # up to 2 % of the features match by chance
 FEWEST, LEAST_SHARE = 3, 0.05
-SAMPLED = 300  # number of views from which the similarity of different points is estimated
+SAMPLED = 300  # number of views in the estimate of the similarity of different points
 FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # relocalization: least number and least fraction of inliers among the matches
 
 
@@ -233,7 +233,7 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
     ``predicted`` (C, 2) [px]: the predicted pixels of the points. ``inverses`` (C, 2, 2): the matrices A of the
     elliptic gates x'Ax = 1. ``reaches`` (C,) [px]: the largest radii of the gates. ``features`` (K, 2) [px]: the pixels
-    of the features. ``cell`` [px]: the size of the grid cells by which the features are sorted for speed.
+    of the features. ``cell`` [px]: the features are sorted into grid cells of this size for speed.
     """
     low_x, low_y = high_x, high_y = features[0, 0], features[0, 1]
     for i in range(1, len(features)):

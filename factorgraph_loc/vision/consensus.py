@@ -130,7 +130,7 @@ def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, covariances: Array
 ) -> float:
     """Return the normalised squared innovation of K ``points`` (K, 3), observed at ``pixels`` (K, 2) with noise
-    ``covariances`` (K, 2, 2), for a camera whose perturbation has the ``covariance`` (6, 6)."""
+    ``covariances`` (K, 2, 2). ``covariance`` (6, 6): that of the camera's perturbation."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
     for i in range(len(points)):

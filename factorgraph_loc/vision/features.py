@@ -15,7 +15,7 @@ from factorgraph_loc.vision.keypoints import PARTS, Descriptors, Extractor, Inte
 
 __all__ = ["EXTRACTORS", "Descriptors", "Extractor", "Integers", "Keypoints", "OpenCvExtractor", "extractor"]
 
-MORE = 10  # with ``everywhere``, this many times as many features are detected, from which ``count`` are selected
+MORE = 10  # with ``everywhere``, this multiple of ``count`` features is detected, and ``count`` are selected
 SIFT_CONTRAST = 0.01  # OpenCV's default of 0.04 finds too few points in indoor images
 
 

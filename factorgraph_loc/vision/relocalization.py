@@ -37,7 +37,7 @@ CONVERGED = 1e-6  # m, rad: step below which the refinement ends
 LARGEST_HEIGHT, LARGEST_TILT = 0.3, 0.15
 LARGEST_SIGMA = 0.5  # m, rad: a pose with larger standard deviations is not accepted
 WORDS = 64  # words of the vocabulary
-SAMPLE, ROUNDS = 4000, 6  # descriptors from which the vocabulary is learnt, and iterations of Lloyd's algorithm
+SAMPLE, ROUNDS = 4000, 6  # number of descriptors for learning the vocabulary, and iterations of Lloyd's algorithm
 NEAREST = 20  # number of keyframes that an image is compared with
 
 
@@ -200,7 +200,7 @@ class KeyframeIndex:
         return np.flatnonzero(alike[self._of])
 
     def _described(self, values: Array, of: Integers) -> Array:
-        """Return the VLAD vectors (K, WORDS * D) of K images, by which images are compared. ``values`` (M, D): the
+        """Return the VLAD vectors (K, WORDS * D) of K images. Similar images have similar vectors. ``values`` (M, D):
         descriptors of all images. ``of`` (M,): the index of each descriptor's image."""
         (nearest, _), count = vq(values, self._words), len(self._words)
         descriptions = np.zeros((int(of.max()) + 1, count, values.shape[1]))

@@ -1,4 +1,4 @@
-"""Gaussian scale space: a pyramid of octaves. An octave contains an image at six scales, of which four are characteristic scales.
+"""Gaussian scale space: a pyramid of octaves. An octave has an image at six scales; four are characteristic scales.
 
 The size of a feature is one of the characteristic scales. A :class:`ScaleSpace` can be used for all images of one size, to reuse
 its memory. Scale-normalised derivatives: Lindeberg, "Feature detection with automatic scale selection", IJCV 30, 1998."""

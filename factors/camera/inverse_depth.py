@@ -8,7 +8,7 @@ elevation [rad] of the direction in the world, and the inverse depth [1/m]. The 
 elevation are singular only for points straight above or below.
 
 A Gaussian of the inverse depth represents all depths from a minimum to infinity. A point is therefore a useful landmark
-from its first sighting on: it informs the camera's rotation at once, and the translation as soon as there is parallax.
+from its first sighting on: it first informs the camera's rotation, and the translation as soon as there is parallax.
 """
 
 import numpy as np

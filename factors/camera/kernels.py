@@ -135,7 +135,7 @@ def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
 
     ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and the remaining errors (K,)
     of their distortion. Only directions at which the lens's Jacobian has a positive determinant are found. The result
-    is NaN, with an infinite error, for a direction that is NaN.
+    of a direction that is NaN is NaN, with an infinite error.
     """
     n = len(distorted)
     directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)

@@ -276,7 +276,7 @@ def log_likelihood(
 def lens_of(model: CameraModel) -> Lens:
     """The camera's intrinsic constants as a tuple for compiled code.
 
-    One element limits the radius up to which the distortion is valid. This is the radius where the radial part stops
+    One element is the maximum radius of a valid distortion. This is the radius where the radial part stops
     growing, and at most the radius of :data:`WIDEST` or :data:`WIDEST_FISHEYE`.
     """
     focal = model.fx, model.fy, model.cx, model.cy

@@ -111,7 +111,7 @@ def _nearest(centres: Array, directions: Array) -> Array:
 def _inform(
     k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, robust: float, squared: Array
 ) -> tuple[Array, Array, float]:
-    """The Gauss-Newton system of a ``point`` (3,), for the arguments of :func:`triangulated`. Returns its information
+    """The Gauss-Newton system of a ``point`` (3,) in the images of :func:`triangulated`. Returns its information
     matrix (3, 3), the negative gradient (3, 1) of the loss, and the smallest depth of the point. Writes the squared
     norms of the whitened residuals into ``squared`` (M,)."""
     information, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)

@@ -199,16 +199,14 @@ def updated(
     gate: float,
 ) -> tuple[Array, Array, Array, float, int]:
     """The robust, iterated Kalman update by one measurement of landmarks. See :func:`factors.update.update_state`.
-
     ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
     ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components of the error state are the pose.
     ``values`` (P,): corrections of the estimated sensor constants at the prediction.
     ``indices`` (P,): the indices of these constants in :data:`~factors.landmarks.model.PARAMETERS`.
     ``first``: the index of the first of these constants in the error state.
     ``gate``: the noise of a landmark is increased if its normalised innovation squared exceeds this limit.
-
-    Returns the correction (S,), the covariance (S, S) after it, the whitened residuals (K, 2) of the prediction, their normalised
-    square, and the number of measured ranges and bearings. Raises LinAlgError if rounding makes a covariance singular.
+    Returns the correction (S,), the covariance (S, S) after it, the whitened residuals (K, 2) of the prediction, their
+    normalised square, and the number of measured values. Raises LinAlgError if rounding makes a covariance singular.
     """
     count, size = len(packed[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)

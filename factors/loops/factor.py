@@ -82,7 +82,7 @@ class LoopFactor:
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:
-        """The factor, at least 1, by which the scale of the loss must be multiplied for the loss to be convex at these values."""
+        """The multiple, at least 1, of the scale of the loss that makes the loss convex at these values."""
         error, _, _ = self.whitened(values)
         return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)
 

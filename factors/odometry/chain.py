@@ -97,7 +97,7 @@ class OdometryChain:
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
         """Add the motion (dx, dy, dtheta) from the previous row until ``t``, in the robot frame at the previous row.
 
-        ``unknown`` [s]: the part of the time since the previous row in which the motion is unknown. If there is already
+        ``unknown`` [s]: the time of unknown motion since the previous row. If there is already
         a motion until ``t``, the new motion is composed with it. Returns False if the row is too old and is ignored.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1

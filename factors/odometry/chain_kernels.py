@@ -12,8 +12,8 @@ from factors.compiled import compiled
 from factors.se2 import Array, arc_coefficients
 
 ROW = 6  # the number of columns of a row: time, kind, and four values
-# Kinds of rows. The values are (v, w, 0, 0) of a velocity, the twist of an increment and the time in which its motion is
-# unknown, and (w, 0, 0, 0) of a gyro.
+# Kinds of rows. The values are (v, w, 0, 0) of a velocity, the twist of an increment and its time of unknown motion,
+# and (w, 0, 0, 0) of a gyro.
 VELOCITY, INCREMENT, GYRO = 0.0, 1.0, 2.0
 # Columns of a knot: the integrated state (8), the velocity in the robot frame (3), the target velocity that it converges to (3),
 # whether the wheels are at rest, and the time of the last gyro row.

@@ -105,7 +105,7 @@ class OdometryFactor:
 
 
 class ScaleFreeOdometryFactor(OdometryFactor):
-    """An odometry factor for graphs in which only the wheels determine the scale of the map. The residual is in the
+    """An odometry factor for graphs whose map has no other source of scale than the wheels. The residual is in the
     unit of the wheels' report.
 
     A residual in metres becomes smaller if the estimated world shrinks, and no other measurement opposes that. The most
@@ -246,7 +246,7 @@ def cost_of_all(
     constants: Array,
     indices: Integers,
 ) -> float:
-    """Half the sum of the squared residuals of :func:`linearize_all`, for the same arguments."""
+    """Half the sum of the squared residuals of :func:`linearize_all` with the same arguments."""
     total = 0.0
     for k in range(len(first)):
         delta = steps.deltas[k]

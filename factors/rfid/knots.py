@@ -1,4 +1,4 @@
-"""Interpolation between evenly spaced knots, for the grids and tables of detection models. The place of a value is its
+"""Interpolation between evenly spaced knots of the grids and tables of detection models. The place of a value is its
 distance from the first knot in units of the spacing."""
 
 from typing import TypeVar

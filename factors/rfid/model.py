@@ -24,7 +24,7 @@ NEGLIGIBLE_LOGIT = -14.0  # logit of a tag out of range
 NEAR = 1e-2  # m; is added in square to a squared distance, so that directions are defined at the antenna
 PARAMETERS = 12  # maximum number of parameters of a detection model in compiled code
 ALMOST_ONE = 1.0 - 1e-9  # maximum read probability of a beam model, because 1 has no logit
-# Center (negated) and width of the sigmoid by which reads of a beam model decrease behind a tag, in the cosine of the tag's facing.
+# A beam model has fewer reads behind a tag: center (negated) and width of a sigmoid of the cosine of the tag's facing.
 FRONT, SIDE = 0.25, 0.15
 
 

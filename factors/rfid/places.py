@@ -1,8 +1,8 @@
 """Likelihood tables by the tag's position in the robot frame, and the likelihood of reads at poses anywhere in a large map.
 
 All antennas of a robot measure from one robot pose. Their responses to a tag are therefore functions of the tag's
-position in the robot frame, and equal for all tags of one height. A global search for the pose uses these tables, and
-so does planning, with larger cells.
+position in the robot frame, and equal for all tags of one height. A global search for the pose uses these tables.
+Planning uses tables with larger cells.
 
 For each pose, a :class:`~factors.rfid.index.TagIndex` finds the tags in reach. Most of these were not read, so one
 table has the log-likelihood that all antennas together miss a tag. If a model depends on the facing of tags, a search
@@ -55,8 +55,8 @@ class MissTable(NamedTuple):
     """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is
     relative to the log-likelihood that they miss a tag out of reach.
 
-    ``surveyed`` (H, S, S): untempered, for a tag that works and is where the map has it, at H heights.
-    ``folded`` (H, S, S): tempered, for a tag that may be weak, moved or dead.
+    ``surveyed`` (H, S, S): untempered values of a tag at one of H heights that works and is where the map has it.
+    ``folded`` (H, S, S): tempered values of a tag that may be weak, moved or dead.
     ``cell`` [m]: the size of a cell. ``reach`` [m]: the distance beyond which both are zero.
     """
 

@@ -172,7 +172,7 @@ class RssiModel:
 
 @dataclass(frozen=True, eq=False)
 class PhaseLikelihood:
-    """The likelihood of phases by ``model`` as a function of the robot's pose, for the ``tags`` of a map."""
+    """The likelihood of phases by ``model`` as a function of the robot's pose in a map of ``tags``."""
 
     model: PhaseModel
     tags: TagArray
@@ -208,7 +208,7 @@ class PhaseLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of signal strengths as a function of the robot's pose, for a map of tags. It is relative to its
+    """The likelihood of signal strengths as a function of the robot's pose in a map of tags. It is relative to its
     value for residuals of zero."""
 
     model: RssiModel
@@ -300,7 +300,7 @@ def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tupl
 
 @compiled
 def _add_group(psi: Array, by: Array, offset: float, gradient: Array, information: Array) -> None:
-    """Add the contribution of one group of reads to ``gradient`` (3,) and ``information`` (3, 3), for a concentration kappa of 1.
+    """Add one group of reads to ``gradient`` (3,) and ``information`` (3, 3). The concentration kappa is 1.
     ``psi``: the phase errors of the reads. ``by`` (..., 3): their derivatives by the pose. ``offset``: their common phase."""
     total, mean = 0.0, np.zeros(3)
     for r in range(len(psi)):
@@ -320,7 +320,7 @@ def _add_group(psi: Array, by: Array, offset: float, gradient: Array, informatio
 
 @compiled(inline="always")
 def _mounted(antenna: Array, offset: Array) -> tuple[float, float, float, float]:
-    """An antenna's x, y and horizontal boresight (x, y) in the reference frame, in which the robot is at ``offset`` (3,)."""
+    """An antenna's x, y and horizontal boresight (x, y) in the reference frame. The robot is at ``offset`` (3,)."""
     x, y = _on_robot(offset, antenna[0], antenna[1])
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return x, y, c * antenna[3] - s * antenna[4], s * antenna[3] + c * antenna[4]

@@ -31,7 +31,7 @@ Measured = tuple[Array, Integers, Integers]  # offsets, antennas and rounds of r
 Tags = tuple[Array, Array, Integers, Integers]  # points, normals, tables (A, T) and hits (K, T)
 
 CELL = 0.05  # m; size of a cell of a table
-COARSE = 8  # number of cells along each side of a block, for which the largest value is stored
+COARSE = 8  # number of cells along each side of a block; the largest value of a block is stored
 FACINGS = 9  # number of layers, for evenly spaced cosines of the facing from -1 to 1
 NEGLIGIBLE = 15.0  # logarithm of the ratio of two likelihoods above which the smaller one is neglected
 NO_MATTER = 1e-3  # a tag is neglected if its log-likelihood differs by less from the value of a tag out of reach

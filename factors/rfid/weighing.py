@@ -2,7 +2,7 @@
 
 Three measures make this fast. The probabilities of all measurements of a tag are multiplied before one logarithm is
 taken. The inner loops run over poses, which access nearby cells of a table for one tag. These loops use vector
-instructions, also for logarithms and exponentials, for which a library would be called pose by pose.
+instructions. Logarithms and exponentials are computed here too: a library would be called pose by pose.
 """
 
 import math
@@ -30,13 +30,7 @@ _MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a float: ma
 
 @compiled(error_model="numpy", fastmath=FAST)
 def log_likelihood(
-    packed: Packed,
-    tables: Tables,
-    of_map: MapTags,
-    counts: Counts,
-    poses: Array,
-    tempering: float,
-    parameters: Array,
+    packed: Packed, tables: Tables, of_map: MapTags, counts: Counts, poses: Array, tempering: float, parameters: Array
 ) -> Array:
     """The tempered log-likelihood (N,) of read ``counts`` at poses (N, 3).
 

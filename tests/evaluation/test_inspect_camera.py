@@ -107,11 +107,11 @@ def test_a_camera_that_looks_where_its_rig_says(tmp_path, pitch, way):
 def test_a_camera_that_looks_at_the_floor_though_its_rig_says_ahead(tmp_path):
     (problem,) = mounting_problems(turning(tmp_path, 0.0, 1.0))
     assert re.fullmatch(
-        r"images rotate (1\.00|0\.9\d) times as much as the robot, as if the camera looks at the floor; by the rig's mounting "
-        r"the ratio is -?0\.00: is camera\.pitch about 1\.[3-6], not 0\.0\?",
+        r"images rotate (1\.00|0\.9\d) times as much as the robot, as if the camera points at the floor; by the "
+        r"mounting the ratio is -?0\.00: is camera\.pitch about 1\.[3-6], not 0\.0\?",
         str(problem),
     )
     (problem,) = mounting_problems(turning(tmp_path, np.pi / 2, 0.0))
-    assert "as if the camera looks ahead; by the rig's mounting the ratio is 1.00" in str(problem)
+    assert "as if the camera points ahead; by the mounting the ratio is 1.00" in str(problem)
     (problem,) = mounting_problems(turning(tmp_path, np.pi / 2, -1.0))
     assert problem.fields["where"] == "at the ceiling"

@@ -27,7 +27,7 @@ MEASUREMENT = 3.0  # radius of the region that describes a point, divided by hal
 SCALE_RATIO = 1.2  # maximum ratio between the sizes of two points that correspond in the score ``strict``
 
 _NODES = 64  # number of nodes of the integration over a disc
-_CHUNK = 20_000  # number of pairs that are compared at once, to limit memory
+_CHUNK = 20_000  # number of pairs in one comparison, to limit memory
 
 Truths = NDArray[np.bool_]
 Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both images

@@ -34,7 +34,7 @@ _NAME = 40  # maximum length of a name at an axis
 class _Row:
     """A row of a chart of dots: a variant, its ``values`` on each log, and a ``mark`` at their median or mean.
 
-    ``band``: the interval in which the mark is expected, None for none.
+    ``band``: the expected interval of the mark, None for none.
     """
 
     name: str
@@ -95,7 +95,7 @@ def times(results: Results, metric: Metric) -> Picture | None:
 
 
 def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Array]]) -> Picture | None:
-    """Plot the distribution of position errors of causal and final poses, over the logs on which all variants have errors.
+    """Plot the distribution of position errors of causal and final poses, over the logs with errors of all variants.
 
     ``errors``: by kind of trajectory, variant and log, quantiles of the position error [m]. Return None if there are no errors.
     """

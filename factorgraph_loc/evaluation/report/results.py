@@ -215,7 +215,7 @@ class Results:
         return MetricComparison(metric, figures, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
     def unscored(self) -> list[str]:
-        """Return the logs on which a run has scored poses, but too few for scores."""
+        """Return the logs with a run that has scored poses, but too few for scores."""
         kinds = [f"{kind}.scored" for kind in KINDS]
         return [
             log
@@ -277,7 +277,7 @@ def score(row: Row, metric: str) -> float | None:
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
     """Return the best of the complete variants, or None if there is none. A variant is complete if it has a score on
-    every log on which at least one variant has a score."""
+    every log that any variant has a score on."""
     if metric.better is None or not figures:
         return None
     complete = {

@@ -90,8 +90,8 @@ class TrajectoryScore:
         """
         figures: dict[str, float | None] = {"pairs": len(self.estimate)}
         figures |= self.ape.figures("ape")
-        others = [(f"rpe_{delta}", errors) for delta, errors in self.rpe.items()]
-        for name, errors in (("rpe_per_m", self.rpe_per_m), ("rpe_per_s", self.rpe_per_s), *others):
+        by_delta = [(f"rpe_{delta}", errors) for delta, errors in self.rpe.items()]
+        for name, errors in (("rpe_per_m", self.rpe_per_m), ("rpe_per_s", self.rpe_per_s), *by_delta):
             known = errors or _NONE
             figures |= known.figures(name) | {f"{name}.pieces": len(known.position) if errors else None}
         return figures
@@ -164,10 +164,10 @@ def score_paths(
         settings |= {"max_diff": max_diff} if associate_by == "nearest" else {"max_gap": max_gap}
     moved = replace(pair, estimate=aligned, reference=truth)
     errors = pose_errors(moved, all_pairs=all_pairs)
-    others = {
-        text: found
+    by_delta = {
+        text: relative
         for text, (length, unit) in deltas.items()
-        if (found := relative_errors(moved, length, unit, all_pairs=all_pairs)) is not None
+        if (relative := relative_errors(moved, length, unit, all_pairs=all_pairs)) is not None
     }
     lengths = float(_steps(estimate).sum()), float(_steps(reference).sum())
     poses = len(estimate), len(reference)
@@ -179,7 +179,7 @@ def score_paths(
         )
         values = estimate.name, len(aligned), min(poses), max_diff, reference.name
         warnings.append(notice("few_pairs", sentence, *values))
-    return TrajectoryScore(aligned, truth, transform, *errors, others, lengths, poses, settings, tuple(warnings))
+    return TrajectoryScore(aligned, truth, transform, *errors, by_delta, lengths, poses, settings, tuple(warnings))
 
 
 def pose_errors(

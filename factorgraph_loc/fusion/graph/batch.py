@@ -18,7 +18,7 @@ from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5
 WIDEST = 8.0  # the initial factor on the scales of robust losses, if the initial values are rough
-NARROWED = 0.5  # the factor by which the scales decrease in each step
+NARROWED = 0.5  # the ratio of the scales of a step to those of the step before
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:

@@ -184,7 +184,7 @@ class Graph:
         self.departed: tuple[Values, Values] = {}, {}
         self.keyframes: dict[int, Keyframe] = {}  # by consecutive numbers
         self.ticks: list[TickAt] = []
-        self.changes: tuple[Change, ...] = ()  # the intervals in which the robot was carried
+        self.changes: tuple[Change, ...] = ()  # the intervals when the robot was carried
         self.is_anchored = False  # False while odometry from before the first keyframe may still arrive
         self._damping = 0.0  # the largest damping that was needed so far to compute covariances
         self.t = -math.inf
@@ -293,7 +293,7 @@ class Graph:
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
         """Add the landmark or bias ``new`` as a variable, and return its key. ``covariance`` (3, 3): the covariance of
-        the pose from which it was observed."""
+        the observing pose."""
         is_position = len(new.mean) > 1
         numbers = [index_of(key) for key in self.keys.values() if is_landmark(key) is is_position]
         first = 0 if is_position else len(self.constants)

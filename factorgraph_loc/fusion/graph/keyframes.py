@@ -40,7 +40,7 @@ Backend = AtTheEnd | Incremental  # solves the graph
 
 
 class _KeyframeView:
-    """Read access to the state of the graph, for the sensor of a measurement on one keyframe.
+    """Gives the sensor of a measurement on one keyframe read access to the state of the graph.
 
     ``guess``: pose and covariance of the keyframe. ``offset``: the motion from the keyframe to the measurement, None
     for zero. ``newest``: True if the keyframe is the newest one.

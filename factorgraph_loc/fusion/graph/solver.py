@@ -57,7 +57,7 @@ class FullHistory:
 
     Sensor constants are in all branches of iSAM2's elimination tree. To read an estimate, iSAM2 would therefore solve the whole
     tree. The variables of the last update are at the root of the tree. Without points they are solved separately, which is faster.
-    An update with points has many variables, for which one solution of the whole tree takes less time.
+    An update with points has many variables. One solution of the whole tree then takes less time.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother

@@ -106,7 +106,7 @@ class Images:
     def stream(self, reading: Reading) -> ImageStream:
         """Return the stream of images. Newly extracted images are moved to the cache folder.
 
-        ``reading``: has the absolute time of t = 0, from which the times in the stream count, and a list for warnings.
+        ``reading``: has the absolute time of t = 0 in the stream, and a list for warnings.
         """
         if self._written is not None:
             with writing(self._folder), locked(self._folder.parent / LOCK):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 SMALL, LARGE = 2**24, 2**27  # bytes: a chunk may always unpack to SMALL, and never to more than LARGE
-FILE = 2**30  # bytes to which a file may always unpack, if the disk has room
+FILE = 2**30  # bytes: unpacked size that is always allowed for a file, if the disk has room
 CHUNK_RATIO, FILE_RATIO = 1000, 50  # maximum compression ratio of a chunk above SMALL, of a file above FILE
 STEP = 2**22  # bytes that are unpacked at a time
 ROS1 = ".bag"

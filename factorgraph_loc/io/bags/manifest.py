@@ -1,4 +1,4 @@
-"""Proposes a manifest, the description of a log, for a ROS bag: which topic is which sensor.
+"""Proposes a manifest (the description of a log) for a ROS bag. The manifest assigns topics to sensors.
 
 Topics are recognised by their message types and by common names.
 """
@@ -201,7 +201,7 @@ def _has_no_pose(bag: Bag, topic: Topic) -> bool:
 
 def _joints(bag: Bag, topic: Topic, remarks: list[str]) -> dict[str, Any]:
     """Return the proposed settings of wheels for a JointState topic. Wheels are recognised by the names of joints in
-    its first message. What the user should check is appended to ``remarks``."""
+    its first message. Questions for the user are appended to ``remarks``."""
     first = next(bag.messages([topic.name]), None)
     names = [name for name in getattr(first and first.message, "name", ()) if isinstance(name, str)]
     wheels = [name for name in names if WHEEL.search(name)] or names
@@ -335,7 +335,7 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
 def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[str, dict[str, Any]]:
     """Return the proposed topics of ranges to landmarks with their settings, by the name of the topic.
 
-    Such a topic has fields for a distance and, at the same place in the message, for the name of a landmark.
+    Such a topic has a field for a distance, and next to it in the message a field for the name of a landmark.
     """
     candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
     out.remarks += [

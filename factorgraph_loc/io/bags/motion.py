@@ -129,7 +129,7 @@ class OdometryTopic(PoseTopic):
     """The settings of the topic that gives the odometry: odometry messages, poses, velocities, tf, or wheel joints."""
 
     use: Literal["pose", "twist"] = "pose"
-    """part of odometry messages to use: pose, for the motion between messages, or twist, for the velocity; for wheels,
+    """part of odometry messages to use: pose gives the motion between messages, twist the velocity; for wheels,
     pose means their angles and twist their angular rates"""
     wheels: WheelSettings | None = None
     """joints and sizes of the wheels, if topic has joint states, or is the topic of the left wheel of two"""
@@ -159,7 +159,7 @@ class YawRates:
     def stream(self, reading: Reading) -> YawRateStream:
         """Return the turn rates about the robot's z axis. An IMU axis that is perpendicular to the robot's z axis may be NaN.
 
-        ``reading``: has the absolute time of t = 0, from which the times in the stream count, and a list for warnings.
+        ``reading``: has the absolute time of t = 0 in the stream, and a list for warnings.
         """
         turned = self._options.turned()
         if self._options.frame is not None:

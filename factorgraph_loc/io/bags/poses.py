@@ -46,7 +46,7 @@ class PoseTopic(RowTopic, Turned):
     """The settings of a topic of poses, or of tf with the poses of the frame ``child`` in the frame ``parent``."""
 
     parent: str | None = None
-    """frame in which the poses are given, if the topic is tf"""
+    """reference frame of the poses, if the topic is tf"""
     child: str | None = None
     """frame of the robot, if the topic is tf"""
 
@@ -310,7 +310,7 @@ class Tree:
         return next((name for name in ROBOT if name in self.parents), None)
 
     def above(self, frame: str, names: tuple[str, ...]) -> str | None:
-        """Return the first of ``names`` that is above ``frame`` and in which ``frame`` moves. Returns None without such a frame."""
+        """Return the first of ``names`` that is above ``frame`` and that ``frame`` moves in, or None."""
         chain = upward(self.parents, frame)
         first = next((i for i, name in enumerate(chain) if name in self.moving), len(chain))
         return next((name for name in names if name in chain[first + 1 :]), None)

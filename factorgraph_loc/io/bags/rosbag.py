@@ -108,7 +108,7 @@ class Options(FileModel):
     clock: Clock = "header"
     """timestamps to use: header for the timestamps of message headers, receive for the times of receipt; a topic may override it"""
     base_frame: str = "base_link"
-    """frame of the robot, relative to which tf_static gives the mountings of sensors"""
+    """frame of the robot; mountings of sensors are read from tf_static relative to this frame"""
 
 
 OTHERS = {

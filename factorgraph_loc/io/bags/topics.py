@@ -32,7 +32,7 @@ ELEMENT = re.compile(r"\[(\d+)\]$")  # matches the index at the end of a path su
 BYTES = ("uint8", "byte", "char", "octet")  # a list of these types is one value, such as an EPC
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 HEADER = "std_msgs/msg/Header"
-DEPTH = 6  # maximum nesting level of messages in which fields are listed
+DEPTH = 6  # maximum nesting level of messages whose fields are listed
 
 Row = tuple[Any, ...]
 Clock = Literal["header", "receive"]

@@ -36,7 +36,7 @@ class StartSettings(FileModel):
 
 
 class Manifest(FileModel):
-    """A manifest, the description of one or several logs. ``title``, ``licence``, ``origin``: texts about the data, for the user.
+    """A manifest, the description of one or several logs. ``title``, ``licence``, ``origin``: texts about the data.
 
     ``reader``: name of the reader of the log. ``options``: its options; a list of values gives several logs.
     ``path``, ``rig``, ``world``: the data, the rig and the map, below the folder of the manifest or the data folder.

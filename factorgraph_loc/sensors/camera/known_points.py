@@ -209,7 +209,7 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """Return a factor without points, to which matches are added. Returns None if the features cannot be matched
+        """Return a factor without points. The caller adds matches. Returns None if the features cannot be matched
         with the map."""
         self.names = ()
         if self.associator is None:

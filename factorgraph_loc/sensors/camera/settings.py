@@ -90,7 +90,7 @@ class CameraSettings(SensorSettings):
     z: Offset = 0.0
     """height of the camera"""
     roll: Angle = 0.0
-    """first rotation of a camera that looks forward, about the robot's x axis"""
+    """first rotation of a camera with the optical axis forward, about the robot's x axis"""
     pitch: Angle = 0.0
     """second rotation, about the robot's y axis; down is positive"""
     yaw: Angle = 0.0

@@ -194,8 +194,8 @@ def mounting_problems(log: Log) -> list[Notice]:
         return []
     where = "at the floor" if share > APART else "at the ceiling" if share < -APART else "ahead"
     sentence = (
-        "images rotate {ratio:.2f} times as much as the robot, as if the camera looks {where}; by the rig's mounting the ratio "
-        "is {expected:.2f}: is camera.pitch about {pitch:.1f}, not {stated:.1f}?"
+        "images rotate {ratio:.2f} times as much as the robot, as if the camera points {where}; by the mounting the "
+        "ratio is {expected:.2f}: is camera.pitch about {pitch:.1f}, not {stated:.1f}?"
     )
     return [notice("camera_mounting", sentence, share, where, expected, math.asin(share), camera.pitch)]
 

@@ -70,8 +70,8 @@ class Candidate:
     """The sightings of a landmark whose position is not known yet.
 
     Immutable, because filters go back to an earlier state when a measurement is late. ``sightings``: in order of time.
-    ``sources``: for each sighting, an object from which the caller makes a factor once the landmark is located.
-    ``due``: the number of sightings at which the next attempt to locate the landmark is made."""
+    ``sources``: for each sighting, an object that the caller makes a factor of, once the landmark is located.
+    ``due``: the next attempt to locate the landmark is made after this number of sightings."""
 
     sightings: tuple[PartialSighting, ...] = ()
     sources: tuple[object, ...] = ()

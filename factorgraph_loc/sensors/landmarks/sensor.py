@@ -144,14 +144,14 @@ class LandmarkObservation(ResidualObservation):
             own = names.pop() if factor.free else None
             bias = names.pop() if factor.biased else None
             point, shorter = None if own is None else values[own], 0.0 if bias is None else float(values[bias][0])
-            here = factor.fixed([values[name] for name in names], point, shorter)
-            uncertain = np.zeros((2, 2)) if here.point_covariances is None else here.point_covariances[0]
+            bound = factor.fixed([values[name] for name in names], point, shorter)
+            uncertain = np.zeros((2, 2)) if bound.point_covariances is None else bound.point_covariances[0]
             uncertain = uncertain if own is None else spreads[own]
             if (
                 bias is not None
             ):  # an error of the range has the effect of a shift of the landmark along the line of sight
                 uncertain = uncertain + spreads[bias] * np.eye(2)
-            fixed.append(here if len(names) == len(term.blocks) else replace(here, point_covariances=uncertain[None]))
+            fixed.append(bound if len(names) == len(term.blocks) else replace(bound, point_covariances=uncertain[None]))
         factor = together(fixed)
         return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 

@@ -296,7 +296,7 @@ class OdometryCalibrator(ConstantsCalibrator):
 
 
 def _residuals(windows: Windows, model: OdometryModel) -> Residuals:
-    """Return the errors of the odometry over the windows, for the report."""
+    """Return the errors of the odometry over the windows."""
     start, end = windows.states(model)
     sigmas = np.sqrt(np.diagonal(windows.covariances(model), axis1=1, axis2=2))
     return Residuals(windows.log.name, ERRORS, windows.t, end[:, 4] - start[:, 4], windows.errors(model), sigmas)

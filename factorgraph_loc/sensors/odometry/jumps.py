@@ -69,15 +69,15 @@ def _outliers(rates: Array, least: float) -> Integers:
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 
 
-def jump_warning(kind: str, found: list[Jump], stream: Motion, end: str) -> Notice:
-    """Return a warning about the jumps ``found`` in a stream. ``kind``: the kind of the warning. ``end``: text that is
+def jump_warning(kind: str, events: list[Jump], stream: Motion, end: str) -> Notice:
+    """Return a warning about the jumps ``events`` in a stream. ``kind``: the kind of the warning. ``end``: text that is
     appended to it."""
-    first = found[0]
+    first = events[0]
     sentence = (
         "the {what} of the {source} jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {before:.2f} and {after:.2f} "
         f"{{unit}} (such rows: {{rows}}){end}"
     )
-    rows = len({jump.row for jump in found})
+    rows = len({jump.row for jump in events})
     t = float(stream.t[first.row])
     source = "gyro" if isinstance(stream, YawRateStream) else "odometry"
     return notice(kind, sentence, first.what, source, first.rate, first.unit, t, first.before, first.after, rows)
@@ -89,11 +89,11 @@ def without_jumps(stream: M, rules: RowRules, warnings: list[Notice]) -> M:
 
     The velocity before a removed row is valid until the next row. The motion of a removed increment is marked as unknown.
     """
-    if rules.bad_rows == "refuse" or not (found := jumps(stream)):
+    if rules.bad_rows == "refuse" or not (events := jumps(stream)):
         return stream
-    warnings.append(jump_warning("skipped_jumps", found, stream, ": skipped"))
+    warnings.append(jump_warning("skipped_jumps", events, stream, ": skipped"))
     keep = np.ones(len(stream.t), dtype=bool)
-    keep[[jump.row for jump in found]] = False
+    keep[[jump.row for jump in events]] = False
     kept = selected(stream, keep)
     if isinstance(kept, IncrementStream):
         rows = np.flatnonzero(keep)

@@ -56,7 +56,7 @@ class VelocityOdometry:
 class IncrementOdometry:
     """Motion since the previous measurement: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot frame at that measurement.
 
-    ``unknown`` [s]: the part of the time since the previous measurement in which the motion is unknown.
+    ``unknown`` [s]: the time of unknown motion since the previous measurement.
     """
 
     sensor: ClassVar[str] = "odometry"
@@ -100,7 +100,7 @@ class IncrementStream(Stream):
     """All increments of a log: ``dx``, ``dy`` [m] and ``dtheta`` [rad], each (N,): motion since the previous row, in
     the robot frame at the previous row.
 
-    ``unknown`` (N,) [s]: the part of the time since the previous row in which the motion is unknown, by default 0.
+    ``unknown`` (N,) [s]: the time of unknown motion since the previous row, by default 0.
     """
 
     rank: ClassVar[int] = FLOOR
@@ -163,9 +163,7 @@ INCREMENTS = Table(
         within("dx", LENGTH, LONGEST_WAY, "forward motion since the previous row"),
         within("dy", LENGTH, LONGEST_WAY, "motion to the left since the previous row"),
         within("dtheta", ANGLE, MOST_TURNED, "rotation since the previous row"),
-        number(
-            "unknown", DURATION, 0.0, MAX_SPAN, "part of the time since the previous row in which the motion is unknown"
-        ),
+        number("unknown", DURATION, 0.0, MAX_SPAN, "time of unknown motion since the previous row"),
     ),
     optional=(("unknown",),),
     stream="factorgraph_loc.sensors.odometry.measurement:IncrementStream",
@@ -196,7 +194,7 @@ WHEELS = Table(
 
 
 def since_skipped(t_ns: Integers, resumed: NDArray[np.bool_]) -> Array:
-    """Return the times (N,) [s] in which the motion of increments at N timestamps [ns] is unknown, because rows were skipped.
+    """Return the times (N,) [s] of unknown motion in increments at N timestamps [ns] after skipped rows.
 
     ``resumed`` (N,): True for each row that follows a skipped row. Its time is that since the row before; the time of
     other rows is 0.

@@ -56,9 +56,9 @@ def summarize(log: Log) -> Summary:
 def _jumps(log: Log) -> list[Notice]:
     """Return warnings about jumps of the odometry and of the gyro."""
     return [
-        jump_warning(f"{name}_jumps", found, stream, '; bad_rows = "skip" skips them')
+        jump_warning(f"{name}_jumps", events, stream, '; bad_rows = "skip" skips them')
         for name, stream in log.streams.items()
-        if isinstance(stream, VelocityStream | IncrementStream | YawRateStream) and (found := jumps(stream))
+        if isinstance(stream, VelocityStream | IncrementStream | YawRateStream) and (events := jumps(stream))
     ]
 
 
@@ -180,10 +180,10 @@ def match(rates: Array, delayed: Array) -> RateMatch | None:
     return RateMatch(float(SHIFTS[best] * STEP), float(fits[best, 1])) if abs(fits[best, 0]) >= ALIKE else None
 
 
-def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]:
-    """Return correlation and slope between ``rates`` and ``others`` of ``shift`` steps later. Both are zero without motion."""
+def _correlation(rates: Array, signal: Array, shift: int) -> tuple[float, float]:
+    """Return correlation and slope between ``rates`` and ``signal``, ``shift`` steps later. Zeros without motion."""
     a = rates[max(0, -shift) : len(rates) - max(0, shift)]
-    b = others[max(0, shift) : len(others) - max(0, -shift)]
+    b = signal[max(0, shift) : len(signal) - max(0, -shift)]
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
     if len(a) < FEWEST or np.sqrt(np.mean(a**2)) < MOVES:
@@ -192,24 +192,24 @@ def _correlation(rates: Array, others: Array, shift: int) -> tuple[float, float]
     return (ab / np.sqrt(aa * bb), ab / aa) if bb > 0.0 else (0.0, 0.0)
 
 
-def _compared(sensor: str, name: str, found: RateMatch | None) -> list[Notice]:
-    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``found``: its comparison with the
+def _compared(sensor: str, name: str, compared: RateMatch | None) -> list[Notice]:
+    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``compared``: its comparison with the
     odometry. ``sensor``: the section of the rig whose time_offset corrects the clock."""
-    if found is None:
+    if compared is None:
         return []
     lines = []
-    if found.slope < 0.0:
+    if compared.slope < 0.0:
         sentence = "{source} turns in the opposite direction of the odometry: expected counter-clockwise angles, seen from above"
         lines.append(notice("opposite_turns", sentence, name))
-    size = abs(found.slope)
+    size = abs(compared.slope)
     if DEGREES[0] < size < DEGREES[1]:
         lines.append(notice("degrees", IN_DEGREES, name, size, "the odometry"))
     elif DEGREES[0] < 1.0 / size < DEGREES[1]:
         lines.append(notice("degrees", IN_DEGREES, "the odometry", 1.0 / size, name))
-    if found.shift:
+    if compared.shift:
         # a late clock needs a negative offset; if the reference is late, the odometry is early and needs a positive offset
-        offset = -found.shift if sensor == "imu" else found.shift
-        lines.append(interfaces.line(name, found.shift, "the odometry", sensor, offset))
+        offset = -compared.shift if sensor == "imu" else compared.shift
+        lines.append(interfaces.line(name, compared.shift, "the odometry", sensor, offset))
     return lines
 
 

@@ -216,7 +216,7 @@ class KnownTags:
         )
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
-        """Update the states of tags by the evidence of a scan at ``t`` [s]. Misses are used at once. Reads are used
+        """Update the states of tags by the evidence of a scan at ``t`` [s]. Misses are used immediately. Reads are used
         after :data:`CONFIRMED` seconds."""
         is_read, tags, log_likelihoods = evidence.is_read, evidence.tags, evidence.log_likelihoods
         self.states.learn(t, tags[~is_read], log_likelihoods[~is_read])

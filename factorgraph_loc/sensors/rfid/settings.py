@@ -160,7 +160,7 @@ class PhaseSettings(FileModel):
     min_reads: Annotated[int, Field(ge=2, le=1000)] = 3
     """smallest number of reads of a tag by an antenna in a window"""
     window: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 2.0
-    """length of the windows in which phases of one tag and antenna are compared"""
+    """length of the windows; phases of one tag and antenna are compared in a window"""
     step: Annotated[float, Field(ge=1e-3, le=60.0), InUnit("s")] = 1.0
     """time between the beginnings of two windows"""
 
@@ -296,7 +296,7 @@ class RfidSettings(SensorSettings):
 
 
 class SurveySettings(FileModel):
-    """The transform from the frame in which tags were surveyed to the world: a rotation about a point, then a translation."""
+    """The transform from the frame of the tags' survey to the world: a rotation about a point, then a translation."""
 
     x: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
     """translation of the map's tags along x, after the rotation"""

@@ -49,12 +49,12 @@ class SimulatedRssiSettings(FileModel):
 
 
 class Fading(FileModel):
-    """Fades: intervals in which an antenna misses a tag. Fades are independent for each antenna and tag."""
+    """Fades: intervals when an antenna misses a tag. Fades are independent for each antenna and tag."""
 
     duration: Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("s")] = 2.0
     """mean duration of a fade"""
     share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
-    """fraction of the time in which an antenna misses a tag because of fades"""
+    """fraction of the time that an antenna misses a tag because of fades"""
 
 
 class AntennaStop(FileModel):

@@ -33,7 +33,7 @@ from factors.rfid.signals import PhaseReads
 from factors.se2 import Array, Integers
 
 MAX_GAP = 0.1  # s; longest interpolated gap of a reference
-PHASE_WINDOW = 2.0  # s; length of the windows in which phases are compared
+PHASE_WINDOW = 2.0  # s; length of the windows for the comparison of phases
 
 ANTENNA = named("antenna", "the name of an antenna")
 RFID = Table(
@@ -207,7 +207,7 @@ def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: S
     A read without a given round belongs to the first round of its antenna that has no read of the tag yet, in order of
     time. If all rounds of the antenna have one, it belongs to the last round.
     """
-    own = {name: [k for k, other in enumerate(names) if other == name] for name in names}
+    own = {name: [k for k, antenna in enumerate(names) if antenna == name] for name in names}
     out = np.full(len(reads), -1, dtype=np.int64)
     for i, read in enumerate(reads):
         if not isinstance(read.antenna, str) or read.antenna not in names:

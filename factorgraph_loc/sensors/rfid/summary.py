@@ -81,16 +81,16 @@ def summarize(log: Log) -> Summary:
     return Summary({"rfid": summary}, in_map, rfid_problems(log, summary), (_paragraph(summary),))
 
 
-def _paragraph(found: RfidSummary) -> Paragraph:
-    unknown = f"{len(found.unknown)} others" if found.unknown else "no others"
+def _paragraph(summary: RfidSummary) -> Paragraph:
+    unknown = f"{len(summary.unknown)} others" if summary.unknown else "no others"
     header = ("antenna", "reads", "rounds", "rounds per s", "without a read", "last [s]")
     rows = [
         (name, str(a.reads), str(a.rounds), f"{a.rate:.2f}", str(a.silent), f"{a.last:.1f}")
-        for name, a in found.antennas.items()
+        for name, a in summary.antennas.items()
     ]
     return Paragraph(
-        f"RFID: {found.reads} reads of {found.known} tags of the map and of {unknown}, in {found.rounds} rounds, "
-        f"{found.scans} scans",
+        f"RFID: {summary.reads} reads of {summary.known} tags of the map and of {unknown}, in {summary.rounds} rounds, "
+        f"{summary.scans} scans",
         header,
         tuple(rows),
     )
@@ -132,33 +132,33 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
     )
 
 
-def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
-    """Return warnings about tags, antennas and clock of the reads of a log. ``found``: their summary."""
+def rfid_problems(log: Log, summary: RfidSummary) -> list[Notice]:
+    """Return warnings about tags, antennas and clock of the reads of a log."""
     out = list[Notice]()
-    if found.unread:
+    if summary.unread:
         sentence = "{unread} of {tags} tags of the map are never read: {names}"
-        names = listed(found.unread, SHOWN)
-        out.append(notice("unread_tags", sentence, len(found.unread), len(log.world.tags), names))
-    if found.unknown:
-        reads = sum(found.unknown.values())
-        sentence, names = "{reads} reads are of {tags} tags that the map lacks: {names}", listed(found.unknown, SHOWN)
-        out.append(notice("unknown_tags", sentence, reads, len(found.unknown), names))
-    if misspelt := in_other_case(found.unknown, found.unread):
+        names = listed(summary.unread, SHOWN)
+        out.append(notice("unread_tags", sentence, len(summary.unread), len(log.world.tags), names))
+    if summary.unknown:
+        reads = sum(summary.unknown.values())
+        sentence, names = "{reads} reads are of {tags} tags that the map lacks: {names}", listed(summary.unknown, SHOWN)
+        out.append(notice("unknown_tags", sentence, reads, len(summary.unknown), names))
+    if misspelt := in_other_case(summary.unknown, summary.unread):
         sentence = "tags are in the map with other capital letters: {names}: set epc_case for reads or map"
         out.append(notice("other_case", sentence, listed(misspelt, SHOWN)))
-    if coded := [epc for epc in found.unknown if text_of_hex(epc) in log.world.tags]:
+    if coded := [epc for epc in summary.unknown if text_of_hex(epc) in log.world.tags]:
         sentence = 'reads have the text of tags as hexadecimal digits: {names}: set epc_case = "ascii-hex"'
         out.append(notice("coded_epcs", sentence, listed(coded, SHOWN)))
     carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
         notice("unknown_antenna", UNKNOWN_ANTENNA, name, antenna.reads, antenna.rounds)
-        for name, antenna in found.antennas.items()
+        for name, antenna in summary.antennas.items()
         if name not in carried
     ]
     idle = "antenna {antenna} of the rig is never active"
-    out += [notice("idle_antenna", idle, name) for name in carried if name not in found.antennas]
-    last = max((antenna.last for antenna in found.antennas.values()), default=0.0)
-    for name, antenna in found.antennas.items():
+    out += [notice("idle_antenna", idle, name) for name in carried if name not in summary.antennas]
+    last = max((antenna.last for antenna in summary.antennas.values()), default=0.0)
+    for name, antenna in summary.antennas.items():
         if antenna.last < last - STOPPED:
             stops = "antenna {antenna} stops at {t:.1f} s, {before:.1f} s before the last antenna"
             out.append(notice("antenna_stops", stops, name, antenna.last, last - antenna.last))
@@ -166,17 +166,17 @@ def rfid_problems(log: Log, found: RfidSummary) -> list[Notice]:
             out.append(notice("silent", "antenna {antenna} reads nothing", name))
         elif antenna.last_read < last - STOPPED:
             out.append(notice("silent", "antenna {antenna} reads nothing after {t:.1f} s", name, antenna.last_read))
-    return out + _clock_trouble(log, found)
+    return out + _clock_trouble(log, summary)
 
 
-def _clock_trouble(log: Log, found: RfidSummary) -> list[Notice]:
+def _clock_trouble(log: Log, summary: RfidSummary) -> list[Notice]:
     out = []
-    count, step = found.late
+    count, step = summary.late
     if step > CLOCK_STEP:
         jump = "{rounds} rounds have timestamps up to {step:.1f} s before an earlier round: did the clock of the reader jump?"
         out.append(notice("late_rounds", jump, count, step))
     odometry = log.streams.get("odometry")
-    if odometry is None or not len(odometry.t) or not found.rounds:
+    if odometry is None or not len(odometry.t) or not summary.rounds:
         return out
     t = log.streams["rfid"].t + log.rig.time_offset("rfid")
     wheels = odometry.t + log.rig.time_offset("odometry")

@@ -86,7 +86,7 @@ def pairs_of(
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
-    """Return the flat indices (round, tag) of the pairs of a log in which antenna and tag are closer than :data:`REACH`."""
+    """Return the flat indices (round, tag) of the pairs of antenna and tag that are closer than :data:`REACH`."""
     every = np.arange(log.hits.size)
     return every[view_of(log, settings, survey, every)[1] < REACH]
 

@@ -112,7 +112,7 @@ class _Focus:
         return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
 
     def without(self, block: int) -> _Focus:
-        """Return a copy without the reads of one ``block`` of windows, for a jackknife."""
+        """Return a copy without the reads of one ``block`` of windows. A jackknife compares such copies."""
         edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
         inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
         return replace(self, reads=self.reads.chosen(~inside))
