@@ -85,7 +85,7 @@ class RowRules(FileModel):
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
         """Return indices (N,) that sort the rows by timestamp ``t_ns`` (N,), or 0 to N - 1 if ``order`` is "refuse".
-        Sorted rows add a warning to ``warnings``. ``rows`` (N,): row numbers in the file ``source`` that the warning names."""
+        Sorted rows add a warning to ``warnings``. ``rows`` (N,): row numbers that the warning names."""
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))
