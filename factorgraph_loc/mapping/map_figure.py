@@ -22,9 +22,10 @@ LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Plot a new map of tags, with the given map and the trajectory. Tags are labelled by the last characters of their EPC.
+    """Plot a new map of tags, with the given map and the trajectory. ``log``: the name of the log, for the title.
 
-    In addition to :func:`figure`, candidate positions of ambiguous tags are drawn, and given tags that were not located.
+    Labels are the last characters of EPCs. Candidate positions of ambiguous tags, and given tags that were not located,
+    are drawn in addition to the elements of :func:`figure`.
     """
     out = figure(log, made.made, made.poses, LABEL)
     axis = out.axes[0]

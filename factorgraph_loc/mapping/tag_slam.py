@@ -43,7 +43,7 @@ WINDOW = 90  # number of last keyframes along which new tags are searched
 MARGIN = 1.0
 ITERATIONS, FINAL_ITERATIONS = 4, 40  # of the optimization after each section, and at the end
 ROUNDS = 3  # largest number of times that all tags are searched again at the end
-MOVED_GATE = 13.8  # 99.9 % of chi-square with two degrees of freedom
+MOVED_GATE = 13.8  # squared Mahalanobis distance of a significant move: 99.9 % of chi-square, two degrees of freedom
 
 Factors = list[tuple[Factor, tuple[int, ...]]]
 
@@ -52,7 +52,7 @@ Factors = list[tuple[Factor, tuple[int, ...]]]
 class TagObservations:
     """K antenna observations of T tags, ordered by time. An observation is what one antenna read in some inventory rounds.
 
-    ``names``: the EPCs of the T tags. ``t`` (K,) [s]: times. ``antennas`` (K,): indices of the antennas in ``model``.
+    ``names``: the EPCs of the T tags. ``t`` (K,) [s]: times. ``antennas`` (K,): indices in the reader's ``model``.
     ``rounds`` (K,): the number of inventory rounds. ``hits`` (K, T): the number of these rounds that read each tag.
     ``heights`` (T,) [m]: the heights of the tags. ``has_height`` (T,): False where the height is only assumed.
     ``facing`` (T,) [rad]: the facings in the world frame, NaN where unknown. ``positions`` (T, 2) [m]: from the log's

@@ -77,7 +77,8 @@ class FeatureTracker:
 def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel) -> Integers:
     """Match the features of two images. Returns pairs (M, 2) of indices.
 
-    ``first``, ``second``: the features of an image as directions (K, 2), that is x and y at depth 1, and descriptors (K, D).
+    ``first``, ``second``: the features of an image, as directions (K, 2), which are x and y at depth 1, and descriptors
+    (K, D). ``camera``: its calibration.
     """
     if len(first[0]) == 0 or len(second[0]) == 0:
         return np.empty((0, 2), dtype=np.int64)

@@ -123,8 +123,8 @@ class KnownPoints:
         return inexact
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
-        """Return a factor of all named points that are in the map, without outlier rejection, on the pose at their
-        time. Returns None if there are none."""
+        """Return a factor of all named points that are in the map, without outlier rejection, on the pose at the time
+        of the image. Returns None without such points."""
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:

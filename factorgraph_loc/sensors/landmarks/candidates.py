@@ -32,7 +32,7 @@ FEWEST, GROWTH = 8, 1.25  # number of sightings at the first attempt, and its fa
 DIRECTIONS = 24  # number of initial positions on a circle around the robot
 RADII = (1.0, 3.0, 10.0, 30.0)  # m; radii of the initial positions if there is no range
 ITERATIONS, REFINEMENTS = 20, 8  # largest numbers of iterations, with independent and with correlated odometry errors
-CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m; iterations end if a step is shorter than the first; longest step
+CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m; iterations end if a step is shorter than CONVERGED; longest step
 FLAT = 1e-4 * np.eye(2)  # information of the nearly flat prior [1/m^2]
 NEAR, MOST_FUSED = 0.5, 8  # m; minimum distance between distinct positions; largest number of distinct positions
 # the best position is unambiguous if the loss of each other position is larger by MARGIN, which is multiplied by the median squared

@@ -224,7 +224,7 @@ class OdometryCalibrator(ConstantsCalibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Estimate constants and noise, see :meth:`Calibrator.learn`. Empty if the reference has no headings."""
+        """See :meth:`Calibrator.learn`. The result is empty if the reference has no headings."""
         reference = traced[0].log.reference
         has_heading = reference is not None and reference.has_heading
         return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()

@@ -18,7 +18,7 @@ from factors.se2 import Array, Integers
 
 DURATION = 5.0  # s; scans of this time are tested jointly
 KEPT = 60.0  # s; older scans are discarded
-SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations; a suspicion begins above the first and ends below the second
+SUSPICIOUS, CALM = 6.0, 3.0  # standard deviations: a suspicion begins above SUSPICIOUS and ends below CALM
 SCANS = 4  # minimum number of scans in a test
 BLOCK, POSSIBLE = 10.0, 0.01  # s, length of a block of time; minimum probability of a read that is counted
 INDEPENDENT = 1.5  # a ratio of variances up to this is treated as 1
@@ -99,7 +99,7 @@ class ScanMonitor:
         return excess, variance, count
 
     def _beginning(self) -> float:
-        """Return the time [s] at which the suspicion begins: the sum of ``surprise`` (see :meth:`add`) after it is largest."""
+        """Return the time [s] of the begin of the suspicion. The sum of ``surprise`` after this time is the largest."""
         total, most, begin = 0.0, -math.inf, self._scans[-1][0]
         for t, surprise, variance in reversed(self._scans):
             # one standard deviation is subtracted, so that scans with the expected likelihood reduce the sum
@@ -188,7 +188,7 @@ SHOWN = 4  # number of groups that a message names
 DIFFERENT = 0.15  # a model is doubted only if the relative error of its predicted reads exceeds this
 TINY = 1e-9  # replaces zero reads in a logarithm
 WINDOW = 15.0  # s; the weight of reads falls to 1/e in this time
-DOUBTED, TRUSTED = 1e-5, 1e-3  # a doubt begins below the first, and ends above the second, p-value of the counts
+DOUBTED, TRUSTED = 1e-5, 1e-3  # p-values of the counts: a doubt begins below DOUBTED and ends above TRUSTED
 # an antenna is dead if at least MANY reads are predicted, and a smaller fraction than NEARLY_NONE is observed
 MANY, NEARLY_NONE = 12.0, 0.05
 KNOWN = BAND / 4.0  # m; scans are only counted if the standard deviation of the position is below this

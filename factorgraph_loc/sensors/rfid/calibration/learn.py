@@ -62,7 +62,7 @@ CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)
 MIN_READS = 100.0  # minimum number of weighted reads for the fit of a model
 COEFFICIENT = "coefficient of "
 VAGUE = 0.5  # a parameter with a larger relative standard error is not determined
-BURSTS = 1.3  # a smaller overdispersion does not change the tempering
+BURSTS = 1.3  # the tempering is not changed for an overdispersion below this
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
 @dataclass(frozen=True)
 class _Focus:
     """The agreement of phases along references as a function of a state (5,): x, y, heading of the survey transform, and x, y of
-    the lever arm. ``reads``: the reads with a phase. ``model``: the model of phases. ``initial``: the survey transform at first."""
+    the lever arm. ``reads``: the reads with a phase. ``model``: the model of phases. ``initial``: the initial survey transform."""
 
     reads: PhaseReads
     model: PhaseModel
