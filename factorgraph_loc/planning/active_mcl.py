@@ -1,12 +1,11 @@
-"""The particle filter of a robot that chooses its paths: ActiveMCL, Algorithm 2 of the paper (Raoui, Bouyakhf, Devy, ICINCO 2011).
+"""The particle filter ActiveMCL of a robot that chooses its paths (Raoui, Bouyakhf, Devy, ICINCO 2011, Algorithm 2).
 
 One step of the algorithm is this. Propose paths. Predict reads along each path, drawn from the antenna model, and the remaining
 entropy. Choose a path and drive it. Update the particles once, by the actual reads. Proposals, predictions and choice are in
 :mod:`~factorgraph_loc.planning.policies`, and the loop is in :mod:`~factorgraph_loc.planning.closed_loop`. The particles are those
 of the search for an unknown pose (:mod:`~factorgraph_loc.fusion.search`) over free space.
 
-The algorithm as printed in the paper is different. Each action has particles of its own, weighted by a scan that was
-not made. The index m denotes both the map and the particle.
+The algorithm as printed is different. Each action has particles of its own, weighted by a scan that was not made.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Policies that choose the path of a robot with an uncertain pose.
 
 ``information`` chooses the path with the largest expected reduction of the belief's entropy, minus the cost of its
-length. ``paper_literal`` has the opposite sign, as printed in the paper, and prefers the least informative path.
-``random``, ``patrol`` and ``nearest_tags`` are for comparison.
+length. ``paper_literal`` has the opposite sign, as printed by Raoui, Bouyakhf and Devy (ICINCO 2011). It prefers the
+least informative path. ``random``, ``patrol`` and ``nearest_tags`` are for comparison.
 
 All policies get the same candidates. These are paths whose first metre is free according to the proximity sensor, and a
 turn in place unless the robot has just turned. Only policies that compare candidates use paths to distant places.

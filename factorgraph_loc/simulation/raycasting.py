@@ -2,7 +2,7 @@
 
 For a camera position, each of :data:`BINS` horizontal directions has a list of the faces that a ray may hit, nearest first. A
 texture has several mip levels, each with half the resolution of the previous one. A texture on an oblique surface is sampled at
-several places along the slant, in the mip level whose texels have about the distance of these places.
+several places along the slant, in the mip level with texels about as far apart as these places.
 
 Functions that are called for each ray are inlined. Otherwise numba's reference counting of arrays would double the run time.
 """

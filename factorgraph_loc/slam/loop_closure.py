@@ -1,6 +1,6 @@
 """Loop closure without a map: recognition of points of the graph that were last observed long ago.
 
-About once a second an image is compared with those of the old points that may be visible. Features are matched without
+About once a second, an image is compared with the old points that may be visible in it. Features are matched without
 a predicted pose (Associator.relocalized of :mod:`factorgraph_loc.vision.association`). The resulting pose must be on
 the floor. The points are matched again with this pose as the prediction. Enough of the visible points must match, in
 all parts of the image. Places in a building resemble each other. Therefore the poses of consecutive images must agree

@@ -1,6 +1,6 @@
 """The motion model of the monoSLAM filter. Odometry predicts x, y and heading; the floor bounds height, roll and pitch.
 
-The state is that of Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on
+The state is as in Davison, Reid, Molton, Stasse, "MonoSLAM: real-time single camera SLAM", IEEE Transactions on
 Pattern Analysis and Machine Intelligence 29(6), 2007. The error state has 12 values. The first six are rotation (3,)
 and translation (3,) of the pose in the robot's frame, as in ``gtsam.Pose3``. The velocity (3,) in the world frame and
 the turn rate (3,) in the robot's frame follow.

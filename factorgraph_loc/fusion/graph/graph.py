@@ -281,7 +281,7 @@ class Graph:
 
     def value(self, name: str, default: Array | None = None) -> Array:
         """The estimate of the constants or the landmark with this name. If it is not in the graph, ``default`` is
-        returned, or KeyError is raised if that is None."""
+        returned, or KeyError is raised if it is None."""
         if default is not None and name not in self.keys:
             return default
         return self.values[self.keys[name]]
