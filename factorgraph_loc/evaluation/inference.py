@@ -208,7 +208,7 @@ def rank_biserial(differences: Array) -> float:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Correct p values for the number of tests by Holm's method. None stands for a comparison that is not tested."""
+    """Correct ``p_values`` for the number of tests by Holm's method. A value of None (no test) is not counted."""
     tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0

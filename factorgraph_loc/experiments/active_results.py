@@ -56,7 +56,7 @@ def runs_of(rows: Sequence[Row], case: Case, policy: str) -> list[Row]:
 
 
 def metres(rows: Sequence[Row]) -> Array:
-    """Return the distances (N,) [m] that robots drove until they were localized. Infinite if a robot was not localized."""
+    """Return the distances (N,) [m] that robots drove until they were localized, infinite if they never were."""
     return np.array([row["metres"] if row.get("localized") else math.inf for row in rows], dtype=float)
 
 

@@ -275,7 +275,7 @@ def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Exp
 
 
 def _change(content: dict[str, Any], key: str, value: Any, source: object) -> None:
-    """Set the value of a dotted key in the content of a file; see :func:`read_experiment`."""
+    """Set the value of a dotted key in the content of a file; see :func:`read_experiment`. ``source``: for messages."""
     first, _, rest = key.partition(".")
     if first in Experiment.model_fields:
         set_key(content, key, value, source)

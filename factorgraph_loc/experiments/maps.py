@@ -281,7 +281,7 @@ def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _uses_reference(options: MapOptions, *, has_reference: bool) -> bool:
-    """True if a map of tags is made with the poses of the reference. ``has_reference``: whether the log has a reference."""
+    """True if a map of tags uses the poses of the reference. ``has_reference``: whether the log has a reference."""
     if options.poses not in (None, "reference", "odometry"):
         raise InputError(f"--poses is {quoted(options.poses)}, expected reference or odometry")
     return has_reference if options.poses is None else options.poses == "reference"

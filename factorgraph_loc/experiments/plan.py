@@ -170,7 +170,7 @@ def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
 
 
 def _check_count(count: int, experiment: Experiment) -> None:
-    """Raise InputError if a number of runs is too large."""
+    """Raise InputError if ``count``, the number of runs of the ``experiment``, is above :data:`MOST_RUNS`."""
     if count > MOST_RUNS:
         raise InputError(f"the experiment {experiment.name} plans more than {MOST_RUNS:,} runs")
 

@@ -61,7 +61,7 @@ def evaluate(
     processed on one thread. ``progress`` is called after each image.
     """
     with _one_thread():
-        what.find(sequence.first)  # compilation and allocation at first use are not part of the measured time
+        what.find(sequence.first)  # the first call takes longer, and is not measured
         keypoints, descriptors = what.find(sequence.first)
         progress()
         for k, (image, homography) in enumerate(zip(sequence.others, sequence.homographies, strict=True)):

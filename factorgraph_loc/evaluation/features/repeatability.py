@@ -99,7 +99,8 @@ def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Can
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
-    """Return for each image a mask of the points that lie inside the other image too."""
+    """Return for each image a mask of the points that lie inside the other image. Arguments: see
+    :func:`repeatability`."""
     back = invert(homography)
     return (
         inside(project(homography, first.points), shapes[1]),

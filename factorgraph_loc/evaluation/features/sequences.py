@@ -207,7 +207,7 @@ def warped(photograph: Image, source: Path) -> list[Sequence]:
 
 
 def _zoomed(photograph: Image, name: str) -> Sequence:
-    """Return the sequence of reduced photographs."""
+    """Return the sequence ``name`` of images of the ``photograph`` that are reduced by :data:`ZOOMS`."""
     height, width = photograph.shape[:2]
     images, homographies = [], []
     for zoom in ZOOMS:
@@ -225,7 +225,7 @@ def _zoomed(photograph: Image, name: str) -> Sequence:
 
 
 def _rotated(photograph: Image, name: str) -> Sequence:
-    """Return the sequence of rotated photographs."""
+    """Return the sequence ``name`` of images of the ``photograph`` that are rotated by :data:`ROTATIONS`."""
     height, width = photograph.shape[:2]
     side = int(min(height, width) / np.sqrt(2.0))
     centre, middle = np.array((width - 1.0, height - 1.0)) / 2.0, (side - 1.0) / 2.0

@@ -132,7 +132,7 @@ def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list
 
 
 def _toml(content: Any) -> Any:
-    """Return nested ``content`` without its None values, which TOML cannot represent."""
+    """Return nested ``content`` without the values that are None, because TOML has no such value."""
     if isinstance(content, Mapping):
         return {str(key): _toml(value) for key, value in content.items() if value is not None}
     if isinstance(content, list | tuple):
