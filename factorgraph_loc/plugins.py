@@ -94,6 +94,7 @@ PRESETS = {  # simulated worlds, with their descriptions
     "office": "Rooms on both sides of a corridor, doors, furniture; tags on walls and furniture.",
     "sparse": "The world of office with fewer tags.",
     "bursty": "The world of office; each antenna loses each tag a fifth of the time, for 2 s on average.",
+    "gates": "The world of office without tags in the map; antennas at its doors read two tags on the robot.",
     "corridor": "One corridor that is the same from both ends; tags at equal distances on both sides.",
     "warehouse": "Rows of shelves with tags.",
     "symmetric": "Corridors in the shape of an H with a half-turn symmetry; three tags hang in them.",

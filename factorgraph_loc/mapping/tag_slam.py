@@ -88,9 +88,10 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
     read_tags = {epc for scan in scans for epc in scan.tags}
     if not read_tags:
         raise InputError(f"{log.name}: has no reads of tags (rfid), so there is nothing to map")
-    if log.rig.find(RfidSettings) is None:
+    settings = log.rig.find(RfidSettings)
+    if settings is None or settings.tags:
         raise InputError(
-            f"{log.name}: its rig has no section [rfid]: add it with the antennas and their detection model"
+            f"{log.name}: its rig has no antennas: add [rfid.antennas] with their mounting and detection model"
         )
     antennas = {name: i for i, name in enumerate(log.rig.of(RfidSettings).all_antennas())}
     model = log.rig.of(RfidSettings).model()

@@ -160,7 +160,7 @@ def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
         sensor
         for sensor in sensors().values()
         if any(channel.name == kind_of(name) for channel in sensor.channels for name in names)
-        and (sensor.locates or (sensor.detects and getattr(world, sensor.detects, None)))
+        and (sensor.locates or any(getattr(world, layer, None) for layer in (sensor.detects, *sensor.layers)))
     ]
 
 

@@ -41,6 +41,8 @@ class WorldSettings(FileModel):
     """height of the tags that are not on the floor"""
     even: bool = False
     """whether tags are at equal distances along the walls, symmetric on both sides, rather than at random"""
+    antennas: Annotated[int, Field(ge=0, le=1000)] = 0
+    """number of fixed RFID antennas at doors and on walls, which read the tags on the robot"""
     landmarks: Annotated[int, Field(ge=0, le=10_000)] = 0
     """number of landmarks on the walls"""
     points: Annotated[int, Field(ge=0, le=10_000)] = 0
@@ -53,6 +55,9 @@ class WorldSettings(FileModel):
         if self.tag_count() > MOST_TAGS:
             raise ValueError(f"density results in {self.tag_count():,} tags, expected at most {MOST_TAGS:,}")
         return self
+
+    def antenna_names(self) -> list[str]:
+        return [f"A{i:03d}" for i in range(self.antennas)]
 
     def tag_count(self) -> int:
         if self.tags is not None:
@@ -210,10 +215,21 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return out
 
 
+# two tags on the robot, one facing to the front and one to the back
+_CARRIED: Mapping[str, Any] = {
+    "front": {"x": 0.25, "z": 1.2, "facing": 0.0},
+    "back": {"x": -0.25, "z": 1.2, "facing": 3.1415},
+}
+_READER: Mapping[str, Any] = {key: value for key, value in RACKHAM_RIG["rfid"].items() if not key.startswith("preset")}
+
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "office": _OFFICE,
     "sparse": merged(_OFFICE, {"world": {"tags": 15}}),
     "bursty": merged(_OFFICE, _BURSTY),
+    "gates": {
+        "world": {"plan": "office", "tags": 0, "antennas": 16},
+        "rig": {**RACKHAM_RIG, "rfid": {**_READER, "tags": _CARRIED}},
+    },
     "corridor": merged(
         _OFFICE,
         {"world": {"plan": "hall", "width": 40.0, "depth": 3.0, "tags": 20, "surfaces": ["wall"], "even": True}},

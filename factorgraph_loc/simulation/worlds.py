@@ -12,6 +12,7 @@ from factorgraph_loc.maps.points import PointMap
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.landmarks.measurement import Landmark
 from factorgraph_loc.sensors.rfid.map import Tag
+from factorgraph_loc.sensors.rfid.settings import FixedAntenna
 from factorgraph_loc.simulation.settings import WorldSettings
 from factors.se2 import Array
 
@@ -204,10 +205,21 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     return World(
         name=settings.plan,
         tags=tags,
+        antennas=_antennas(plan, walls, settings, rng),
         landmarks={f"L{i:03d}": Landmark(x=x, y=y) for i, (x, y) in enumerate(landmarks)},
         points=_points(plan, walls, boxes, settings.points, rng) if settings.points else None,
         walls=tuple((a, b, c, d) for a, b, c, d in plan.segments().round(3).tolist()),
     )
+
+
+def _antennas(plan: Plan, walls: Array, settings: WorldSettings, rng: np.random.Generator) -> dict[str, FixedAntenna]:
+    """Return the fixed antennas by name. The first ones are in the middle of the doors, half of them facing to each side of their
+    door. The rest are on walls. Their height is that of the tags."""
+    doors = np.array([both_sides(door)[side] for side in (0, 1) for door in plan.doors]).reshape(-1, 4)
+    at_doors = _places(doors[: settings.antennas], np.full(min(len(doors), settings.antennas), 0.5))
+    places = np.concatenate((at_doors, _distribute(plan, walls, settings.antennas - len(at_doors), rng))).round(4)
+    antennas = [FixedAntenna.bounded(x=x, y=y, z=settings.tag_height, yaw=yaw) for x, y, yaw in places.tolist()]
+    return dict(zip(settings.antenna_names(), antennas, strict=True))
 
 
 def _distribute(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:

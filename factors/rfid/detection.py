@@ -20,16 +20,17 @@ from numpy.typing import NDArray
 from factors.rfid import kernels, tag_states, weighing
 from factors.rfid.index import Counts, MapTags, moved, tag_index
 from factors.rfid.model import Packed, RfidModel
+from factors.rfid.mounting import reach_of
 from factors.rfid.parameters import adjusted
-from factors.rfid.places import Places, RobotTables, antennas_of, in_reach, is_wide, robot_tables
+from factors.rfid.places import BY_ANTENNA, PLACED, Places, RobotTables, antennas_of, in_reach, is_wide, robot_tables
 from factors.rfid.tables import Tables, make_tables
 from factors.se2 import Array, Integers
 
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
-    """T tags of a map. ``points`` (T, 3) [m]: positions in the world. ``facing`` (T,) [rad]: the direction that each
-    tag faces, NaN if it is unknown."""
+    """T tags of a map, or on a robot. ``points`` (T, 3) [m]: positions in the world, or in the robot frame. ``facing`` (T,) [rad]:
+    the direction that each tag faces, NaN if it is unknown."""
 
     points: Array
     facing: Array
@@ -166,7 +167,8 @@ class ExpectedReads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of read counts as a function of the robot's pose, for given antennas and a map of tags.
+    """The likelihood of read counts as a function of the robot's pose, for given antennas and tags. ``tags``: those of the map. If
+    the antennas of the ``model`` are fixed in the world, those on the robot.
 
     ``parameters`` (Q,): adjustments of detection models, mounting and clock (:mod:`factors.rfid.parameters`), zero at
     first. With M detection models and A antennas, Q is 2 M + A + 2.
@@ -199,9 +201,9 @@ class RfidLikelihood:
         return out
 
     def prepare(self) -> None:
-        """Compute the tables of the likelihood of particles now. Otherwise the first call of :meth:`log_likelihood`
-        computes them, which delays a running filter."""
-        for name in ("_tables", "_places"):
+        """Compute the tables of the likelihood of particles now. Otherwise the first call of :meth:`log_likelihood` computes
+        them, which delays a running filter."""
+        for name in ("_tables",) if self.model.fixed else ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
     @cached_property
@@ -262,7 +264,8 @@ class RfidLikelihood:
         their time offset, the velocity of the first measurement is used for all measurements.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
-        if parameters is None and not (self.parameters.any() or counts.offsets.any()) and is_wide(poses, self.reach):
+        unchanged = parameters is None and not (self.parameters.any() or counts.offsets.any() or self.model.fixed)
+        if unchanged and is_wide(poses, self.reach):
             return self._unadjusted._places.log_likelihood(poses, counts.packed, self.model.tempering)
         parameters = self.parameters[None] if parameters is None else np.ascontiguousarray(parameters)
         return weighing.log_likelihood(*self._tabled, counts.packed, poses, float(self.model.tempering), parameters)
@@ -283,16 +286,20 @@ class RfidLikelihood:
     def work(self, counts: TagReadCounts) -> int:
         """An estimate of the computing time of :meth:`log_likelihood` per pose, if the poses are far apart: about the
         number of tags to evaluate."""
+        if self.model.fixed:
+            return PLACED + BY_ANTENNA * len(counts.antennas) * len(self.tags.points)
         return self._unadjusted._places.work(counts.packed)
 
     @property
     def reach(self) -> float:
         """The largest distance [m] from the robot's origin at which an antenna can read a tag."""
-        return kernels.reach_of(self.packed, np.zeros((0, 3)))
+        return reach_of(self.packed, np.zeros((0, 3)))
 
     @cached_property
     def reached(self) -> float:
-        """The mean number of tags in reach of a random pose in the area of the map's tags."""
+        """The mean number of tags in reach of a random pose in the area of the map's tags. All tags of a robot are in reach."""
+        if self.model.fixed:
+            return float(len(self.tags.points))
         return in_reach(self.tags.points[:, :2], self._unadjusted.reach)
 
     @cached_property

@@ -9,16 +9,16 @@ semi-definite. Derivatives are by the body-frame perturbation of the pose, by th
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.compiled import compiled
 from factors.rfid.index import Counts, MapTags, delayed, moved, near_tags
 from factors.rfid.model import NEGLIGIBLE_LOGIT, Packed, logit
+from factors.rfid.mounting import place_measurements, placed, reach_of
 from factors.rfid.parameters import MOST_CERTAIN, adjusted
 from factors.se2 import Array, Integers
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}  # fast-math flags that keep infinities
-ROW = 8  # numbers per antenna in the result of `_place_antennas`
+ROW = 8  # numbers per antenna in the result of `place_measurements`
 OF_READ, PLACE = 5, 7  # numbers of derivatives of one read probability, without and with the two by the tag's position
 MOST_COLUMNS = 8  # largest number of components of pose and parameters that one measurement depends on
 
@@ -39,24 +39,12 @@ def tag_logit(
 
 
 @compiled(inline="always")
-def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float, float, float]:
-    """The antenna's x, y, cosine and sine of its heading in the world, and the cosine and sine of the robot's heading.
-    The robot is at ``offset`` (3,) in the frame of ``pose`` (3,)."""
-    c0, s0 = math.cos(pose[2]), math.sin(pose[2])
-    x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
-    c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
-    a = packed.antennas[antenna]
-    x, y = x + c * a[0] - s * a[1], y + s * a[0] + c * a[1]
-    return x, y, c * a[3] - s * a[4], s * a[3] + c * a[4], c, s
-
-
-@compiled(inline="always")
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float, float]:
-    """The logit of one tag for an antenna at (x, y) with horizontal boresight (c, s) in the world. Also returns its derivatives by
-    the tag's position along and across the boresight, by the antenna's heading, and by the logarithm of the model's range.
-    ``point`` (3,), ``normal`` (2,): the tag's position and facing in the world. The logit is constant beyond the reach."""
+    """The logit of one tag for an antenna at (x, y) with horizontal boresight (c, s) in the frame of the tags. Also returns its
+    derivatives by the tag's position along and across the boresight, by the antenna's heading, and by the logarithm of the model's
+    range. ``point`` (3,), ``normal`` (2,): the tag's position and facing in that frame. The logit is constant beyond the reach."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey
@@ -86,36 +74,6 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
     # without false reads, a probability p may be 0 or 1, so that log(p) or log(1 - p) is infinite
     q = min(max(packed.false_read + by_rate, 1e-12), 1.0 - 1e-12)
     return q, by_rate * (1.0 - sigmoid), by_rate
-
-
-@compiled
-def reach_of(packed: Packed, offsets: Array) -> float:
-    """The largest distance [m] from the reference pose at which a tag can be read. ``offsets`` (K, 3): the robot's
-    poses at the measurements, in the frame of the reference pose."""
-    offset = farthest = 0.0
-    for k in range(len(offsets)):
-        offset = max(offset, math.hypot(offsets[k, 0], offsets[k, 1]))
-    for a in range(len(packed.which)):
-        lever = math.hypot(packed.antennas[a, 0], packed.antennas[a, 1])
-        farthest = max(farthest, packed.reach[packed.which[a]] + lever)
-    return offset + farthest
-
-
-@compiled(inline="always")
-def _place_antennas(packed: Packed, pose: Array, offsets: Array, antennas: NDArray[np.int64], out: Array) -> float:
-    """Write the antenna of each measurement, at ``offsets`` (K, 3) from ``pose``, into ``out`` (K, 8): position and
-    boresight in the world, then boresight and position in the frame of the pose. Returns the reach [m] from
-    ``pose``."""
-    farthest = 0.0
-    for k in range(len(antennas)):
-        a = packed.antennas[antennas[k]]
-        out[k, 0], out[k, 1], out[k, 2], out[k, 3], _, _ = placed(packed, antennas[k], pose, offsets[k])
-        co, so = math.cos(offsets[k, 2]), math.sin(offsets[k, 2])
-        out[k, 4], out[k, 5] = co * a[3] - so * a[4], so * a[3] + co * a[4]
-        out[k, 6], out[k, 7] = offsets[k, 0] + co * a[0] - so * a[1], offsets[k, 1] + so * a[0] + co * a[1]
-        reach = packed.reach[packed.which[antennas[k]]]
-        farthest = max(farthest, math.sqrt(out[k, 6] ** 2 + out[k, 7] ** 2) + reach)
-    return farthest
 
 
 @compiled(inline="always")
@@ -184,7 +142,7 @@ def _add_tag(
     Writes, for each measurement, the derivative ``slope`` (K,) by the read probability and the Fisher information ``curve`` (K,) on
     that probability, both 0 out of reach. Writes the derivatives ``by`` (K, 7) of the probability by the antenna's position in the
     frame of the pose (2), its yaw, the parameters ``a`` and ``b`` of its model, and the tag's position in the world (2). ``at``:
-    the result of :func:`_place_antennas`. ``far``: the result of :func:`_unread`.
+    the result of :func:`place_measurements`. ``far``: the result of :func:`_unread`.
     """
     nll = mean = variance = 0.0
     for k in range(len(antennas)):
@@ -229,8 +187,11 @@ def _add_measurement(
     """
     own, by, count = np.empty(MOST_COLUMNS, np.int64), np.zeros((MOST_COLUMNS, OF_READ)), 3
     own[0], own[1], own[2] = 0, 1, 2
-    by[0, 0] = by[1, 1] = by[2, 2] = 1.0
-    by[2, 0], by[2, 1] = -at[7], at[6]
+    way = (
+        -1.0 if packed.fixed else 1.0
+    )  # a motion of the robot moves fixed antennas the opposite way in the robot frame
+    by[0, 0] = by[1, 1] = by[2, 2] = way
+    by[2, 0], by[2, 1] = -way * at[7], way * at[6]
     model, turn = 2 * packed.which[antenna], 2 * len(packed.reach)
     for place, local in ((model, 3), (model + 1, 4), (turn, 2), (turn + 1 + antenna, 2)):
         if columns[place] >= 0:
@@ -238,9 +199,9 @@ def _add_measurement(
             count += 1
     if columns[-1] >= 0:
         c, s = math.cos(offset[2]), math.sin(offset[2])
-        own[count], by[count, 2] = columns[-1], twist[2]
-        by[count, 0] = c * twist[0] - s * twist[1] - twist[2] * (at[7] - offset[1])
-        by[count, 1] = s * twist[0] + c * twist[1] + twist[2] * (at[6] - offset[0])
+        own[count], by[count, 2] = columns[-1], way * twist[2]
+        by[count, 0] = way * (c * twist[0] - s * twist[1] - twist[2] * (at[7] - offset[1]))
+        by[count, 1] = way * (s * twist[0] + c * twist[1] + twist[2] * (at[6] - offset[0]))
         count += 1
     for a in range(count):
         row = np.zeros(OF_READ)
@@ -280,7 +241,7 @@ def scores(
     at, by, slope, curve = np.empty((scans, ROW)), np.empty((scans, PLACE)), np.empty(scans), np.empty(scans)
     pulls, curves = np.empty((scans, OF_READ)), np.empty((scans, OF_READ, OF_READ))
     for n in range(count):
-        farthest = _place_antennas(packed, poses[n], offsets, antennas, at)
+        farthest = place_measurements(packed, poses[n], offsets, antennas, at)
         # the tags that are not near any pose are out of reach and not read
         beyond = len(of_map.points) - tags
         e_sum = mean_sum = variance_sum = 0.0
@@ -351,7 +312,7 @@ def by_tag(
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
     at, far, by = np.empty((scans, ROW)), _unread(packed, rounds), np.empty((scans, PLACE))
     slope, curve, own = np.empty(scans), np.empty(scans), np.empty(size)
-    _place_antennas(packed, pose, offsets, antennas, at)
+    place_measurements(packed, pose, offsets, antennas, at)
     for t in range(tags):
         nll[t] = _add_tag(packed, at, antennas, rounds, hits[:, t], points[t], normals[t], far, by, slope, curve)[0]
         for k in range(scans):
@@ -374,7 +335,7 @@ def probabilities(
     none = np.zeros(3)
     p, distance = np.empty((len(poses), len(points))), np.empty((len(poses), len(points)))
     for n in range(len(poses)):
-        x, y, c, s, _, _ = placed(packed, antennas[n], poses[n], none)
+        x, y, c, s = placed(packed, antennas[n], poses[n], none)
         rate = packed.rate[packed.which[antennas[n]]]
         for t in range(len(points)):
             z = of_tag(packed, antennas[n], x, y, c, s, points[t], normals[t])[0]

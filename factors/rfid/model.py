@@ -174,18 +174,21 @@ class Packed(NamedTuple):
     rate: Array
     peak: Array
     delay: Array
+    fixed: bool
 
 
 @dataclass(frozen=True)
 class RfidModel:
-    """All antennas of a robot and their detection models. ``false_read``: the read probability of a tag out of range. ``miss``: the
-    probability that a round misses any tag. ``tempering``: the exponent of the likelihood, below 1 if reads are correlated."""
+    """All antennas and their detection models. ``false_read``: the read probability of a tag out of range. ``miss``: the
+    probability that a round misses any tag. ``tempering``: the exponent of the likelihood, below 1 if reads are
+    correlated. ``fixed``: True if the antennas are fixed, at poses in the world frame, and the tags are on the robot."""
 
     antennas: tuple[Antenna, ...]
     models: tuple[DetectionModel, ...]
     false_read: float = 1e-3
     miss: float = 0.0
     tempering: float = 1.0
+    fixed: bool = False
 
     def packed(self) -> Packed:
         """The model as a tuple of arrays for compiled code."""
@@ -215,6 +218,7 @@ class RfidModel:
             np.ones(len(self.models)),
             np.array([model.peak for model in self.models]),
             np.zeros(1),
+            self.fixed,
         )
 
 

@@ -59,4 +59,5 @@ def adjusted(packed: Packed, parameters: Array) -> Packed:
         rate,
         packed.peak,
         parameters[-1:].copy(),
+        packed.fixed,
     )

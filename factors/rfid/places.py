@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from factors.compiled import compiled
 from factors.rfid.index import Counts, MapTags, TagIndex, cells
-from factors.rfid.kernels import FAST, reach_of
+from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, Packed
+from factors.rfid.mounting import reach_of
 from factors.rfid.tables import CELL, LEVEL, NO_MATTER, Array32, Tables, logs_of, row_of
 from factors.rfid.weighing import LEAST, mixed
 from factors.se2 import Array, Integers

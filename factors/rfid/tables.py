@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from factors import se2
 from factors.compiled import compiled
 from factors.rfid import knots
-from factors.rfid.kernels import placed, tag_logit
+from factors.rfid.kernels import tag_logit
 from factors.rfid.model import (
     GRID,
     LOGISTIC,
@@ -23,6 +23,7 @@ from factors.rfid.model import (
     RfidModel,
     logistic_value,
 )
+from factors.rfid.mounting import placed
 from factors.rfid.parameters import MOST_CERTAIN
 from factors.se2 import Array, Integers
 
@@ -218,7 +219,7 @@ def relevant(
     measurements and the data of T tags.
 
     The mask is True for near tags that were read, and for near tags with a relevant read probability in the blocks of
-    the tables. In a dense map this excludes most tags.
+    the tables. In a dense map this excludes most tags. All tags on a robot are relevant.
     """
     offsets, antennas, rounds = measured
     points, _, levels, hits = tags
@@ -232,13 +233,13 @@ def relevant(
         m, antenna, yaw = packed.which[antennas[k]], packed.antennas[antennas[k]], 2 * len(packed.reach)
         yaws = parameters[:, yaw] + parameters[:, yaw + 1 + antennas[k]]
         scattered = turned + np.abs(yaws - yaws[0]).max()
-        x, y, c, s, _, _ = placed(packed, antennas[k], middle, offsets[k])
+        x, y, c, s = placed(packed, antennas[k], middle, offsets[k])
         lever = math.hypot(antenna[0], antenna[1]) + math.hypot(offsets[k, 0], offsets[k, 1])
         small, large = math.exp(-parameters[:, 2 * m].max()), math.exp(-parameters[:, 2 * m].min())
         unit = 0.5 * (small + large)
         least = NO_MATTER * min(packed.peak[m], MOST_CERTAIN) / (tempering * rounds[k] * packed.span)
         for t in range(len(near)):
-            if hits[k, t] > 0 or packed.kinds[m] == LOGISTIC:
+            if hits[k, t] > 0 or packed.kinds[m] == LOGISTIC or packed.fixed:
                 out[k, t] = near[t]
             elif near[t]:
                 ex, ey = points[t, 0] - x, points[t, 1] - y

@@ -32,8 +32,9 @@ from factors import se2
 from factors.compiled import compiled
 from factors.gaussian import cholesky
 from factors.rfid.index import Counts, MapTags, delayed, near_tags
-from factors.rfid.kernels import FAST, reach_of
+from factors.rfid.kernels import FAST
 from factors.rfid.model import Packed
+from factors.rfid.mounting import reach_of
 from factors.rfid.parameters import adjusted
 from factors.rfid.tables import Tables
 from factors.rfid.weighing import FARTHEST_RATIO, fast_exp, mark_near, place_antennas, tags_of_tables, weigh_tag

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from factors.compiled import compiled
 from factors.rfid.index import Counts, MapTags, NearTags, delayed, near_tags
-from factors.rfid.kernels import FAST, reach_of
+from factors.rfid.kernels import FAST
 from factors.rfid.model import LOGISTIC, NEGLIGIBLE_LOGIT, Packed
+from factors.rfid.mounting import reach_of
 from factors.rfid.parameters import MOST_CERTAIN, adjusted
 from factors.rfid.tables import CELL, NEGLIGIBLE, Measured, Tables, Tags, relevant, row_of
 from factors.se2 import Array, Integers
@@ -136,7 +137,8 @@ def place_antennas(
 
     ``poses`` (N, 3), ``parameters`` (N or 1, Q): the robot poses and the parameters of each.
     ``placed`` (Q,): the parameters to which ``packed`` is adjusted. Other yaws must be within 0.5 rad of its yaws.
-    ``at`` (K, 4, N): output, x, y, cosine and sine of the heading of each measurement's antenna in the world.
+    ``at`` (K, 4, N): output, x, y, cosine and sine of the heading of each measurement's antenna in the frame of the
+    tags (:mod:`factors.rfid.mounting`).
     ``models`` (M, 2, N): output, the inverse range scale, and the rate times the span of :class:`~factors.rfid.model.Packed`.
     """
     offsets, antennas, _ = measured
@@ -152,12 +154,18 @@ def place_antennas(
     for k in range(len(antennas)):
         a, (dx, dy, turn) = packed.antennas[antennas[k]], offsets[k]
         c1, s1 = math.cos(turn), math.sin(turn)
-        dx, dy = dx + c1 * a[0] - s1 * a[1], dy + s1 * a[0] + c1 * a[1]
-        c1, s1 = c1 * a[3] - s1 * a[4], s1 * a[3] + c1 * a[4]
+        if not packed.fixed:  # the antenna in the frame of the pose, otherwise the robot
+            dx, dy = dx + c1 * a[0] - s1 * a[1], dy + s1 * a[0] + c1 * a[1]
+            c1, s1 = c1 * a[3] - s1 * a[4], s1 * a[3] + c1 * a[4]
         x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
         for n in range(len(poses)):
             x[n], y[n] = poses[n, 0] + cosine[n] * dx - sine[n] * dy, poses[n, 1] + sine[n] * dx + cosine[n] * dy
             c[n], s[n] = cosine[n] * c1 - sine[n] * s1, sine[n] * c1 + cosine[n] * s1
+        if packed.fixed:
+            for n in range(len(poses)):
+                ex, ey = a[0] - x[n], a[1] - y[n]
+                x[n], y[n] = c[n] * ex + s[n] * ey, c[n] * ey - s[n] * ex
+                c[n], s[n] = c[n] * a[3] + s[n] * a[4], c[n] * a[4] - s[n] * a[3]
         if len(parameters) == len(poses):
             own, reference = yaw + 1 + antennas[k], placed[yaw] + placed[yaw + 1 + antennas[k]]
             for n in range(len(poses)):

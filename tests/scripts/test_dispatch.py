@@ -28,7 +28,7 @@ KEPT = {
     "experiments/maps.py": (1, "the word says whether poses are given or estimated, not which sensor there is"),
     "model/measurement.py": (1, "streams are joined that are of one type, whichever that is"),
     "simulation/filming.py": (1, "who renders images makes the stream of them"),
-    "simulation/settings.py": (2, "presets are rigs, as files would say them"),
+    "simulation/settings.py": (4, "presets are rigs, as files would say them"),
     "slam/monoslam_sighting.py": (
         3,
         "monoSLAM is made of one sensor, and asks which of the camera's channels are used",

@@ -42,13 +42,15 @@ SENSOR = SensorType(
             read="factorgraph_loc.sensors.rfid.map:read_layer",
             write="factorgraph_loc.sensors.rfid.map:write_layer",
             suffix=".tags.csv",
-        )
+        ),
+        "antennas": Layer("factorgraph_loc.sensors.rfid.settings:FixedAntenna"),
     },
     detects="tags",
     bind="factorgraph_loc.sensors.rfid.sensor:bind",
     summarize="factorgraph_loc.sensors.rfid.summary:summarize",
     review="factorgraph_loc.sensors.rfid.summary:review",
-    draw="factorgraph_loc.sensors.rfid.summary:draw",
+    check="factorgraph_loc.sensors.rfid.installation:check",
+    draw="factorgraph_loc.sensors.rfid.installation:draw",
     simulation={
         "rssi": Section("factorgraph_loc.sensors.rfid.simulation:SimulatedRssiSettings"),
         "phase": Section("factorgraph_loc.sensors.rfid.simulation:SimulatedPhaseSettings"),

@@ -79,12 +79,12 @@ MARGIN = 1.0  # m; largest distance of the robot from the bounding box of walls 
 MARGIN_OF_TAGS = 3.0  # m; largest distance of the robot from the bounding box of the tags if there are no walls
 
 
-def extent(world: World, tags: TagArray) -> Array:
-    """Return the area where the robot may be, as lower and upper corner (2, 2) [m]: the bounding box of walls and tags
-    with a margin. Both corners are zero without walls and tags."""
+def extent(world: World, places: Array) -> Array:
+    """Return the area where the robot may be, as lower and upper corner (2, 2) [m]: the bounding box of walls and ``places`` (N,
+    2) with a margin. ``places`` are the tags of the map or the fixed antennas. Both corners are zero without walls and places."""
     ends = np.array(world.walls).reshape(-1, 2)
     margin = MARGIN if len(ends) else MARGIN_OF_TAGS
-    points = np.concatenate((ends, tags.points[:, :2])) if len(tags.points) else ends
+    points = np.concatenate((ends, places))
     if not len(points):
         return np.zeros((2, 2))
     return np.array((points.min(axis=0) - margin, points.max(axis=0) + margin))
@@ -111,6 +111,7 @@ class TagEvidence:
 
 class KnownTags:
     """Turns scans into read counts of the map's tags. Unknown tags and antennas are counted as ignored in the diagnostics.
+    ``setup``: the result of :func:`~factorgraph_loc.sensors.rfid.installation.installed`.
 
     It also estimates the ``states`` of the tags. A read shows that a tag is not dead. All other evidence of a scan requires a
     known pose (:meth:`weigh_states`, :meth:`learn`). Tags that are probably dead, weak or moved are listed in the diagnostics.
@@ -124,14 +125,24 @@ class KnownTags:
         model, self.trust = settings.model(), trust(self.map.sigmas)
         self._tempering = model.tempering
         self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
-        self.states = TagStates(len(self.map.names), settings.dead_tags, settings.weak_tags, settings.moved_tags)
+        moved = 0.0 if model.fixed else settings.moved_tags  # a tag on the robot is where the rig has it
+        self.states = TagStates(len(self.map.names), settings.dead_tags, settings.weak_tags, moved)
+        self._sources = (
+            ("map", "on the robot") if model.fixed else ("rig", "in the map")
+        )  # of the antennas and of the tags
         self._excluded: set[int | None] = set()  # indices of antennas that are dead
         self._waiting: deque[tuple[float, Integers, Array]] = deque()  # evidence of reads younger than CONFIRMED
 
     @property
     def antennas(self) -> Sequence[str]:
-        """The names of the rig's antennas."""
+        """The names of the antennas."""
         return list(self._antennas)
+
+    @property
+    def surveyed(self) -> Array:
+        """The positions (N, 2) [m] of the tags of the map, or of the fixed antennas."""
+        model = self.likelihood.model
+        return np.array([(a.x, a.y) for a in model.antennas]) if model.fixed else self.map.tags.points[:, :2]
 
     def exclude(self, antenna: int) -> str:
         """Ignore the rounds of a dead antenna until it reads a tag. Returns its name."""
@@ -161,7 +172,7 @@ class KnownTags:
         if -1 in rows:
             lacking = sum(name not in self._antennas for name in m.antennas)
             if lacking:
-                diagnostics.ignore("antenna that the rig lacks", lacking)
+                diagnostics.ignore(f"antenna that the {self._sources[0]} lacks", lacking)
             if rows.count(-1) > lacking:
                 diagnostics.ignore("dead antenna", rows.count(-1) - lacking)
         if not len(used) or not self.map.names:
@@ -176,7 +187,7 @@ class KnownTags:
             elif rows[number] >= 0:
                 reads.append((rows[number], place))
         if unknown:
-            diagnostics.ignore("tag not in the map", unknown)
+            diagnostics.ignore(f"tag not {self._sources[1]}", unknown)
         at, places = np.array(reads, dtype=np.int64).reshape(-1, 2).T
         self.states.hear(m.t, np.unique(places))
         self._report_suspects()

@@ -12,6 +12,7 @@ import numpy as np
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.model.settings import NOTHING, Estimated
 from factorgraph_loc.sensors.base import Binding, Sensor, Term, View
+from factorgraph_loc.sensors.rfid.installation import installed
 from factorgraph_loc.sensors.rfid.known_tags import STANDING, KnownTags, TagEvidence, TagSignals, extent
 from factorgraph_loc.sensors.rfid.monitor import (
     DURATION,
@@ -22,6 +23,7 @@ from factorgraph_loc.sensors.rfid.monitor import (
     ScanMonitor,
     SilenceMonitor,
 )
+from factorgraph_loc.sensors.rfid.settings import RfidSettings
 from factorgraph_loc.sensors.rfid.stream import RfidScan
 from factors import positive
 from factors.graph import Factor
@@ -138,7 +140,7 @@ class TagSensor(Sensor):
         self.tags = KnownTags(setup, diagnostics)
         self.tags.likelihood.prepare()
         self.work = SCAN + round(self.tags.likelihood.reached)
-        self.bounds = extent(setup.world, self.tags.map.tags)
+        self.bounds = extent(setup.world, self.tags.surveyed)
         self._diagnostics = diagnostics
         self._signals = TagSignals(setup, self.tags)
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
@@ -312,15 +314,21 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength
-    or phase, but the rig has no model of it."""
+    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength or phase,
+    but the rig has no model of it or no antennas."""
     settings, sensors = binding.setup.rig.rfid, binding.setup.sensors
     signals = [signal for signal in ("rssi", "phase") if signal in sensors]
+    if settings is not None and settings.tags and signals:
+        raise InputError(
+            f"the sensor {signals[0]} needs antennas on the robot, but the rig has [rfid.tags]: leave it out of --sensors"
+        )
     for signal in signals:
         if getattr(settings, signal, None) is None:
             raise InputError(f"the rig has no [rfid.{signal}]: add it, or do not use the sensor {signal}")
     if settings is None or TagSensor.modality not in sensors:
         return None
     # strength and phase use the mounting of the rig, so reads must not estimate another mounting
+    setup = installed(binding.setup)
+    settings = setup.rig.of(RfidSettings)
     constants = NOTHING if binding.calibration == "none" else settings.estimated(mounting=not signals)
-    return TagSensor(binding, constants)
+    return TagSensor(replace(binding, setup=setup), constants)

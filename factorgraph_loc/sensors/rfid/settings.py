@@ -129,6 +129,28 @@ class AntennaSettings(FileModel):
     """name of the antenna's detection model in models"""
 
 
+class FixedAntenna(AntennaSettings):
+    """Pose and detection model of an antenna that is fixed in the building, in the map."""
+
+    x: Coordinate
+    """position of the antenna"""
+    y: Coordinate
+    """position of the antenna"""
+
+
+class CarriedTag(FileModel):
+    """Mounting of a tag on the robot, which fixed antennas read."""
+
+    x: Offset = 0.0
+    """position of the tag, forward"""
+    y: Offset = 0.0
+    """position of the tag, to the left"""
+    z: Offset = 0.0
+    """height of the tag"""
+    facing: Angle | None = None
+    """direction of the tag's front; left is positive"""
+
+
 class RssiSettings(FileModel):
     """A model of the signal strength of reads. See :class:`factors.rfid.signals.RssiModel`."""
 
@@ -197,7 +219,7 @@ def default_models() -> dict[str, BeamSettings | LogisticSettings | GridSettings
 
 
 class RfidSettings(SensorSettings):
-    """An RFID reader. Its antennas are given either by ``antennas`` or by a ``preset``."""
+    """An RFID reader: ``antennas`` on the robot, a ``preset`` of them, or ``tags`` on the robot for the antennas of the map."""
 
     preset: Literal["rackham"] | None = None
     """replaces antennas; rackham has eight antennas around the body, named 1 to 8 counter-clockwise from the front"""
@@ -205,6 +227,8 @@ class RfidSettings(SensorSettings):
     """height of the antennas of the preset"""
     antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
     """antennas by the names that the reads give"""
+    tags: dict[str, CarriedTag] = Field(default_factory=dict)
+    """instead of antennas: tags on the robot by EPC, which the antennas of the map read"""
     models: dict[str, ModelSettings] = Field(default_factory=default_models)
     """detection models of antennas by name; the default is a beam"""
     false_read: Share = 1e-3
@@ -230,8 +254,8 @@ class RfidSettings(SensorSettings):
 
     @model_validator(mode="after")
     def _is_complete(self) -> RfidSettings:
-        if (self.preset is None) == (not self.antennas):
-            raise ValueError("expected either antennas or a preset")
+        if (self.preset is not None) + bool(self.antennas) + bool(self.tags) != 1:
+            raise ValueError("expected one of antennas, a preset, and tags on the robot")
         for name, antenna in self.all_antennas().items():
             if antenna.model not in self.models:
                 raise ValueError(
@@ -292,6 +316,7 @@ class RfidSettings(SensorSettings):
             false_read=self.false_read,
             miss=self.miss,
             tempering=self.tempering,
+            fixed=bool(self.tags),
         )
 
 

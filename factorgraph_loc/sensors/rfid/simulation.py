@@ -14,6 +14,7 @@ from factorgraph_loc.model.rig import Rig
 from factorgraph_loc.model.settings import Duration, Metres, Share
 from factorgraph_loc.model.world import World
 from factorgraph_loc.sensors.interfaces import Ride, Simulated
+from factorgraph_loc.sensors.rfid.installation import installed, is_fixed
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.map import Tag
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings, Weight
@@ -253,8 +254,9 @@ def phases(
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the reads of a simulated drive with all faults, the surveyed map, and metadata that lists dead and
-    misplaced tags."""
+    """Return the reads of a simulated drive with all faults, the surveyed map, and metadata that lists dead and misplaced
+    tags."""
+    world, ride = ride.world, installed(ride)
     settings, rfid, rng = ride.settings, ride.rig.of(RfidSettings), ride.rng("reads")
     tags = tag_map(ride.world, ride.rig.of(SurveySettings))
     times = ride.times(settings.rounds_per_second)
@@ -270,7 +272,7 @@ def simulate(ride: Ride) -> Simulated:
         signals["phase"] = phases(rfid, tags.tags, poses, settings.phase, ride.rng("phases"))
         signals["frequency"] = np.full(hits.shape, settings.phase.frequency)
     stream = rfid_stream(names, epcs, times, hits, settings.faults, signals)
-    surveyed, misplaced = _surveyed(ride.world.tags, settings.faults, ride.rng_of_world("survey"))
+    surveyed, misplaced = _surveyed(world.tags, settings.faults, ride.rng_of_world("survey"))
     metadata = {}
     if len(dead):
         metadata["dead"] = ", ".join(epcs[i] for i in sorted(dead.tolist()))
@@ -284,12 +286,19 @@ def looks(settings: Any) -> dict[str, float]:
     RFID reader, or if a fault names an unknown antenna."""
     if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no section [rfid], expected one with antennas")
-    stop, names = settings.faults.antenna_stop, list(settings.rig.of(RfidSettings).all_antennas())
+    rfid, fixed = settings.rig.of(RfidSettings), settings.world.antenna_names()
+    if bool(rfid.tags) != bool(fixed):
+        raise ValueError(
+            "world.antennas and rig.rfid.tags belong together, as in the preset gates: expected both or neither of them"
+        )
+    if fixed and (settings.rssi is not None or settings.phase is not None):
+        raise ValueError("rssi and phase need antennas on the robot, but world.antennas are fixed: remove them")
+    stop, names = settings.faults.antenna_stop, fixed or list(rfid.all_antennas())
     if stop is not None and stop.antenna not in names:
         raise ValueError(
             f"faults.antenna_stop names the antenna {quoted(stop.antenna)}, expected one of {listed(names)}"
         )
-    return {"tags": settings.rounds_per_second * len(names) * settings.world.tag_count()}
+    return {"tags": settings.rounds_per_second * len(names) * (len(rfid.tags) or settings.world.tag_count())}
 
 
 def _surveyed(
@@ -330,7 +339,10 @@ class SimulatedReader:
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
-    """Return the simulated reader of a rig. Raises InputError if the settings have faults, which it cannot simulate."""
+    """Return the simulated reader of a rig. Raises InputError if the settings have faults or fixed antennas, which are not
+    supported here."""
+    if is_fixed(rig):
+        raise InputError(f"{settings.name}: has antennas in the map, expected antennas on the robot for active runs")
     if settings.faults != FaultSettings():
         raise InputError(f"{settings.name}: has faults, which active runs do not support: remove the section [faults]")
     return SimulatedReader(world, rig, settings.rounds_per_second, rng)

@@ -9,7 +9,7 @@ accounts for this in the variance of all counts (McCullagh and Nelder, "Generali
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,8 +19,9 @@ from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.result import Reliability
 from factorgraph_loc.model.trajectory import Trajectory
-from factorgraph_loc.sensors.interfaces import Ending, Marks, Paragraph, Review, Summary, Use, in_other_case, line
+from factorgraph_loc.sensors.interfaces import Ending, Paragraph, Review, Summary, Use, in_other_case, line
 from factorgraph_loc.sensors.rfid.calibration.rounds import overdispersion
+from factorgraph_loc.sensors.rfid.installation import installed, is_fixed
 from factorgraph_loc.sensors.rfid.known_tags import tag_map
 from factorgraph_loc.sensors.rfid.monitor import BAND, BLOCK, DIFFERENT, FEWEST, POSSIBLE, ReadGroups
 from factorgraph_loc.sensors.rfid.settings import RfidSettings, SurveySettings
@@ -35,7 +36,8 @@ from factors.se2 import Array, Integers, wrap_scalar
 STOPPED = 10.0  # s; an antenna has stopped if its last round is earlier than this before the end
 CLOCK_STEP = 1.0  # s; a larger step back of timestamps, or a larger offset to the odometry, causes a warning
 SHOWN = 5  # number of names that a line or a warning lists
-UNKNOWN_ANTENNA = "antenna {antenna} is not on the rig: {reads} reads, {rounds} rounds"
+UNKNOWN_ANTENNA = "antenna {antenna} is not {place}: {reads} reads, {rounds} rounds"
+IN_MAP, ON_ROBOT = "tags of the map", "tags on the robot"
 
 
 @dataclass(frozen=True)
@@ -75,22 +77,24 @@ class RfidSummary:
 
 def summarize(log: Log) -> Summary:
     """Return a summary with warnings. Its entry ``rfid`` is an :class:`RfidSummary`, or None if the log has no reads."""
-    summary, in_map = summarize_rfid(log), {"tags": len(log.world.tags)}
+    in_map = {"antennas": len(log.world.antennas)} if is_fixed(log.rig) else {"tags": len(log.world.tags)}
+    log = installed(log)
+    summary = summarize_rfid(log)
     if summary is None:
         return Summary({"rfid": None}, in_map)
-    return Summary({"rfid": summary}, in_map, rfid_problems(log, summary), (_paragraph(summary),))
+    return Summary({"rfid": summary}, in_map, rfid_problems(log, summary), (_paragraph(log, summary),))
 
 
-def _paragraph(summary: RfidSummary) -> Paragraph:
+def _paragraph(log: Log, summary: RfidSummary) -> Paragraph:
     unknown = f"{len(summary.unknown)} others" if summary.unknown else "no others"
     header = ("antenna", "reads", "rounds", "rounds per s", "without a read", "last [s]")
     rows = [
         (name, str(a.reads), str(a.rounds), f"{a.rate:.2f}", str(a.silent), f"{a.last:.1f}")
         for name, a in summary.antennas.items()
     ]
+    known = f"{summary.known} {ON_ROBOT if is_fixed(log.rig) else IN_MAP}"
     return Paragraph(
-        f"RFID: {summary.reads} reads of {summary.known} tags of the map and of {unknown}, in {summary.rounds} rounds, "
-        f"{summary.scans} scans",
+        f"RFID: {summary.reads} reads of {known} and of {unknown}, in {summary.rounds} rounds, {summary.scans} scans",
         header,
         tuple(rows),
     )
@@ -134,12 +138,12 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
 
 def rfid_problems(log: Log, summary: RfidSummary) -> list[Notice]:
     """Return warnings about tags, antennas and clock of the reads of a log."""
-    out = list[Notice]()
+    out, fixed = list[Notice](), is_fixed(log.rig)
     if summary.unread:
-        sentence = "{unread} of {tags} tags of the map are never read: {names}"
+        sentence = f"{{unread}} of {{tags}} {ON_ROBOT if fixed else IN_MAP} are never read: {{names}}"
         names = listed(summary.unread, SHOWN)
         out.append(notice("unread_tags", sentence, len(summary.unread), len(log.world.tags), names))
-    if summary.unknown:
+    if summary.unknown and not fixed:  # fixed antennas usually read tags of goods and of other robots too
         reads = sum(summary.unknown.values())
         sentence, names = "{reads} reads are of {tags} tags that the map lacks: {names}", listed(summary.unknown, SHOWN)
         out.append(notice("unknown_tags", sentence, reads, len(summary.unknown), names))
@@ -149,19 +153,22 @@ def rfid_problems(log: Log, summary: RfidSummary) -> list[Notice]:
     if coded := [epc for epc in summary.unknown if text_of_hex(epc) in log.world.tags]:
         sentence = 'reads have the text of tags as hexadecimal digits: {names}: set epc_case = "ascii-hex"'
         out.append(notice("coded_epcs", sentence, listed(coded, SHOWN)))
+    place = "in the map" if fixed else "on the rig"
     carried = log.rig.of(RfidSettings).all_antennas() if log.rig.find(RfidSettings) else {}
     out += [
-        notice("unknown_antenna", UNKNOWN_ANTENNA, name, antenna.reads, antenna.rounds)
+        notice("unknown_antenna", UNKNOWN_ANTENNA, name, place, antenna.reads, antenna.rounds)
         for name, antenna in summary.antennas.items()
         if name not in carried
     ]
-    idle = "antenna {antenna} of the rig is never active"
+    idle = f"antenna {{antenna}} of the {'map' if fixed else 'rig'} is never active"
     out += [notice("idle_antenna", idle, name) for name in carried if name not in summary.antennas]
     last = max((antenna.last for antenna in summary.antennas.values()), default=0.0)
     for name, antenna in summary.antennas.items():
         if antenna.last < last - STOPPED:
             stops = "antenna {antenna} stops at {t:.1f} s, {before:.1f} s before the last antenna"
             out.append(notice("antenna_stops", stops, name, antenna.last, last - antenna.last))
+        elif fixed:  # the robot may be elsewhere
+            continue
         elif antenna.last_read is None:
             out.append(notice("silent", "antenna {antenna} reads nothing", name))
         elif antenna.last_read < last - STOPPED:
@@ -194,6 +201,7 @@ TURNED, LATE = math.radians(3.0), 0.05  # rad, s; minimum change of a yaw and of
 
 def review(use: Use, ending: Ending) -> Review:
     """Return the warnings about a finished run, and the reliability of the detection models along its final trajectory."""
+    use = replace(use, log=installed(use.log)) if "rfid" in use.sensors else use
     models = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
     return Review((*doubts(use, ending.diagnostics, ending.learnt), *models.warnings), models.reliability)
 
@@ -210,10 +218,10 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notic
         yield notice("unused_rfid", ignored, log.name, use.estimator, rounds)
     if "rfid" not in use.sensors:
         return
-    stream, tags = log.streams.get("rfid"), log.world.tags
+    stream, tags, kind_of_tags = log.streams.get("rfid"), log.world.tags, ON_ROBOT if is_fixed(log.rig) else IN_MAP
     if isinstance(stream, RfidStream) and not any(epc in tags for epc in stream.epc):
         if tags:
-            yield notice("unread_map", "{log}: none of the {tags} tags of the map is read", log.name, len(tags))
+            yield notice("unread_map", f"{{log}}: none of the {{tags}} {kind_of_tags} is read", log.name, len(tags))
         else:
             yield notice("no_map", "{log}: reads are not used, because the map has no tags", log.name)
         return
@@ -225,7 +233,7 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notic
         if suspects := diagnostics.doubted.get(kind):
             ranked = sorted(suspects.items(), key=lambda row: -row[1])
             names = listed((f"{name} ({_percent(probability)})" for name, probability in ranked), SHOWN)
-            sentence = f"{{log}}: {{count}} of {{tags}} tags of the map {why}: {{suspects}}"
+            sentence = f"{{log}}: {{count}} of {{tags}} {kind_of_tags} {why}: {{suspects}}"
             yield notice(kind, sentence, log.name, len(suspects), len(tags), names)
     settings = log.rig.find(RfidSettings)
     if settings is not None:
@@ -266,8 +274,9 @@ def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
     if turned:
         turns = ", ".join(f"{name} by {math.degrees(turn):+.1f} degrees" for name, turn in turned.items())
         yaws = {name: wrap_scalar(settings.all_antennas()[name].yaw + turn) for name, turn in turned.items()}
-        lines = ", ".join(f"rfid.antennas.{name}.yaw = {yaw:.3f}" for name, yaw in yaws.items())
-        sentence = "antennas are turned from the yaw in the rig ({turns}): set {settings} in the rig"
+        section, file = ("antennas", "map") if settings.tags else ("rfid.antennas", "rig")
+        lines = ", ".join(f"{section}.{name}.yaw = {yaw:.3f}" for name, yaw in yaws.items())
+        sentence = f"antennas are turned from the yaw in the {file} ({{turns}}): set {{settings}} in the {file}"
         yield notice("antenna_yaw", sentence, turns, lines)
     later, sigma = learnt.values.get("rfid.time_offset", (0.0, 0.0))
     if abs(later) > max(CLEARLY * sigma, LATE):
@@ -385,15 +394,3 @@ def _overdispersion(trials: _Trials, band: Integers) -> float:
     np.divide(observed, predicted, out=share, where=predicted > 0.0)
     p = np.clip(trials.p * share[band], 0.0, 1.0 - 1e-3)
     return overdispersion(trials.hit, np.ones(len(p)), p, trials.antenna, trials.tag, trials.block)[0]
-
-
-def draw(log: Log) -> Marks:
-    """Return what a viewer shows: the tags of the map, after the rig's survey transform, and the times of their reads."""
-    known = tag_map(log.world, log.rig.of(SurveySettings))
-    stream = log.streams.get("rfid")
-    t, names = np.empty(0), tuple[str, ...]()
-    if isinstance(stream, RfidStream):
-        rows = [i for i, epc in enumerate(stream.epc) if epc]
-        t = (stream.t - stream.age + log.rig.time_offset("rfid"))[rows]
-        names = tuple(stream.epc[i] for i in rows)
-    return Marks("tags", known.names, known.tags.points, t, names, marker="s", size=5.0, order=2.0)

@@ -62,7 +62,7 @@ def optimal_filter(log: Log) -> Trajectory:
     tags = KnownTags(Setup(log.rig, log.world, SENSORS, np.random.default_rng(0)), diagnostics)
     motion = Motion(log.rig, SENSORS, diagnostics, self_calibration=True)
     likelihood = tags.likelihood
-    grid = GridFilter(prior, *extent(log.world, tags.map.tags))
+    grid = GridFilter(prior, *extent(log.world, tags.surveyed))
     before = None
     t, means, covariances = [], [], []
     for m in log.measurements(SENSORS):

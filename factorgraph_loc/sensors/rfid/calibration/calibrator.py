@@ -37,13 +37,18 @@ class RfidCalibrator(Calibrator):
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
         """Estimate survey, mounting and models, see :meth:`Calibrator.learn`. With smoothed trajectories the survey is
-        not estimated. Raises InputError if the rig has no antennas or a log is too short."""
+        not estimated. Raises InputError if the rig has no antennas, if they are fixed in the map, or if a log is too short."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()
         if rig.rfid is None:
             raise InputError(
                 f"{logs[0].name}: its rig has no RFID antennas, expected the mounting of antennas in [rfid.antennas]"
+            )
+        if rig.rfid.tags:
+            raise InputError(
+                f"{logs[0].name}: antennas in the map are not calibrated: remove rfid from sensors of the rig, to calibrate only "
+                "the rest"
             )
         if grids is None:
             raise ValueError("grids is None, but logs with reads of tags need a path for detection grids")
