@@ -260,5 +260,5 @@ def test_what_cannot_be_calibrated_is_said(read_tags, tmp_path):
         learn_rfid([log], log.rig, tmp_path / "cart")
     antennas = {f"{name} of the rig": antenna for name, antenna in log.rig.rfid.antennas.items()}
     renamed = log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"antennas": antennas})})
-    with pytest.raises(InputError, match=r"reads-1: .* same names in \[rfid.antennas\]"):
+    with pytest.raises(InputError, match=r"reads-1: .* use the names of the log in \[rfid.antennas\]"):
         learn_rfid([log], renamed, tmp_path / "cart")
