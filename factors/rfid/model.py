@@ -157,9 +157,8 @@ class Antenna:
 class Packed(NamedTuple):
     """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw, and of pitch.
     ``which`` (A,): the model of each antenna. ``kinds`` (M,), ``parameters`` (M, 12): of each model. ``shapes`` (M, 5):
-    H, F, NX, NY of a grid, and its first index in ``knots``, the logits of all grids. ``reach`` (M,) [m]. ``span``: ``1
-    - false_read - miss``. ``scale``, ``rate`` (M,) and ``delay`` (1,) [s]: the adjustment by
-    :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest probability of each model."""
+    H, F, NX, NY of a grid, and its first index in ``knots``, the logits of all grids. ``reach`` (M,) [m]. ``scale``,
+    ``rate`` (M,), ``delay`` (1,) [s]: see :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest probabilities."""
 
     antennas: Array
     which: NDArray[np.int64]
