@@ -68,11 +68,11 @@ class Tracks:
         """Return the number of observations of each point (T,)."""
         return np.bincount(self.track, minlength=self.count)
 
-    def kept(self, observations: Truths) -> tuple[Tracks, Integers]:
-        """Select observations by a mask (N,). Returns the tracks with renumbered points, and the old index of each of
-        their T' points (T',)."""
-        old, track = np.unique(self.track[observations], return_inverse=True)
-        left = (self.frame[observations], self.feature[observations], self.pixels[observations])
+    def kept(self, mask: Truths) -> tuple[Tracks, Integers]:
+        """Return the tracks with only the observations for which ``mask`` (N,) is True. Points without an observation
+        are removed, and the rest are numbered anew. Also returns the old number of each remaining point."""
+        old, track = np.unique(self.track[mask], return_inverse=True)
+        left = (self.frame[mask], self.feature[mask], self.pixels[mask])
         return Tracks(track.astype(np.int64), *left), old
 
 

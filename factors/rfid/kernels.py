@@ -42,9 +42,9 @@ def tag_logit(
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float, float]:
-    """The logit of one tag for an antenna at (x, y) with horizontal boresight (c, s) in the frame of the tags. Also returns its
-    derivatives by the tag's position along and across the boresight, by the antenna's heading, and by the logarithm of the model's
-    range. ``point`` (3,), ``normal`` (2,): the tag's position and facing in that frame. The logit is constant beyond the reach."""
+    """The logit of the read probability of one tag, for an antenna at (x, y) with horizontal boresight (c, s) in the
+    frame of the tags. Also returns its derivatives by the tag's position along and across the boresight, by the antenna's
+    heading, and by the logarithm of the model's range. ``point`` (3,), ``normal`` (2,): the tag's position and facing."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey

@@ -215,7 +215,7 @@ class Results:
         return MetricComparison(metric, figures, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
     def unscored(self) -> list[str]:
-        """Return the logs with a run that has scored poses, but too few for scores."""
+        """Return the logs with a run that has some poses to compare with the reference, but too few for error figures."""
         kinds = [f"{kind}.scored" for kind in KINDS]
         return [
             log

@@ -256,7 +256,9 @@ def test_a_floor_that_the_rig_gives_is_kept(read_tags, tmp_path):
 
 def test_what_cannot_be_calibrated_is_said(read_tags, tmp_path):
     log = read_tags(seconds=20.0)
-    with pytest.raises(InputError, match=r"reads-1: has 79 inventory rounds .* expected at least 100 rounds and 2 tags"):
+    with pytest.raises(
+        InputError, match=r"reads-1: has 79 inventory rounds .* expected at least 100 rounds and 2 tags"
+    ):
         learn_rfid([log], log.rig, tmp_path / "cart")
     antennas = {f"{name} of the rig": antenna for name, antenna in log.rig.rfid.antennas.items()}
     renamed = log.rig.model_copy(update={"rfid": log.rig.rfid.model_copy(update={"antennas": antennas})})
