@@ -75,7 +75,10 @@ def test_a_map_is_extended(fgloc, on_disk, tmp_path):
         (["-o", "OUT/a.toml"], "expected a name that ends in .world.toml"),
         (["-o", "OUT/none/a.world.toml"], "there is no folder"),
         (["-o", "OUT/a.world.toml", "-e", "particle_filter"], "expected one that estimates landmarks"),
-        (["-o", "OUT/a.world.toml", "--set", "batch.landmarks=known"], "--set is batch.landmarks"),
+        (
+            ["-o", "OUT/a.world.toml", "--set", "batch.landmarks=known"],
+            "--set batch.landmarks cannot be used to make a map",
+        ),
         (["-o", "OUT/there.world.toml"], "exists already"),
         (
             ["-o", "OUT/a.world.toml", "-e", "ekf"],

@@ -12,7 +12,7 @@ from factorgraph_loc.evaluation.metrics import FEWEST_SCORED, score
 from factorgraph_loc.experiments.doubts import never_localized
 from factorgraph_loc.experiments.run import RunConfig, run
 
-NO_POINTS = "straight: the map has no points for the camera: give --world"
+NO_POINTS = "straight: the map has no points for the camera: give a map with --world"
 STAMPS = np.array([0.3, 0.7])
 
 

@@ -21,7 +21,7 @@ from factors.odometry.factor import OdometryFactor
 
 # Landmarks so far ahead that range measures x and bearing measures heading: the problem along x is linear and Gaussian.
 FAR = World(landmarks={"far": Landmark(x=1e4, y=0.0)})
-SENSOR = BearingRangeSettings(range_sigma=0.3, bearing_sigma=0.5, robust=100.0)
+SENSOR = BearingRangeSettings(range_sigma=0.3, bearing_sigma=0.5, robust=100.0, late=0.0)  # Gaussian
 LINEAR = Rig(odometry=WHEELS, bearing_range=SENSOR)
 STEPS, SENSORS = 30, ("odometry", "bearing_range")
 PRIOR_SIGMAS = np.array((0.2, 1e-4, 1e-5))

@@ -69,7 +69,7 @@ def test_rows_are_sorted(tmp_path, order):
     late = np.array(order) < np.maximum.accumulate(order)
     assert ("sorted_rows" in kinds(log)) == late.any()
     if late.any():
-        assert f"wheels.csv:{int(late.argmax()) + 2}: time is " in said(log, "sorted_rows")
+        assert f"wheels.csv:{int(late.argmax()) + 2}: the time " in said(log, "sorted_rows")
         assert f" {np.count_nonzero(late)} such rows" in said(log, "sorted_rows")
 
 
@@ -135,7 +135,7 @@ def test_rounds_that_reads_name_by_number(native, refused):
     (native / "inventories.csv").write_text("t_ns,antenna,duration\n1,l,x\n1200000000,l,0.1\n1400000000,l,0.1\n")
     (native / "rfid.csv").write_text("t_ns,antenna,epc,inventory\n1150000000,l,E1,2\n")
     (native / "run.toml").write_text(SKIP + (native / "run.toml").read_text())
-    refused(native, "inventories.csv: rows are skipped or sorted, but reads refer to them by number")
+    refused(native, "inventories.csv: rows are skipped or sorted, but reads refer to rows by number")
 
 
 def test_messages_are_skipped_and_sorted(maker, read_drive):
@@ -150,7 +150,7 @@ def test_messages_are_skipped_and_sorted(maker, read_drive):
     messages = [str(warning) for warning in log.warnings if warning.kind in ("bad_rows", "sorted_rows")]
     assert "/imu:2: turn rate about z is nan" in messages[1] + messages[0]
     assert any("/truth:4: qz is nan" in message for message in messages)
-    assert any("/truth:3: time is" in message and "1 such rows" in message for message in messages)
+    assert any("/truth:3: the time " in message and "1 such rows" in message for message in messages)
 
 
 def test_messages_are_refused_with_the_keys(maker, refuse_drive):

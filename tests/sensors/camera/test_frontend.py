@@ -177,7 +177,7 @@ def test_a_log_without_images_stays_as_it_is(log):
 
 
 def test_a_rig_without_camera(log):
-    with pytest.raises(InputError, match=r"pictures: has images, but its rig rig has no \[camera\]"):
+    with pytest.raises(InputError, match=r"pictures: has images, but its rig rig has no section \[camera\]"):
         with_features(replace(log, rig=Rig()), ORB)
 
 
