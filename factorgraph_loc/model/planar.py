@@ -18,8 +18,9 @@ RISE, MOST = 0.3, 3.0  # m between the lowest and the highest pose: limits for a
 TILT = math.radians(10.0)  # angle between the z axes of the robot and the world: limit for a warning
 NEGLIGIBLE = 1e-9  # component of a unit vector below which an axis does not contribute
 UNIT = 0.01  # tolerance of the norm of a quaternion
-# a variance marks a null pose if it is at least HUGE [m^2] and at least ABOVE_USUAL times the median of all variances
+# a variance marks a null pose if it is at least HUGE [m^2] and at least ABOVE_USUAL times that of the last valid pose
 HUGE, ABOVE_USUAL = 1000.0, 100.0
+PLACEHOLDER = 1e300  # m^2; stands for an infinite variance
 NAMED = {"body": "x y z", "optical": "z -x -y"}  # axes that point forward, left and up, by name
 
 Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad")]
@@ -103,13 +104,30 @@ def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.b
     """Return a mask (N,) of null poses, which programs publish while they have lost track.
 
     The quaternion (N, 4) of a null pose is zero, or a variance of x or y (N, 2) [m^2] is at least :data:`HUGE` and far
-    above the median. If more than half of the poses are of this kind, none is a null pose.
+    above that of the last valid pose. Later poses have no influence, with one exception: if more than half of the
+    quaternions are zero, no quaternion marks a null pose, and a reader of poses refuses the file.
     """
     null = np.asarray(~quaternions.any(axis=1))
-    if variances is not None and len(variances):
-        usual = np.median(np.nan_to_num(variances, nan=0.0, posinf=HUGE), axis=0)
-        null = null | (variances >= np.maximum(HUGE, ABOVE_USUAL * usual)).any(axis=1)
-    return null if 2 * np.count_nonzero(null) <= len(null) else np.zeros(len(null), dtype=bool)
+    if 2 * np.count_nonzero(null) > len(null):
+        null = np.zeros(len(null), dtype=bool)
+    if variances is None:
+        return null
+    finite = np.nan_to_num(variances, nan=0.0, posinf=PLACEHOLDER)
+    return np.asarray(null | _rise(finite[:, 0], null) | _rise(finite[:, 1], null))
+
+
+def _rise(variances: Array, null: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the ``variances`` (N,) [m^2] that are at least :data:`HUGE` and far above the last one
+    before that is neither masked nor in ``null`` (N,). The first one is not masked."""
+    out = np.zeros(len(variances), dtype=bool)
+    if not (variances >= HUGE).any():
+        return out
+    last = math.inf
+    for i, variance in enumerate(variances.tolist()):
+        out[i] = variance >= max(HUGE, ABOVE_USUAL * last)
+        if not (out[i] or null[i]):
+            last = variance
+    return out
 
 
 def null_poses(source: object, row: int, count: int) -> Notice:

@@ -11,7 +11,8 @@ from mapped_hall import VELOCITIES, WHEELS, write_mapped
 from rosbag_drive import COUNT, MS, T0, add_imu
 
 from factorgraph_loc import read_log
-from factorgraph_loc.sensors.odometry.measurement import IncrementStream
+from factorgraph_loc.sensors.odometry.jumps import jumps
+from factorgraph_loc.sensors.odometry.measurement import IncrementStream, YawRateStream
 from factorgraph_loc.sensors.odometry.summary import summarize
 
 SKIP, SORT = 'bad_rows = "skip"\n', 'order = "sort"\n'
@@ -216,6 +217,21 @@ def test_an_increment_that_jumps(tmp_path):
     assert isinstance(stream, IncrementStream)
     assert len(stream.t) == 11
     np.testing.assert_allclose(stream.unknown, np.where(np.arange(11) == 5, 0.2, 0.0), atol=1e-9)
+
+
+@given(
+    rates=st.lists(st.sampled_from((0.0, 0.5, -0.5, 3.0, 63.0, -63.0)), min_size=2, max_size=30),
+    length=st.integers(1, 29),
+)
+def test_later_rows_do_not_make_an_earlier_one_a_jump(rates, length):
+    def rows(count):
+        t = 0.1 * np.arange(count)
+        turned = np.array(rates[:count])
+        gyro, moved = YawRateStream(t, turned), IncrementStream(t, 0.05 * turned, 0.0 * t, 0.1 * turned)
+        return [[(jump.row, jump.what) for jump in jumps(stream)] for stream in (gyro, moved)]
+
+    whole, part = rows(len(rates)), rows(min(length, len(rates)))
+    assert part == [[(row, what) for row, what in found if row < length] for found in whole]
 
 
 @IN_SHORT

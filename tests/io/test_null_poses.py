@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mapped_hall import write_mapped
 from refusal import refusal
 
 from factorgraph_loc import read_log, write_native
 from factorgraph_loc.io.motions import through_losses
 from factorgraph_loc.io.readers.pose_file import read_pose_file
+from factorgraph_loc.model.planar import are_null
 from factorgraph_loc.sensors.motion import whole_motion
 from factorgraph_loc.sensors.odometry.measurement import VelocityStream
 from factors import se2
@@ -118,6 +121,27 @@ def test_a_variance_that_grows_is_no_loss(tmp_path, bag_maker):
             )
     log = read_log(made.path, reader="rosbag", options={"odometry": {"topic": "/odom", "use": "twist"}})
     assert isinstance(log.streams["odometry"], VelocityStream)
+
+
+@given(
+    variances=st.lists(
+        st.sampled_from((0.0, 0.01, 5.0, 500.0, 2000.0, 9999.0, np.inf, np.nan)), min_size=2, max_size=30
+    ),
+    length=st.integers(1, 29),
+)
+def test_later_poses_do_not_make_an_earlier_one_null(variances, length):
+    both = np.column_stack((variances, np.ones(len(variances))))
+    upright = np.tile((0.0, 0.0, 0.0, 1.0), (len(variances), 1))
+    whole, part = are_null(upright, both), are_null(upright[:length], both[:length])
+    np.testing.assert_array_equal(whole[:length], part)
+
+
+def test_a_constant_placeholder_marks_no_loss():
+    upright = np.tile((0.0, 0.0, 0.0, 1.0), (4, 1))
+    for placeholder in (9999.0, np.inf, np.nan):
+        assert not are_null(upright, np.full((4, 2), placeholder)).any()
+    lost = np.array([(9999.0, 0.01), (9999.0, 0.01), (9999.0, 9999.0), (9999.0, 0.01)])
+    assert are_null(upright, lost).tolist() == [False, False, True, False]
 
 
 def test_losses_at_both_ends():

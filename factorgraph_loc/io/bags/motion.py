@@ -215,7 +215,11 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
     returned instead of velocities, see :func:`motions.through_losses`.
     """
     values = rows.values
-    null = are_null(values[:, 2:6], values[:, 6:]) if values.shape[1] > 2 else np.zeros(len(rows), dtype=bool)
+    null = np.zeros(len(rows), dtype=bool)
+    if values.shape[1] > 2:
+        # quaternions that are zero from the start show a program without rotations, until the first that is not
+        has_rotations = np.logical_or.accumulate(values[:, 2:6].any(axis=1))
+        null = are_null(values[:, 2:6], values[:, 6:]) & has_rotations
     known = np.flatnonzero(~null)
     keep = rows.kept(checks.not_finite(("v", "w"), values[known, :2]), warnings, known)
     t_ns, velocities = rows.t_ns[keep], values[keep, :2]

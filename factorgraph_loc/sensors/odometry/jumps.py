@@ -1,7 +1,8 @@
-"""Finds and removes jumps of odometry: single rows with a speed or turn rate that no robot can reach between its
-neighbouring rows.
+"""Finds and removes jumps of odometry: single rows with a speed or turn rate that no robot can reach after the rows
+before.
 
-The usual cause is an angle that wraps inside the robot's software.
+The usual cause is an angle that wraps inside the robot's software. Later rows have no influence, so that an estimate at
+a time depends on earlier rows only.
 """
 
 from typing import NamedTuple, TypeVar
@@ -14,10 +15,11 @@ from factorgraph_loc.sensors.odometry.measurement import IncrementStream, Veloci
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
-# a jump differs from the median of its neighbours by LEAST_TURN [rad/s] or LEAST_SPEED [m/s], and is FACTOR times as large
+# a jump differs from the median of the rows before by LEAST_TURN [rad/s] or LEAST_SPEED [m/s], and is FACTOR times as large
 LEAST_TURN, LEAST_SPEED = 6.0, 5.0
 FACTOR = 5.0
-AROUND = (-2, -1, 1, 2)  # neighbours of a row, relative to its number
+HELD = 0.1  # s; assumed duration of the first increment, which is usually zero
+PREVIOUS = 3  # number of rows before a row that it is compared with
 
 
 Motion = VelocityStream | IncrementStream | YawRateStream
@@ -28,29 +30,29 @@ class Jump(NamedTuple):
     """A jump in one row of odometry.
 
     ``row``: the number of the row, from 0. ``what``: "speed" or "turn rate". ``unit``: the unit of the rates. ``rate``:
-    the speed or turn rate of the row. ``before``, ``after``: the rates of the previous row and of the next row.
+    the speed or turn rate of the row. ``previous``, ``following``: the rates of the rows before and after it.
     """
 
     row: int
     what: str
     unit: str
     rate: float
-    before: float
-    after: float
+    previous: float
+    following: float
 
 
 def jumps(stream: Motion) -> list[Jump]:
     """Return the jumps of a stream of odometry or of a gyro in order of its rows. In a jump the speed or turn rate
-    differs from that of the two rows before and after by more than a robot can accelerate."""
-    if len(stream.t) < len(AROUND) + 1:
+    differs from that of the rows before by more than a robot can accelerate."""
+    if not len(stream.t):
         return []
     if isinstance(stream, YawRateStream):
         speeds, turns = np.zeros(len(stream.t)), stream.w
     elif isinstance(stream, VelocityStream):
         speeds, turns = stream.v, stream.w
     else:
-        steps = np.diff(stream.t, prepend=2.0 * stream.t[0] - stream.t[1])
-        steps = np.maximum(steps, np.median(steps))  # two timestamps may be close by chance, which is no high speed
+        steps = np.diff(stream.t, prepend=stream.t[0] - HELD)
+        steps = np.maximum(steps, _usual(steps, HELD))  # two timestamps may be close by chance, which is no high speed
         speeds, turns = np.hypot(stream.dx, stream.dy) / steps, stream.dtheta / steps
     kinds = (("turn rate", "rad/s", turns, LEAST_TURN), ("speed", "m/s", speeds, LEAST_SPEED))
     out = [
@@ -62,11 +64,19 @@ def jumps(stream: Motion) -> list[Jump]:
 
 
 def _outliers(rates: Array, least: float) -> Integers:
-    """Return the indices of ``rates`` (N,) that differ from the median of their neighbours by more than ``least``, and
+    """Return the indices of ``rates`` (N,) that differ from the median of the rates before by more than ``least``, and
     that are more than FACTOR times as large as this median."""
-    padded = np.pad(rates, 2, mode="reflect")
-    usual = np.median([padded[2 + k : len(padded) - 2 + k] for k in AROUND], axis=0)
+    usual = _usual(rates, 0.0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
+
+
+def _usual(values: Array, first: float) -> Array:
+    """Return the median (N,) of the :data:`PREVIOUS` values before each of ``values`` (N,). ``first``: the value that
+    stands before all others."""
+    padded = np.concatenate((np.full(PREVIOUS, np.nan), values[:-1]))
+    padded[PREVIOUS - 1] = first
+    windows = np.lib.stride_tricks.sliding_window_view(padded, PREVIOUS)
+    return np.asarray(np.nanmedian(windows, axis=1))
 
 
 def jump_warning(kind: str, events: list[Jump], stream: Motion, end: str) -> Notice:
@@ -74,13 +84,13 @@ def jump_warning(kind: str, events: list[Jump], stream: Motion, end: str) -> Not
     appended to it."""
     first = events[0]
     sentence = (
-        "the {what} of the {source} jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {before:.2f} and {after:.2f} "
-        f"{{unit}} (such rows: {{rows}}){end}"
+        "the {what} of the {source} jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {previous:.2f} and "
+        f"{{following:.2f}} {{unit}} (such rows: {{rows}}){end}"
     )
     rows = len({jump.row for jump in events})
     t = float(stream.t[first.row])
     source = "gyro" if isinstance(stream, YawRateStream) else "odometry"
-    return notice(kind, sentence, first.what, source, first.rate, first.unit, t, first.before, first.after, rows)
+    return notice(kind, sentence, first.what, source, first.rate, first.unit, t, first.previous, first.following, rows)
 
 
 def without_jumps(stream: M, rules: RowRules, warnings: list[Notice]) -> M:
