@@ -310,7 +310,7 @@ def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def _inflated(covariance: Array, lost: float) -> Array:
-    """Divide a covariance by ``1 - lost``, the factor by which it is too small."""
+    """Divide a covariance by ``1 - lost``, because it is too small by this factor."""
     return covariance / max(1.0 - lost, 0.5)
 
 

@@ -34,7 +34,7 @@ from factors.se2 import Array
 DENSITY = 25.0  # initial number of particles per m^2 and rad
 # numbers of particles: the minimum at the start of a search, the maximum, and the minimum after a resampling
 FEWEST_AT_FIRST, MOST, FEWEST = 10_000, 40_000, 4000
-GROWTH = 4  # largest factor by which one resampling increases the number of particles
+GROWTH = 4  # largest ratio of the numbers of particles after and before one resampling
 # Effective fractions of the particles: resampling starts below the first, and a step of a correction keeps at least the second.
 RESAMPLE_BELOW, ENOUGH = 0.5, 0.2
 FRESH, ELSEWHERE = 2000, 1e-3  # number of additional particles at each resampling, and their total weight

@@ -255,21 +255,21 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
         )
         return
     left, right = _counted(table, sides)
-    reference, tick, track = _reference(roles, path), TICK, None
-    if reference is not None and reference.has_heading:
-        turned = match(Turns(table.times(), right - left), _turns_of(reference))
-    else:
-        turned = None
+    reference, tick, track, length, travelled = _reference(roles, path), TICK, None, 0.0, 0.0
     if reference is not None:
+        turns = Turns(table.times(), right - left)
+        turned = match(turns, _turns_of(reference)) if reference.has_heading else None
         offset = 0.0 if turned is None or turned.offset is None else turned.offset
         length, travelled = _lengths(table.times(), left + right, replace(reference, t=reference.t + offset))
-        tick = float(f"{2.0 * length / max(travelled, 1e-9):.3g}") if travelled > 0.0 and length > 0.0 else TICK
+        if length > 0.0 and travelled > 0.0:
+            tick = float(f"{2.0 * length / travelled:.3g}")
+        if turned is not None and turned.ratio > 0.0:
+            track = float(f"{tick * turned.ratio:.3g}")
+    if length > 0.0 and travelled > 0.0:
         roles.remarks.append(
             f"{table.name}: units.left = {tick:g} m per count of {quoted(table.fields['left'])}, because the reference travels "
             f"{length:.1f} m while the wheels count {travelled / 2.0:.0f}; replace it by the distance per count of your wheels"
         )
-        if turned is not None and turned.ratio > 0.0:
-            track = float(f"{tick * turned.ratio:.3g}")
     else:
         roles.remarks.append(
             f"{table.name}: units.left = {tick:g} m per count of {quoted(table.fields['left'])} is an example: replace it by the"

@@ -22,7 +22,7 @@ LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Plot a new map of tags, with the given map and the trajectory. ``log``: the name of the log, for the title.
+    """Plot a new map of tags, with the given map and the trajectory. ``log``: the name of the log in the title.
 
     Labels are the last characters of EPCs. Candidate positions of ambiguous tags, and given tags that were not located,
     are drawn in addition to the elements of :func:`figure`.

@@ -70,7 +70,7 @@ class Tracks:
 
     def kept(self, mask: Truths) -> tuple[Tracks, Integers]:
         """Return the tracks with only the observations for which ``mask`` (N,) is True. Points without an observation
-        are removed, and the rest are numbered anew. Also returns the old number of each remaining point."""
+        are removed, and the rest get consecutive numbers. Also returns the old number of each remaining point."""
         old, track = np.unique(self.track[mask], return_inverse=True)
         left = (self.frame[mask], self.feature[mask], self.pixels[mask])
         return Tracks(track.astype(np.int64), *left), old

@@ -26,25 +26,24 @@ from factors.se2 import Array
 NOISES = (0.6, 1.0, 1.6)  # factors of the standard deviation of ranges
 SHARES = (0.02, 0.05, 0.12, 0.25, 0.45, 1.0)  # fractions of late ranges; 1 is a bias of all ranges
 MEANS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # m: means of the excess; their prior is proportional to the inverse
-SPREADS = (0.2, 0.7)  # standard deviation of the excess divided by its mean
+RELATIVE_SIGMAS = (0.2, 0.7)  # standard deviation of the excess divided by its mean
 BIASED = 0.05  # prior probability of a bias, if no range is late
 OUTLIERS, FAR = 0.02, 10.0  # fraction of gross errors, and their standard deviation divided by that of an innovation
 LARGEST = 1e4  # squares of normalised innovations are limited to this value
 LEAST = 0.002  # a smaller share of late ranges is replaced by 0
 EXACT = 1e-9  # a smaller variance of a predicted range, in units of the noise, is replaced by 0
 LEAST_GAIN = 1e-6  # minimum relative reduction of a variance by a range
-LEAST_INFORMATION = (
-    0.2  # minimum information of a range, relative to a range that is known to be direct or known to be late
-)
+# minimum information of a range, relative to a range that is known to be direct or known to be late
+LEAST_INFORMATION = 0.2
 
 
 class LateRanges(NamedTuple):
     """The statistics of late ranges, which are too long because the signal was reflected. ``share``: the probability
-    that a range is late. ``mean``, ``spread`` [m]: mean and standard deviation of the excess of a late range."""
+    that a range is late. ``mean``, ``sigma`` [m]: mean and standard deviation of the excess of a late range."""
 
     share: float = 0.0
     mean: float = 0.0
-    spread: float = 0.0
+    sigma: float = 0.0
 
 
 NONE = LateRanges()
@@ -52,18 +51,18 @@ NONE = LateRanges()
 
 @register_jitable
 def mixture(
-    error: float, slope: float, robust: float, share: float, mean: float, spread: float
+    error: float, slope: float, robust: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
     """Returns the negative log-likelihood of a range, its derivative by ``error``, and the information about ``error``.
 
     ``error``: the predicted minus the measured range in standard deviations.
     ``slope``: the inverse of the standard deviation [1/m].
-    ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``spread``: those of :class:`LateRanges`.
+    ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``sigma``: those of :class:`LateRanges`.
 
     The information is the mean information of a direct and a late range, minus the variance of the derivative (Louis,
     Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
     """
-    widening = 1.0 + (slope * spread) ** 2
+    widening = 1.0 + (slope * sigma) ** 2
     beyond = error + slope * mean
     squared, squared_late = error * error, beyond * beyond / widening
     loss = geman_mcclure_loss(squared, robust)
@@ -81,7 +80,7 @@ def mixture(
 
 @register_jitable
 def moments(
-    error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, spread: float
+    error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
     """Returns the error and the weight of a Gaussian measurement that has the effect of a range on a prediction, and
     the normalised innovation squared, averaged over a direct and a late range.
@@ -93,7 +92,7 @@ def moments(
     ``variance``: the variance of the predicted range divided by that of the noise. ``gate``: the noise is increased if
     a normalised innovation squared exceeds it. The other arguments are those of :func:`mixture`.
     """
-    widening = 1.0 + (slope * spread) ** 2
+    widening = 1.0 + (slope * sigma) ** 2
     beyond = error + slope * mean
     squared, squared_late = error * error / (variance + 1.0), beyond * beyond / (variance + widening)
     log_odds = math.log(share / (1.0 - share)) - 0.5 * math.log((variance + widening) / (variance + 1.0))
@@ -112,13 +111,13 @@ def moments(
 
 def _grid() -> tuple[Array, Array, Array]:
     """The shares, the means and the standard deviations of the hypotheses with an excess, as arrays (H,)."""
-    shares, means, spreads = (part.ravel() for part in np.meshgrid(SHARES, MEANS, SPREADS, indexing="ij"))
-    return shares, means, spreads * means
+    shares, means, sigmas = (part.ravel() for part in np.meshgrid(SHARES, MEANS, RELATIVE_SIGMAS, indexing="ij"))
+    return shares, means, sigmas * means
 
 
-_SHARES, _MEANS, _SPREADS = _grid()
+_SHARES, _MEANS, _SIGMAS = _grid()
 _IS_LATE = _SHARES < 1.0
-_PARTS = len(MEANS) * len(SPREADS)  # number of successive hypotheses with equal share
+_PARTS = len(MEANS) * len(RELATIVE_SIGMAS)  # number of successive hypotheses with equal share
 
 
 @lru_cache(maxsize=16)
@@ -153,10 +152,10 @@ class LateShares:
         if self.probability == 0.0:
             return NONE
         logs = _prior(self.probability) if self.log_weights is None else self.log_weights
-        share, mean, spread = _averaged(logs, _SHARES, _MEANS, _SPREADS)
-        return LateRanges(_rounded(share), _rounded(mean), _rounded(spread)) if share >= LEAST else NONE
+        share, mean, sigma = _averaged(logs, _SHARES, _MEANS, _SIGMAS)
+        return LateRanges(_rounded(share), _rounded(mean), _rounded(sigma)) if share >= LEAST else NONE
 
-    def after(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
+    def updated(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
         """The posterior after K ranges.
 
         ``errors`` (K,): the predicted minus the measured ranges in standard deviations. ``slopes`` (K,): the inverse
@@ -166,7 +165,7 @@ class LateShares:
         if self.probability == 0.0 or not slopes.any():
             return self
         logs = _prior(self.probability) if self.log_weights is None else self.log_weights
-        return LateShares(self.probability, _learnt(logs, _SHARES, _MEANS, _SPREADS, errors, slopes, variances))
+        return LateShares(self.probability, _learnt(logs, _SHARES, _MEANS, _SIGMAS, errors, slopes, variances))
 
 
 def _rounded(value: float) -> float:
@@ -176,11 +175,11 @@ def _rounded(value: float) -> float:
 
 @compiled(error_model="numpy")
 def _learnt(
-    logs: Array, shares: Array, means: Array, spreads: Array, errors: Array, slopes: Array, variances: Array
+    logs: Array, shares: Array, means: Array, sigmas: Array, errors: Array, slopes: Array, variances: Array
 ) -> Array:
     """The normalised logarithms of the probabilities of all hypotheses after K ranges. ``logs`` (noises, 1 + H): those
-    before. ``shares``, ``means``, ``spreads`` (H,): the hypotheses with an excess. The other arguments are those of
-    :meth:`LateShares.after`."""
+    before. ``shares``, ``means``, ``sigmas`` (H,): the hypotheses with an excess. The other arguments are those of
+    :meth:`LateShares.updated`."""
     out, late = logs.copy(), np.empty(_PARTS)
     for k in range(len(errors)):
         if slopes[k] == 0.0:
@@ -191,7 +190,7 @@ def _learnt(
             direct = math.exp(-0.5 * squared) / math.sqrt(noise)
             floor = OUTLIERS / FAR * math.exp(-0.5 * squared / FAR**2) / math.sqrt(noise)
             for j in range(_PARTS):
-                width = noise + (slopes[k] * spreads[j]) ** 2
+                width = noise + (slopes[k] * sigmas[j]) ** 2
                 beyond = errors[k] + slopes[k] * means[j]
                 late[j] = math.exp(-0.5 * beyond * beyond / width) / math.sqrt(width)
             out[n, 0] += math.log((1.0 - OUTLIERS) * direct + floor)
@@ -203,7 +202,7 @@ def _learnt(
 
 
 @compiled(error_model="numpy")
-def _averaged(logs: Array, shares: Array, means: Array, spreads: Array) -> tuple[float, float, float]:
+def _averaged(logs: Array, shares: Array, means: Array, sigmas: Array) -> tuple[float, float, float]:
     """The share of late ranges, and the mean and standard deviation of their excess, averaged over all hypotheses. The
     arguments are those of :func:`_learnt`."""
     share = first = second = 0.0
@@ -214,6 +213,6 @@ def _averaged(logs: Array, shares: Array, means: Array, spreads: Array) -> tuple
                 weight += shares[j] * math.exp(logs[n, 1 + j])
             share += weight
             first += weight * means[j]
-            second += weight * (means[j] ** 2 + spreads[j] ** 2)
+            second += weight * (means[j] ** 2 + sigmas[j] ** 2)
     mean = first / share
     return share, mean, math.sqrt(max(second / share - mean * mean, 0.0))

@@ -303,7 +303,7 @@ def _losses(
     ``losses`` (N, K): output. With covariances it includes half the log-determinant of the noise covariance, minus its
     value without the points' part.
     """
-    robust, share, mean, spread = tails
+    robust, share, mean, sigma = tails
     range_sigma, range_sigma_relative, bearing_sigma = noise
     axis = ahead_x = ahead_y = 0.0
     for i in range(len(poses)):
@@ -336,7 +336,7 @@ def _losses(
                 mixed = bb * range_error**2 - 2.0 * rb * range_error * bearing_error + rr * bearing_error**2
                 squared, width, shrunk = mixed / determinant, 0.5 * math.log(determinant), 1.0 / math.sqrt(rr)
             if share > 0.0 and math.isnan(bearings[k]):
-                tail = robust, share, mean, spread
+                tail = robust, share, mean, sigma
                 losses[i, k] = width + mixture(shrunk * range_error, shrunk * weight, *tail)[0]
             else:
                 losses[i, k] = width + geman_mcclure_loss(squared, robust)

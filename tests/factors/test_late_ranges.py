@@ -22,7 +22,7 @@ errors, slopes, robusts = st.floats(-40.0, 15.0), st.floats(0.5, 20.0), st.float
 
 @given(errors, slopes, robusts, lates)
 def test_the_loss_is_that_of_a_mixture(error, slope, robust, late):
-    width = 1.0 + (slope * late.spread) ** 2
+    width = 1.0 + (slope * late.sigma) ** 2
     parts = (
         (1.0 - late.share) * math.exp(-geman_mcclure_loss(error**2, robust)),
         late.share * math.exp(-geman_mcclure_loss((error + slope * late.mean) ** 2 / width, robust)) / math.sqrt(width),
@@ -46,7 +46,7 @@ def test_the_loss_is_that_of_a_mixture(error, slope, robust, late):
 def test_a_correction_has_the_moments_of_the_mixture(error, slope, variance, late):
     """By quadrature, without a robust loss and without a gate."""
     by_range = np.linspace(-12.0, 12.0, 40_001) * math.sqrt(variance)  # change of the prediction
-    width = 1.0 + (slope * late.spread) ** 2
+    width = 1.0 + (slope * late.sigma) ** 2
     density = (1.0 - late.share) * np.exp(-0.5 * (error + by_range) ** 2)
     density += late.share * np.exp(-0.5 * (error + by_range + slope * late.mean) ** 2 / width) / math.sqrt(width)
     density *= np.exp(-0.5 * by_range**2 / variance)
@@ -129,7 +129,7 @@ def learnt(excess, share, noise=1.0, bias=0.0, count=400, seed=1, prior=0.1, sig
     shares = LateShares(prior)
     for first in range(0, count, 4):
         part = slice(first, first + 4)
-        shares = shares.after(errors[part], np.full(4, 1.0 / sigma), np.full(4, 0.2))
+        shares = shares.updated(errors[part], np.full(4, 1.0 / sigma), np.full(4, 0.2))
     return shares
 
 
@@ -150,16 +150,16 @@ def test_other_errors_are_not_taken_for_late_ranges(noise, bias):
 def test_gross_errors_on_both_sides_are_not_taken_for_late_ranges():
     shares, rng = LateShares(0.1), np.random.default_rng(4)
     errors = rng.standard_normal(400) + 12.0 * rng.choice((-1.0, 0.0, 1.0), 400, p=(0.03, 0.94, 0.03))
-    assert shares.after(errors, np.full(400, 10.0), np.full(400, 0.2)).expected.share < 0.03
+    assert shares.updated(errors, np.full(400, 10.0), np.full(400, 0.2)).expected.share < 0.03
 
 
 def test_before_any_range_few_are_late_and_none_without_a_prior():
     assert 0.002 < LateShares(0.1).expected.share < 0.03
     assert learnt(0.5, 0.2, prior=0.0).expected == NONE
-    assert LateShares(0.1).after(np.zeros(2), np.zeros(2), np.zeros(2)).log_weights is None
+    assert LateShares(0.1).updated(np.zeros(2), np.zeros(2), np.zeros(2)).log_weights is None
 
 
 def test_a_gross_error_leaves_finite_probabilities():
-    shares = LateShares(0.1).after(np.array((-1e9, 1e9)), np.full(2, 10.0), np.zeros(2))
+    shares = LateShares(0.1).updated(np.array((-1e9, 1e9)), np.full(2, 10.0), np.zeros(2))
     assert np.isfinite(shares.log_weights).all()
     assert np.exp(shares.log_weights).sum() == pytest.approx(1.0)

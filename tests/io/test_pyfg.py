@@ -1,16 +1,6 @@
 import numpy as np
 import pytest
-
-ROWS = """
-VERTEX_SE2 10.0 A0 1.0 2.0 0.0
-VERTEX_SE2 10.5 A1 2.0 2.0 0.0
-VERTEX_SE2 11.0 A2 2.0 2.0 7.0
-VERTEX_XY L0 5.0 2.0
-EDGE_SE2 10.5 A0 A1 1.0 0.0 0.0 0.02 0.0 0.0 0.005 0.0 0.0008
-EDGE_SE2 11.0 A1 A2 0.0 0.0 7.0 0.02 0.0 0.0 0.005 0.0 0.0008
-EDGE_RANGE 10.6 A1 L0 3.1 0.09
-EDGE_RANGE 10.2 A0 L0 3.9 0.09
-"""
+from sound_files import PYFG
 
 
 @pytest.fixture
@@ -23,7 +13,7 @@ def write(tmp_path):
 
 
 def test_pyfg(write, one):
-    log = one(write(ROWS))
+    log = one(write(PYFG))
     odometry, ranges = log.streams["odometry"], log.streams["bearing_range"]
     assert (log.name, log.t0_ns, log.warnings) == ("small", 10_000_000_000, ())
     np.testing.assert_allclose(odometry.t, (0.0, 0.5, 1.0))
@@ -37,7 +27,7 @@ def test_pyfg(write, one):
 
 
 def test_the_noise_is_that_of_the_file(write, one):
-    rig = one(write(ROWS)).rig
+    rig = one(write(PYFG)).rig
     noise = rig.odometry.noise
     assert noise.along.per_time == pytest.approx(0.2)
     assert noise.lateral.per_time == pytest.approx(0.1)
@@ -47,7 +37,7 @@ def test_the_noise_is_that_of_the_file(write, one):
 
 
 def test_different_variances_and_ranges_of_zero_are_warnings(write, one):
-    text = ROWS.replace("3.1 0.09", "0.0 0.36")
+    text = PYFG.replace("3.1 0.09", "0.0 0.36")
     log = one(write(text))
     assert len(log.streams["bearing_range"].t) == 1
     assert "variance differs between rows, from 0.09 to 0.36: the rig has the median 0.225" in " ".join(
@@ -74,8 +64,8 @@ def test_different_variances_and_ranges_of_zero_are_warnings(write, one):
     ],
 )
 def test_what_is_not_read_names_its_row(write, refused, old, new, message):
-    assert old in ROWS
-    assert message in refused(write(ROWS.replace(old, new))).replace("'", "")
+    assert old in PYFG
+    assert message in refused(write(PYFG.replace(old, new))).replace("'", "")
 
 
 def test_a_file_without_poses(write, refused):

@@ -313,7 +313,7 @@ class PixelFinder:
         return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))
 
     def clear(self) -> None:
-        """Discard the images. Call this if the estimated trajectory starts anew, or if it is known to be right."""
+        """Discard the images. Call this if the estimated trajectory starts again, or if it is known to be right."""
         self._fixes, self._stamps = [], []
 
     @staticmethod

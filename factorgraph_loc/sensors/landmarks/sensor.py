@@ -341,7 +341,7 @@ class LandmarkSensor(Sensor):
             self._late_before.popleft()
         values = {name: value for name in observation.blocks if (value := view.value(name)) is not None}
         alone = observation.on_pose(values, {name: view.block_covariance(name) for name in values})
-        self._late = self._late.after(*alone.measured.predicted(view.pose, view.covariance))
+        self._late = self._late.updated(*alone.measured.predicted(view.pose, view.covariance))
 
     @property
     def suspicious_since(self) -> float | None:

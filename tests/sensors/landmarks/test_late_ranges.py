@@ -92,7 +92,7 @@ def test_what_came_after_a_time_is_forgotten():
     log = office(seconds=2.0)
     setup, diagnostics = Setup(log.rig, log.world, SENSORS, np.random.default_rng(0)), Diagnostics()
     sensor = bind(Binding(setup, Motion(setup.rig, SENSORS, diagnostics), diagnostics))
-    states = [LateShares(0.1).after(np.full(1, -float(k)), np.full(1, 10.0), np.zeros(1)) for k in range(5)]
+    states = [LateShares(0.1).updated(np.full(1, -float(k)), np.full(1, 10.0), np.zeros(1)) for k in range(5)]
     for t in range(4):
         sensor._late_before.append((float(t), states[t]))
     sensor._late = states[4]
