@@ -19,7 +19,7 @@ SPACING = 0.05  # m between points of a path
 
 
 class Walled(Protocol):
-    """An object with ``walls``, such as a map: segments (x1, y1, x2, y2) [m]. ``name``: its name in errors."""
+    """An object with walls, such as a map. ``walls``: ends (x1, y1, x2, y2) of each wall [m]. ``name``: in errors."""
 
     @property
     def name(self) -> str: ...
@@ -41,10 +41,10 @@ def _segments(world: Walled) -> Array:
 class FreeSpace:
     """The free space of a map: the largest connected set of K free cells in a grid of NX times NY cells of size :data:`CELL`.
 
-    ``centres`` (K, 2): centres of the free cells [m]. ``graph`` (K, K): distances between neighbouring free cells [m].
-    ``index`` (NX, NY): number of each free cell, -1 for other cells. ``origin`` (2,): corner of the first cell [m].
-    ``distance`` (NX, NY): distance from the centre of each cell to the nearest wall [m]. ``clearance``: minimum
-    distance of free cells from walls [m].
+    ``centres`` (K, 2): centres of the free cells [m]. ``graph`` (K, K): sparse matrix of the distances [m] between
+    neighbouring free cells. ``index`` (NX, NY): the row of each free cell in ``centres``, -1 for other cells.
+    ``origin`` (2,): smallest x and y of the grid [m]. ``distance`` (NX, NY): distance from the centre of each cell to
+    the nearest wall [m]. ``clearance``: minimum distance of free cells from walls [m].
     """
 
     centres: Array
@@ -68,7 +68,7 @@ class FreeSpace:
         return np.column_stack((places, math.pi * (2.0 * shares - 1.0)))
 
     def cells(self, points: Array) -> NDArray[np.int64]:
-        """Return the number of the free cell that contains each of the ``points`` (N, 2), -1 for a point outside of free cells."""
+        """Return the indices (N,) of the free cells that contain the ``points`` (N, 2), -1 for points outside."""
         places = np.floor((points - self.origin) / CELL).astype(np.int64)
         inside = np.all((places >= 0) & (places < self.index.shape), axis=-1)
         i, j = np.where(inside[:, None], places, 0).T
@@ -116,9 +116,9 @@ def nearest_walls(world: Walled, points: Array) -> tuple[Array, NDArray[np.int64
 
 
 def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
-    """Return the corners (N, 2) of a path between the cells ``start`` and ``end``.
+    """Return the corners (N, 2) [m] of the shortest path from the cell ``start`` to the cell ``end``.
 
-    It is the shortest path on the grid, straightened where the line of sight crosses only free cells.
+    The path is shortest among the paths from cell to neighbouring cell, then :func:`straightened`.
     """
     _, predecessors = csgraph.dijkstra(space.graph, directed=False, indices=end, return_predecessors=True)
     return straightened(space, space.centres[chain(predecessors, start)])
@@ -136,10 +136,10 @@ def chain(predecessors: NDArray[np.int32], start: int) -> list[int]:
 
 
 def straightened(space: FreeSpace, points: Array) -> Array:
-    """Return the corners of the path ``points`` (N, 2) after parts with a free line of sight are replaced by straight lines."""
+    """Return the path ``points`` (N, 2) without the points that straight lines through free cells can bypass."""
     corners, i = [0], 0
     while i < len(points) - 1:
-        # bisection for the farthest point in line of sight: points before it are nearly always in line of sight, too
+        # bisection may miss the farthest point in line of sight, but rarely: nearer points are mostly in sight, too
         low, high = i + 1, len(points) - 1
         while low < high:
             middle = (low + high + 1) // 2

@@ -12,7 +12,7 @@ from factorgraph_loc.files.models import Coordinate, FileModel, InUnit
 from factorgraph_loc.maps.points import PointMap
 from factors.se2 import Array
 
-# families of AprilTags are named tagBITShDISTANCE, other families by the size of their grid of bits and their number of markers
+# "tag36h11" is the AprilTag family with 36 bits and Hamming distance 11; "4x4_50" are 50 ArUco markers of 4 x 4 bits
 MarkerFamily = Literal[
     "tag16h5",
     "tag25h9",
@@ -68,7 +68,7 @@ class Marker(FileModel):
 
 
 class MarkerSettings(FileModel):
-    """The ``family`` of the markers to detect in the images of a log."""
+    """Settings of marker detection in images. ``family``: the family of markers to detect."""
 
     family: MarkerFamily
 
@@ -79,7 +79,7 @@ def corner_names(marker: str) -> list[str]:
 
 
 def marker_of(point: str) -> str | None:
-    """Return the name of the marker whose corner is the ``point`` of a map. Returns None if the point is no corner of a marker."""
+    """Return the name of the marker that has the map point named ``point`` as a corner, None if none has."""
     marker, _, corner = point.rpartition("/")
     is_corner = corner in CORNER_NUMBERS and marker.rpartition("-")[0] in get_args(MarkerFamily)
     return marker if is_corner else None

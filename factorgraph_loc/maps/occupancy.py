@@ -19,7 +19,7 @@ from factors.se2 import Array
 Wall = tuple[float, float, float, float]
 Yaw = Annotated[float, Field(ge=-7.0, le=7.0), InUnit("rad")]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-# cells: tolerance for simplified outlines; the staircase of cells along an oblique wall deviates by half a cell from a line
+# cells: tolerance of simplified outlines. It is above half a cell, so that the staircase of an oblique wall is a line
 TOLERANCE = 0.75
 STRIP = 256  # rows of the image that are processed together, to limit memory
 MIN_EXTENT = 2.0  # cells: smaller groups of occupied cells are noise of the mapping sensor
@@ -40,10 +40,10 @@ class MapFile(FileModel):
 
 
 def read_walls(path: Path) -> tuple[Wall, ...]:
-    """Read the outlines of the occupied cells of a map ``NAME.yaml`` as segments (x1, y1, x2, y2) [m] in the map's frame.
+    """Return the outlines of the occupied cells of a map as segments (x1, y1, x2, y2) [m] in the map's frame.
 
-    Segments run through the centres of the outermost occupied cells, within :data:`TOLERANCE`. Groups of cells smaller
-    than :data:`MIN_EXTENT` are omitted. Raises InputError with the file and the problem.
+    ``path``: the YAML file of the map. Segments are at most :data:`TOLERANCE` cells from the centres of the outermost
+    occupied cells. Groups smaller than :data:`MIN_EXTENT` are omitted. Raises InputError if the map is invalid.
     """
     stated = parse_model(MapFile, read_yaml(path), path)
     if stated.free_thresh >= stated.occupied_thresh:
@@ -90,7 +90,7 @@ def _are_occupied(values: NDArray[np.uint8], stated: MapFile) -> NDArray[np.bool
 
 
 def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the outlines of groups of occupied cells as segments (W, 4): column and row of both ends."""
+    """Return the outlines of ``occupied`` (rows, columns) as segments (W, 4): column and row of both ends."""
     import cv2  # noqa: PLC0415 - worlds without such a map need no OpenCV
 
     contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)

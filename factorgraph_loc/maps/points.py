@@ -39,19 +39,19 @@ property int views
 end_header
 """
 ROUNDING = 1e-9  # rounding error of an eigenvalue, relative to the largest
-ARM = 1.0  # m: distance that counts as much as a turn of 1 rad in the choice of the nearest place
+ARM = 1.0  # m per rad: weight of directions against distances in the choice of the nearest camera position
 LEAST = 0.01  # m: minimum standard deviation of a point after the common error is removed
 
 
 @dataclass(frozen=True, eq=False)
 class PointMap:
-    """A map of P points in space, and V views of them in images.
+    """A map of P points in space, with V views. A view is one observation of one point in an image.
 
     ``names``: P unique names. ``positions`` (P, 3): in the world frame [m]. ``covariances`` (P, 3, 3) [m^2].
     ``feature``: the kind of ``descriptors`` (V, D), "" if points are identified only by name (V = 0). ``owners`` (V,):
     index of the point of each view. ``seen_from`` (V, 3): position of the camera at each view [m].
-    ``common`` (V, 3, 3): covariances of (x, y, heading) about the camera of the error that all points in a view share,
-    see :class:`CommonError`. None if the map was made with a reference.
+    ``common`` (V, 3, 3): covariance [m, rad] of the error of (x, y, heading) of the map near each of these cameras, see
+    :class:`CommonError`. It is None if the camera's trajectory was known from a reference when the map was made.
     """
 
     names: tuple[str, ...]
@@ -110,7 +110,10 @@ class PointMap:
         )
 
     def with_points(self, added: PointMap, source: object) -> PointMap:
-        """Return this map with the points ``added``. Raises InputError, naming the file ``source``, if a name exists already."""
+        """Return the map with points ``added``, which have no views. ``source``: their file.
+
+        Raises InputError if a name exists already.
+        """
         if double := [name for name in added.names if name in self.index]:
             raise InputError(f"{source}: the point {double[0]} occurs twice, expected unique names")
         return replace(
@@ -122,7 +125,7 @@ class PointMap:
 
 
 def write_points(points: PointMap, path: Path) -> None:
-    """Write ``NAME.points.parquet``. It has one row per view, and one row without a descriptor for a point without views."""
+    """Write a map of points as a Parquet table: one row per view, and one row for each point without views."""
     viewed = np.zeros(len(points), dtype=bool)
     viewed[points.owners] = True
     unseen = np.flatnonzero(~viewed)
@@ -145,9 +148,10 @@ def write_points(points: PointMap, path: Path) -> None:
 
 
 def read_points(path: Path) -> PointMap:
-    """Read ``NAME.points.parquet``. Raises InputError with file, row (counted from 1) and column of an invalid value.
+    """Return the map of points that :func:`write_points` wrote to ``path``.
 
-    All rows of a point must have the same position. Covariances must be positive semi-definite.
+    Raises InputError with file, row (counted from 1) and column of an invalid value. All rows of a point must have the
+    same position. Covariances must be positive semi-definite.
     """
     table = read_parquet(path)
     missing = [name for name in (*COLUMNS, "feature") if name not in table.columns]
@@ -209,7 +213,7 @@ def _check_covariances(
 ) -> None:
     """Raise InputError at the first of ``covariances`` (N, 3, 3) that is not positive semi-definite.
 
-    ``columns``: the columns with their elements. ``names`` (N), ``rows`` (N,): the points and rows that an error names.
+    The error names the table's ``columns``, and one of N point ``names`` and of the ``rows`` (N,), counted from 0.
     """
     least, _, most = np.linalg.eigvalsh(covariances).T
     if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(most))):
@@ -249,8 +253,8 @@ def _descriptors(table: pl.DataFrame, rows: NDArray[np.int64], feature: str, pat
 def write_ply(points: PointMap, path: Path) -> None:
     """Write a PLY file for viewers of point clouds.
 
-    A point has its position, its standard deviation in the worst direction [m] and its number of views. Format: G.
-    Turk, "The PLY polygon file format", 1994.
+    Each vertex has the position of a point, its standard deviation in the worst direction [m] and its number of views.
+    Format: G. Turk, "The PLY polygon file format", 1994.
     """
     sigma = worst_sigma(points.covariances)
     views = np.bincount(points.owners, minlength=len(points))
@@ -262,13 +266,14 @@ def write_ply(points: PointMap, path: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class CommonError:
-    """The error that all points near a place of a map share, if the map was made without a reference.
+    """The error of a map that neighbouring points share, because the map was made along an estimated trajectory.
 
-    ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): unit vectors from the
-    camera to the points. ``covariances`` (K, 3, 3): the shared error of (x, y, heading) about each place.
+    ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): mean direction, as a
+    unit vector, from each position to the observed points. ``covariances`` (K, 3, 3): covariance [m, rad] of (x, y,
+    heading) of the shared error at each position.
 
-    Such a map is distorted like the estimated trajectory of its recording. A robot that localizes in the map has
-    the same error, however many points it observes. The error is therefore added to the covariance of its pose.
+    A robot that localizes in the map has the same error, however many points it observes. Estimators therefore add the
+    covariance of the nearest position to that of the robot's pose.
     """
 
     places: Array
@@ -277,7 +282,7 @@ class CommonError:
 
     @classmethod
     def of(cls, points: PointMap) -> CommonError | None:
-        """Return the shared error of a map. Returns None if the map was made with a reference."""
+        """Return the shared error of a map. Returns None if the map has none (``points.common`` is None)."""
         if points.common is None or not len(points.owners):
             return None
         places, first, of = np.unique(points.seen_from[:, :2], axis=0, return_index=True, return_inverse=True)
@@ -287,10 +292,10 @@ class CommonError:
         return cls(places, _unit(directions), points.common[first])
 
     def at(self, poses: Array, looking: float = 0.0) -> Array:
-        """Return the covariances (N, 3, 3) of the shared error at the ``poses`` (N, 3) of a robot.
+        """Return the covariances (N, 3, 3) [m, rad] of the shared error at the ``poses`` (N, 3) of a robot.
 
-        It is the shared error at the nearest place with a similar direction of view, moved to the pose as a rigid body.
-        ``looking``: direction of the camera in the robot frame [rad].
+        For each pose, the camera position of the map that is nearest in distance and direction of view is selected. Its
+        covariance is then moved to the pose (:func:`carried`). ``looking``: camera direction in the robot frame [rad].
         """
         ahead = poses[:, 2] + looking
         cosine = np.column_stack((np.cos(ahead), np.sin(ahead))) @ self.directions.T
@@ -300,9 +305,10 @@ class CommonError:
 
 
 def carried(covariances: Array, arms: Array) -> Array:
-    """Return ``covariances`` (N, 3, 3) of (x, y, heading) [m, rad] of a rigid body, moved to other points of the body.
+    """Return the covariances (N, 3, 3) of the poses (x, y, heading) [m, rad] of other points on the same rigid bodies.
 
-    ``arms`` (N, 2): the vectors from the old points to the new ones [m]. Both arguments are in the world frame.
+    ``covariances`` (N, 3, 3): of one point on each body. ``arms`` (N, 2): the vectors from this point to the other
+    point [m]. All are in the world frame.
     """
     lever = np.repeat(np.eye(3)[None], len(arms), axis=0)
     lever[:, 0, 2], lever[:, 1, 2] = -arms[:, 1], arms[:, 0]
@@ -310,15 +316,13 @@ def carried(covariances: Array, arms: Array) -> Array:
 
 
 def without_common(points: PointMap) -> PointMap:
-    """Return the map after the error that points of a view share is subtracted from the covariances of the points."""
+    """Return the map with the shared error (:class:`CommonError`) subtracted from the covariances of its points."""
     if points.common is None:
         return points
     moved = carried(points.common, points.positions[points.owners, :2] - points.seen_from[:, :2])[:, :2, :2]
     order = np.argsort(-np.trace(moved, axis1=1, axis2=2), kind="stable")
     shared = np.zeros_like(points.covariances)
-    shared[points.owners[order], :2, :2] = moved[
-        order
-    ]  # of several views of a point, the last has the smallest shared error
+    shared[points.owners[order], :2, :2] = moved[order]  # if a point has several views, the smallest error remains
     values, axes = np.linalg.eigh(points.covariances - shared)
     own = (axes * np.maximum(values, LEAST**2)[:, None, :]) @ axes.transpose(0, 2, 1)
     return replace(points, covariances=own)

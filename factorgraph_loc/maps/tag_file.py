@@ -18,7 +18,7 @@ from factorgraph_loc.maps.markers import MarkerFamily, Turn
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
-# the axes of a tag (columns) in the axes of a marker, which point out of the marker, right and up
+# columns: the axes of a tag, which point right, up and out of the tag, in a marker's frame: x out, y right, z up
 TAG_AXES = np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
 _CENTRED = {"x": 0.0, "y": 0.0, "z": 0.0, "qw": 1.0, "qx": 0.0, "qy": 0.0, "qz": 0.0}
 UNIT = 0.01  # tolerance of the length of a quaternion
@@ -43,8 +43,9 @@ class Place(FileModel):
 class TagFile(FileModel):
     """The section ``[markers]`` of a world file that refers to a file of apriltag_ros.
 
-    ``family``: the family of the tags. ``sigma`` [m]: standard deviation of each coordinate of a tag's position. ``at``: the poses
-    of bundles by name and of standalone tags by number. If a bundle has no pose, its frame is the frame of the map.
+    ``file``: the path of that file. ``family``: the family of the tags. ``sigma`` [m]: standard deviation of each
+    coordinate of a tag's position. ``at``: the poses of bundles by name and of standalone tags by number. A bundle
+    without a pose has the frame of the map.
     """
 
     file: str
@@ -54,8 +55,8 @@ class TagFile(FileModel):
 
 
 class BundledTag(FileModel):
-    """A tag of the file. ``id``: its number. ``size``: side of its black square [m]. ``x``, ``y``, ``z`` [m] and the
-    quaternion ``qw``, ``qx``, ``qy``, ``qz``: its pose in the frame of the bundle."""
+    """A tag in a file of apriltag_ros. ``id``: its number. ``size``: side of its black square [m]. ``x``, ``y``, ``z``
+    [m] and the quaternion ``qw``, ``qx``, ``qy``, ``qz``: its pose in the frame of its bundle."""
 
     id: Annotated[int, Field(ge=0, le=1_000_000)]
     size: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("m")]
@@ -70,7 +71,7 @@ class BundledTag(FileModel):
 
 
 class TagBundle(FileModel):
-    """A bundle of tags: several tags (``layout``) with known poses in a common frame."""
+    """A bundle of AprilTags, which have known poses in a common frame. ``layout``: the tags."""
 
     name: str = ""
     layout: tuple[BundledTag, ...]
@@ -82,10 +83,10 @@ class _Tags(FileModel):
 
 
 def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict[str, dict[str, float]]:
-    """Return the markers of a file of apriltag_ros by name, each with the keys of a marker in a world file.
+    """Return the markers of a file of apriltag_ros, by name. Keys and values of a marker are those in a world file.
 
-    ``content``: the section ``[markers]`` of the world file ``source``, which names a file in ``folder``. A standalone
-    tag without a pose in ``at`` is not part of the map. Raises InputError if the file is invalid or gives no markers.
+    ``content``: the section ``[markers]`` of the world file ``source``, see :class:`TagFile`. ``folder``: the folder of
+    the world file. A standalone tag without a pose in ``at`` is omitted. Raises InputError if no marker remains.
     """
     settings = parse_model(TagFile, content, f"{source} [markers]")
     path = inside(folder, settings.file, source)
@@ -116,7 +117,7 @@ def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict
     if not markers:
         first = next(iter(alone), "0")
         raise InputError(
-            f"{source} [markers]: {path.name} has no poses of tags: give them, such as [markers.at.{first}]"
+            f"{source} [markers]: {path.name} has no poses of tags: add the pose of each tag, such as [markers.at.{first}]"
         )
     return markers
 
@@ -129,7 +130,7 @@ def _marker(path: Path, tag: BundledTag, rotation: Array, position: Array) -> di
         raise bad_field(path, f"tag {tag.id}: qx, qy, qz, qw", quaternion.tolist(), "a unit quaternion")
     turn = rotation @ scipy.spatial.transform.Rotation.from_quat(quaternion).as_matrix() @ TAG_AXES.T
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the heading of a tag on the ceiling is arbitrary
+        warnings.simplefilter("ignore")  # of gimbal lock: the heading of a tag on the ceiling is arbitrary
         facing, down, roll = scipy.spatial.transform.Rotation.from_matrix(turn).as_euler("ZYX").tolist()
     x, y, z = (position + rotation @ np.array((tag.x, tag.y, tag.z))).tolist()
     return {"x": x, "y": y, "z": z, "size": tag.size, "facing": facing, "pitch": -down, "roll": roll}
