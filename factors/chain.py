@@ -17,7 +17,7 @@ from factors.gaussian import inverse, product, product_by_transpose, put
 from factors.se2 import Array, Integers
 
 POSE = 3
-LEAST = 1e-11  # if elimination reduces a diagonal element to a smaller fraction, the rest counts as a rounding error
+LEAST = 1e-11  # a matrix counts as singular if a pivot is below this fraction of the original diagonal element
 
 # The normal equations as four blocks of the information matrix. Two of them contain the gradient in their last column:
 # - each pose with itself (N, 3, 3);
@@ -29,8 +29,9 @@ System = tuple[Array, Array, Array, Array]
 
 @compiled
 def normal(count: int, first: Integers, jacobian: Array, residual: Array) -> System:
-    """The normal equations of ``count`` poses and P parameters, from M residuals. ``first`` (M,): the number of the first pose that
-    each residual depends on. ``jacobian`` (M, 6 + P): derivatives by this pose, by the next pose, and by the parameters."""
+    """Return the normal equations of ``count`` poses and P parameters, from M residuals. ``first`` (M,): the index of
+    the first pose that each residual depends on. ``jacobian`` (M, 6 + P): the derivatives of the residuals with respect
+    to this pose, the next pose, and the parameters."""
     shared = jacobian.shape[1] - 2 * POSE
     own, coupling = np.zeros((count, POSE, POSE)), np.zeros((count, POSE, POSE))
     side, corner = np.zeros((count, POSE, shared + 1)), np.zeros((shared + 1, shared + 1))
@@ -94,12 +95,12 @@ def _subtract(left: Array, right: Array, out: Array) -> None:
 
 @compiled
 def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Array, Array]:
-    """Eliminate one pose of ``system`` after the other. The diagonal of the information is multiplied by ``1 + damping`` first.
+    """Eliminate the N poses of ``system`` in order, after multiplying the diagonal by ``1 + damping``.
 
-    Returns five values: False if a pose is not determined, otherwise True; the inverse of the remaining block of each
-    pose (N, 3, 3); its products with the block of the next pose (N, 3, 3), and with the block of parameters and
-    gradient (N, 3, P + 1); the remaining block of the parameters (P + 1, P + 1).
-    """
+    Returns True if the poses are determined, and four arrays for the back substitution: the inverse of each pose's
+    reduced diagonal block (N, 3, 3), this inverse times the block of the pose and the next pose (N, 3, 3), this inverse
+    times the block of the pose, the parameters and the gradient (N, 3, P + 1), and the reduced block of the parameters
+    (P + 1, P + 1)."""
     own, coupling, side, corner = system
     count, shared = len(own), len(corner) - 1
     inverses, by_next, by_side = np.zeros_like(own), np.zeros_like(own), np.zeros_like(side)

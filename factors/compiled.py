@@ -40,7 +40,7 @@ def compiled(function: Any = None, /, **options: Any) -> Any:
 
 
 def _compiled(function: Any, options: dict[str, Any]) -> Any:
-    # no wrapper for calls from C: numba would compile it too, and nobody calls the functions from C
+    # without the wrapper for calls from C, which nobody uses, numba compiles faster
     made = numba.njit(**{"no_cfunc_wrapper": True, **options})(function)
     with suppress(RuntimeError):  # no folder for the cache is writable
         made._cache = _Shared(function)  # the option `cache=True` does the same with numba's own class
@@ -50,9 +50,9 @@ def _compiled(function: Any, options: dict[str, Any]) -> Any:
 class _Shared(FunctionCache):
     """A cache of one function's compiled code with a lock between processes.
 
-    The process that does not find the code takes the lock, and releases it after saving the code. While it compiles the
-    function, it may also lock the functions that this one calls. There is no deadlock, because calls of compiled
-    functions form no cycle. The operating system releases the locks of a process that ends.
+    A process that does not find the code locks the function, compiles it, saves the code, and releases the lock. It may
+    also lock the functions that this function calls. Locks cannot block each other in a circle, because compiled
+    functions do not call each other in a circle. The operating system releases the locks of a process that ends.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -93,7 +93,7 @@ class _Shared(FunctionCache):
             return
 
     def _place(self) -> int:
-        """The offset of the byte that represents this function in the lock file. All functions of a folder have one lock file."""
+        """The offset of this function's byte in the lock file. The functions of a folder share one lock file."""
         return zlib.crc32(self._impl.filename_base.encode())
 
 

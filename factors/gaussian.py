@@ -11,7 +11,7 @@ import numpy as np
 from factors.compiled import compiled
 from factors.se2 import Array
 
-# Largest asymmetry of a covariance that a few rounding errors explain, relative to the product of the two standard deviations.
+# A covariance counts as symmetric if mirrored elements differ by less than this, relative to the standard deviations.
 SKEW = 1e-7
 
 

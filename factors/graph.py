@@ -24,11 +24,11 @@ from factors.compiled import compiled
 from factors.gaussian import cholesky
 from factors.se2 import Array, Integers
 
-# The largest number of variables of a `gtsam.JacobianFactor` in Python. A `gtsam.GaussianConditional` may have any number.
+# The constructor of `gtsam.JacobianFactor` in Python accepts at most this number of variables.
 MOST_TERMS = 3
 # A fraction of the mean diagonal and a constant, which are added to an information matrix so that it is invertible.
 RELATIVE_RIDGE, RIDGE = 1e-9, 1e-10
-LEAST = 1e-12  # minimum of twice a cost, against division by zero
+LEAST = 1e-12  # minimum of a divisor
 Values = dict[int, Array]
 GTSAM_ERRORS = (RuntimeError, IndexError, ValueError)  # all exceptions that GTSAM raises
 
@@ -106,28 +106,30 @@ class Factor(Protocol):
     """A factor that :func:`jacobian_factors` accepts."""
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (m,) with robust weights, and a Jacobian (m, d) for each variable."""
+        """Return the whitened residual (m,) and one Jacobian (m, d) for each variable, at the ``values`` of the
+        variables. Both include the square root of the robust weight, if there is one."""
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The loss. It is robust if the factor has robust weights."""
+        """Return the cost at the values of the variables. It includes the robust loss, if there is one."""
 
 
 class Stack(Protocol):
-    """Many factors of one kind that are linearised by one call, for speed. Each factor depends on one of N poses or on two
-    consecutive poses, and on some of P parameters of the graph, such as sensor constants. ``rows``: M, the number of residuals."""
+    """Many factors of one kind that are linearised by one call, for speed. Each factor depends on one of N poses or on
+    two consecutive poses, and on some of P parameters of the graph, such as sensor constants. ``rows``: the number M of
+    all residuals."""
 
     rows: int
 
     @property
     def first(self) -> Integers:
-        """The number (M,) of the first pose that each of the ``rows`` residuals depends on."""
+        """The index (M,) of the first pose that each of the M residuals depends on."""
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Linearise at ``poses`` (N, 3) and ``parameters`` (P,). Writes ``residual`` (M,) and ``jacobian`` (M, 6 + P),
-        whose columns :mod:`factors.chain` defines."""
+        """Linearise at ``poses`` (N, 3) and ``parameters`` (P,). Writes into ``residual`` (M,) and ``jacobian`` (M, 6 +
+        P): the derivatives with respect to the first pose, the next pose, and the parameters."""
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """The loss at ``poses`` (N, 3) and ``parameters`` (P,), summed over all factors."""
+        """Return the sum of the costs of all factors at ``poses`` (N, 3) and ``parameters`` (P,)."""
 
 
 @runtime_checkable
@@ -137,14 +139,14 @@ class Stackable(Factor, Protocol):
 
     @property
     def kind(self) -> Hashable:
-        """A key for grouping: factors of one class with equal ``kind`` and on equal parameters can be in one stack.
-        None if the factor must be linearised alone."""
+        """Factors of one class can be in one stack if they have equal ``kind`` and the same parameters. None if the
+        factor must be linearised alone."""
 
     def stack(self, factors: Sequence[Any], numbers: Sequence[int], column: int) -> Stack:
-        """Combine ``factors`` of this type and kind.
+        """Combine ``factors`` of this type and kind into one stack.
 
-        ``numbers``: for each factor, the number of the (first) pose that it depends on. ``column``: the index of the
-        first component of the factors' vector among the parameters of the graph.
+        ``numbers``: for each factor, the index of the (first) pose that it depends on. ``column``: the index in the
+        parameters (P,) of the graph at which the parameters of these factors start.
         """
 
 
@@ -158,16 +160,16 @@ def jacobian_factors(
     values: Mapping[int, Array],
     on_failure: Callable[[str], None] | None = None,
 ) -> list[gtsam.GaussianFactor]:
-    """Linearise factors at ``values``, as linear factors of GTSAM in the same order.
+    """Linearise factors. Returns linear factors of GTSAM in the same order.
 
     ``factors``: tuples of a factor, the keys of its variables, and its number of residuals. The number is needed only
     with ``on_failure``.
-    ``values``: the value of each key.
+    ``values``: the value of each variable by key.
     ``on_failure``: is called with the reason if a residual or Jacobian is not finite or has a wrong shape. The linear
     factor is then zero. If ``on_failure`` is None, nothing is checked.
 
-    Factors with an attribute ``alike`` of equal value are linearised together by the method ``linearize_all`` of their
-    class. It returns residuals (N, m) and a Jacobian (N, m, d) for each variable. These factors are never checked.
+    Factors with equal attributes ``alike`` are linearised together by their class method ``linearize_all``, without a
+    check. The method returns residuals (N, m) and a Jacobian (N, m, d) for each variable.
     """
     out: list[Any] = []
     alike: defaultdict[Hashable, list[int]] = defaultdict(list)
@@ -189,7 +191,8 @@ def jacobian_factors(
 
 
 def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:
-    """A linear factor on the variables ``keys``, from the whitened ``residual`` (m,) and Jacobian ``blocks`` (m, d)."""
+    """Make a linear factor of GTSAM. ``keys``: the variables. ``residual`` (m,): whitened. ``blocks``: one Jacobian (m,
+    d) for each variable."""
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)
@@ -203,14 +206,14 @@ def _unit(size: int) -> gtsam.noiseModel.Unit:
 
 
 class PriorFactor:
-    """A Gaussian prior of a pose. ``mean`` (3,): a pose. ``covariance`` (3, 3): of the mean's body-frame perturbation."""
+    """A Gaussian prior of a pose. ``mean`` (3,): a pose. ``covariance`` (3, 3): its covariance in the body frame."""
 
     def __init__(self, mean: Array, covariance: Array) -> None:
         self._mean = mean
         self._whitener = positive.whitener(covariance)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (3,) ``log(mean^-1 * pose)`` and its Jacobian."""
+        """Return the residual (3,) ``log(mean^-1 * pose)`` and its Jacobian (3, 3), both whitened."""
         error = se2.log(se2.between(self._mean, values[0]))
         return self._whitener @ error, [self._whitener @ se2.inverse_right_jacobian(error)]
 
@@ -228,7 +231,7 @@ class VectorPriorFactor:
         self._whitener = np.diag(1.0 / uncertainty) if uncertainty.ndim == 1 else positive.whitener(uncertainty)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (P,) and its Jacobian."""
+        """Return the whitened residual (P,) and its Jacobian (P, P)."""
         return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:
@@ -268,15 +271,16 @@ def _zeros(size: int) -> Array:
 
 
 def retract(key: int, value: Array, step: Array) -> Array:
-    """The value of the variable ``key`` after a step in its tangent space: a body-frame twist of a pose, a change of a vector."""
+    """Return ``value`` moved by ``step``. If ``key`` is the key of a pose, the step is a twist in the body frame.
+    Otherwise it is added."""
     return se2.moved(value, step) if is_pose(key) else value + step
 
 
 def frame_motions(values: Values) -> tuple[Array, list[int]]:
-    """The gauge directions of a graph: how all variables change when the whole solution moves in the world frame.
+    """Return how all variables change when the whole solution moves in the world frame (the gauge freedom).
 
-    Returns an array (n, 3) of stacked tangent steps of the variables, and the index behind the last row of each
-    variable. The columns are derivatives by a shift in x, a shift in y, and a rotation about the origin of the world.
+    The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to a
+    shift in x, a shift in y, and a rotation about the origin. The second result has the end row of each variable.
     """
     parts = []
     for key, value in values.items():

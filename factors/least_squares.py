@@ -14,14 +14,14 @@ import numpy as np
 from factors.se2 import Array, Integers
 
 DAMPING, MAX_DAMPING = 1e-3, 1e8
-LEAST = 1e-9  # minimum of a diagonal element of the curvature, because the cost may not depend on some directions
+LEAST = 1e-9  # minimum of a diagonal element of the curvature. It is zero if the cost does not depend on a variable
 # Limits of `descended`. The gain is relative to the cost; the step is in m, rad or the units of other variables.
 MAX_ITERATIONS, CONVERGED_GAIN, CONVERGED_STEP, INITIAL_DAMPING = 100, 1e-6, 1e-6, 1e-8
 State = TypeVar("State")
 
 
 class Minima(NamedTuple):
-    """The solutions of N problems: the final ``states`` (N, S), with ``costs`` (N,), ``gradients`` (N, D) and
+    """The solutions of N minimisations: the final ``states`` (N, S), and the ``costs`` (N,), ``gradients`` (N, D) and
     ``curvatures`` (N, D, D) at these states."""
 
     states: Array
@@ -41,11 +41,11 @@ def minima(
 ) -> Minima:
     """Find local minima of N independent costs.
 
-    ``at(states, which)``: returns costs (n,), gradients (n, D) and curvatures (n, D, D) of the problems with indices
+    ``at(states, which)``: returns costs (n,), gradients (n, D) and curvatures (n, D, D) of the costs with indices
     ``which`` (n,). The curvature is the Fisher information or the Gauss-Newton approximation of the Hessian.
     ``start`` (N, S): initial states.
     ``iterations``: maximum number of iterations.
-    ``converged``: scalar or (D,). A problem is solved when all components of its step are at most this large.
+    ``converged``: scalar or (D,). A minimum is reached when all components of a step are at most this large.
     ``moved(states, steps)``: returns the states (n, S) after steps (n, D).
     ``largest``: scalar or (D,). A step with a larger component is shortened.
     """
@@ -110,8 +110,8 @@ def descended(
     Returns None if the step is not determined. ``damping`` is relative to the diagonal of the curvature.
     ``state``: the initial state. ``max_iterations``: maximum number of steps.
 
-    The problem is solved when a step is at most :data:`CONVERGED_STEP`, or when it reduces the cost by at most the
-    fraction :data:`CONVERGED_GAIN`. Returns the state at the minimum, its cost, and the number of iterations.
+    The search ends when the step is at most :data:`CONVERGED_STEP`, or when it reduces the cost by at most the fraction
+    :data:`CONVERGED_GAIN`. Returns the state at the minimum, its cost, and the number of iterations.
     """
     damping, cost, iteration = INITIAL_DAMPING, cost_of(state), 0
     while iteration < max_iterations and damping < MAX_DAMPING:

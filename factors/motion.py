@@ -16,8 +16,8 @@ from factors.se2 import Array, Integers, between_scalars, compose_scalars, exp_s
 class Increment:
     """The relative motion of the robot between two times.
 
-    ``delta`` (3,): the pose at the end in the frame of the pose at the start. ``covariance`` (3, 3): covariance of its body-frame
-    perturbation. ``duration`` [s]: the time between both. ``still`` [s]: the time at rest.
+    ``delta`` (3,): the pose at the end in the frame of the pose at the start. ``covariance`` (3, 3): the covariance of
+    ``delta`` in the frame of the end. ``duration`` [s]: end minus start. ``still`` [s]: the part of it at rest.
     """
 
     delta: Array
@@ -27,7 +27,7 @@ class Increment:
 
     @property
     def moving(self) -> float:
-        """The part [s] of the duration with motion."""
+        """The time [s] in motion."""
         return self.duration - self.still
 
 
@@ -50,8 +50,7 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Propagate the body-frame ``covariance`` (3, 3) of a pose along an increment. Returns the body-frame covariance
-    (3, 3) of the pose at the end."""
+    """Return the body-frame covariance (3, 3) of a pose after a motion, from the ``covariance`` (3, 3) before it."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 
@@ -68,17 +67,18 @@ def poses_between(
     poses: Array,
     covariances: Array,
 ) -> tuple[Array, Array]:
-    """Interpolate M estimated poses at T times, along the odometry.
+    """Interpolate M estimated poses to T times with the odometry. Returns poses (T, 3), and covariances (T, 3, 3) in
+    the body frame.
 
     ``previous`` (T,): the index of the last estimated pose before each time.
     ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time,
     its body-frame covariance, and its duration.
-    ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: the motion from each estimated pose to the next.
-    ``elsewhere`` (M-1,): True where somebody carried the robot to the next pose. Poses in between then ignore the next pose.
+    ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: the same from each estimated pose to
+    the next one.
+    ``elsewhere`` (M-1,): True if a person carried the robot to the next estimated pose. It is then not used.
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
 
-    The misclosure of the odometry at the next pose is distributed in proportion to time. The covariance is interpolated
-    linearly, plus that of a Brownian bridge. Returns poses (T, 3) and body-frame covariances (T, 3, 3).
+    The error of the odometry between two estimated poses is distributed in proportion to time.
     """
     count = len(previous)
     at, out = np.empty((count, 3)), np.empty((count, 3, 3))

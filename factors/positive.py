@@ -42,8 +42,8 @@ def sound(covariance: Array) -> Array:
 
 @compiled(error_model="numpy")
 def is_clear(covariance: Array) -> bool:
-    """True if a covariance (D, D) is finite, symmetric and far from singular. A cheap sufficient test: :func:`sound`
-    then returns the covariance unchanged."""
+    """True if a covariance (D, D) is finite, symmetric and far from singular. This test is faster than :func:`sound`,
+    which then returns the covariance unchanged."""
     size, shares = len(covariance), np.empty(covariance.shape)
     for i in range(size):
         if not 0.0 < covariance[i, i] < np.inf:
@@ -57,14 +57,13 @@ def is_clear(covariance: Array) -> bool:
     determinant = 1.0
     for i in range(size):
         determinant *= lower[i, i] * lower[i, i]
-    # The determinant of a correlation matrix is less than e times its smallest eigenvalue, which is therefore far above LEAST.
+    # the smallest eigenvalue of a correlation matrix exceeds its determinant / e, and is therefore far above LEAST
     return exists and determinant > CLEAR
 
 
 def whitener(covariances: Array) -> Array:
-    """Matrices W (..., D, D) that whiten errors with these covariances (..., D, D): ``W covariance W^T`` is the identity. W is the
-    inverse of the lower Cholesky root. If any root does not exist, all W are computed from eigenvalues, after raising small ones.
-    """
+    """Return matrices W (..., D, D) that whiten errors with these covariances (..., D, D): ``W covariance W^T`` is the
+    identity. If a covariance is not positive definite, its small eigenvalues are raised first."""
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
     except np.linalg.LinAlgError:

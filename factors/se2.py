@@ -163,7 +163,7 @@ def arc_coefficients(phi: float) -> tuple[float, float]:
 
 
 def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
-    """:func:`arc_coefficients` of an array of angles."""
+    """Return :func:`arc_coefficients` of an array of angles."""
     small = np.abs(phi) < SMALL
     safe = np.where(small, 1.0, phi)
     a = np.where(small, 1.0 - phi**2 / 6.0, np.sin(safe) / safe)
@@ -187,7 +187,7 @@ def _rotation3(heading: Array) -> Array:
 
 @compiled(inline="always")
 def _arc_of_many(angle: float) -> tuple[float, float]:
-    """:func:`arc_coefficients`, faster, with an error of at most 1e-12."""
+    """A faster :func:`arc_coefficients`, with an error of at most 1e-12."""
     if abs(angle) > SHORT:
         return math.sin(angle) / angle, 2.0 * math.sin(angle / 2.0) ** 2 / angle
     z = angle * angle
@@ -198,7 +198,7 @@ def _arc_of_many(angle: float) -> tuple[float, float]:
 
 @compiled(inline="always")
 def _wrapped_of_many(angle: float) -> float:
-    """:func:`wrap_scalar`, faster."""
+    """A faster :func:`wrap_scalar`."""
     return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
 
 
@@ -222,7 +222,7 @@ def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float
 def compose_scalars(
     x: float, y: float, heading: float, dx: float, dy: float, turned: float
 ) -> tuple[float, float, float]:
-    """:func:`compose` of two poses: (dx, dy, turned) is given in the frame of (x, y, heading)."""
+    """:func:`compose` of the poses (x, y, heading) and (dx, dy, turned)."""
     c, s = math.cos(heading), math.sin(heading)
     return x + c * dx - s * dy, y + s * dx + c * dy, wrap_scalar(heading + turned)
 
@@ -231,7 +231,7 @@ def compose_scalars(
 def between_scalars(
     x: float, y: float, heading: float, to_x: float, to_y: float, to: float
 ) -> tuple[float, float, float]:
-    """:func:`between` of two poses: (to_x, to_y, to) in the frame of (x, y, heading)."""
+    """:func:`between` of the poses (x, y, heading) and (to_x, to_y, to)."""
     c, s, dx, dy = math.cos(heading), math.sin(heading), to_x - x, to_y - y
     return c * dx + s * dy, c * dy - s * dx, wrap_scalar(to - heading)
 
@@ -327,8 +327,8 @@ def twists_to(pose: Array, targets: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"reassoc", "contract"})
 def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) of (x,
-    y, heading) in the world frame. ``weights`` (N,): must have the sum 1."""
+    """Return the weighted mean (3,) of poses (N, 3), and the covariance (3, 3) of (x, y, heading) in the world frame.
+    The mean of the headings is circular. ``weights`` (N,): must have the sum 1."""
     x = y = cosine = sine = 0.0
     for n in range(len(poses)):
         x, y = x + weights[n] * poses[n, 0], y + weights[n] * poses[n, 1]

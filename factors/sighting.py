@@ -15,23 +15,23 @@ from factors.se2 import Array
 
 class SightingFactor(Protocol):
     """The interface of a factor with K sightings that were measured at one time, such as the ranges and bearings of K
-    landmarks in :class:`~factors.landmarks.factor.BearingRangeFactor`. Each sighting has g coordinates."""
+    landmarks. Each sighting has g coordinates."""
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, g) and its Jacobian (K, g, d) by each value."""
+        """Return the residual (K, g), and its Jacobian (K, g, d) with respect to each value. All are whitened."""
 
     def weight(self, squared: Array) -> Array:
         """The robust weights of ``squared`` norms of whitened residuals."""
 
     def dof(self) -> int:
-        """Number of measured coordinates."""
+        """Return the number of measured coordinates."""
 
 
 def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
-    """Extend an ``offset`` (3,) to a time ``seconds`` later, at the robot's body-frame velocity ``twist`` (3,).
+    """Correct the relative pose ``offset`` (3,) for a measurement that was made ``seconds`` later.
 
-    ``offset``: the pose at the measurement's time in the frame of the pose variable, None for zero. It is returned
-    unchanged if the twist is None.
+    ``offset``: the robot's pose at the time of the measurement, in the frame of the estimated pose. None if both poses
+    are equal. ``twist`` (3,): the robot's velocity in the body frame. If it is None, the offset is returned unchanged.
     """
     if twist is None or seconds == 0.0:
         return offset
@@ -41,13 +41,12 @@ def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array 
 
 @dataclass(frozen=True)
 class Marginalized:
-    """A sighting factor on the pose only. Its remaining values are fixed, and their covariances are added to the noise.
+    """A sighting factor on the pose only, made from a factor on the pose and further variables.
 
-    ``factor``: the factor on the pose and further values, such as sensor constants or the position of a landmark.
-    ``values``: the estimates of the further values. ``covariances``: the covariance of each, None if the value is exact.
-
-    All K sightings have the error of a value in common. Its covariance is therefore multiplied by K, so that it does
-    not average out.
+    ``factor``: the factor on the pose and the further variables, such as sensor constants or the position of a
+    landmark. ``values``: the estimates of the further variables. ``covariances``: the covariance of each estimate, or
+    None if it is exact. The covariances increase the noise of the sightings. They are multiplied by the number of
+    sightings, because the error is common to all sightings and does not average out.
     """
 
     factor: SightingFactor
@@ -55,7 +54,7 @@ class Marginalized:
     covariances: tuple[Array | None, ...]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, g), and its Jacobian (K, g, 3) by the pose."""
+        """Return the residual (K, g), and its Jacobian (K, g, 3) with respect to the pose. Both are whitened."""
         residual, (by_pose, *by_values) = self.factor.whitened([values[0], *self.values])
         noise = np.eye(residual.shape[1])
         for block, covariance in zip(by_values, self.covariances, strict=True):
@@ -67,7 +66,7 @@ class Marginalized:
         return np.einsum("kij,kj->ki", whitener, residual), [whitener @ by_pose]
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (K g,) with robust weights, and its Jacobian (K g, 3) by the pose."""
+        """The whitened residual (K g,) with robust weights, and its Jacobian (K g, 3) with respect to the pose."""
         residual, (by_pose,) = self.whitened(values)
         weight = np.sqrt(self.weight(np.einsum("ki,ki->k", residual, residual)))
         return (weight[:, None] * residual).ravel(), [(weight[:, None, None] * by_pose).reshape(-1, 3)]
@@ -77,11 +76,11 @@ class Marginalized:
         return self.factor.weight(squared)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Half the sum of weighted squares of the residuals."""
+        """Return half the weighted sum of squared residuals."""
         residual, _ = self.whitened(values)
         squared = np.einsum("ki,ki->k", residual, residual)
         return float(0.5 * np.sum(self.weight(squared) * squared))
 
     def dof(self) -> int:
-        """Number of measured values."""
+        """Return the number of measured coordinates."""
         return self.factor.dof()

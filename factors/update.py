@@ -60,20 +60,19 @@ def update_state(
     ``linearize(delta)``: returns the whitened residuals (K, g) at the correction ``delta`` (S,), and their Jacobian (K,
     g, D) by the first D components of the error state.
     ``covariance`` (S, S): covariance of the error state at the prediction.
-    ``weight``: maps squared norms (K,) of whitened residuals to weights (K,). A weight is a robust weight times a
-    tempering exponent of the likelihood. The weight of zero is therefore the tempering exponent.
+    ``weight``: maps squared norms (K,) of whitened residuals to weights (K,). A weight is the robust weight times the
+    tempering exponent of the likelihood, so that ``weight(0)`` is the tempering exponent.
     ``iterations``: maximum number of iterations. They end earlier when a step is below ``converged``.
     ``dof``: number of measured values, stored in the result.
     ``common``: number of errors that all sightings have in common. They are independent unit Gaussians. ``linearize``
     gets them after the S components of the error state.
 
-    The first iteration linearises at the prediction. There the noise of a sighting is multiplied by the square of (normalised
-    innovation squared / gate) where this ratio exceeds 1, so that an outlier has less influence but is not rejected. Further
-    iterations divide the noise by the weight at the updated state (iteratively reweighted least squares). The normalised innovation
-    squared excludes the tempering. The update is in information form, or in square-root form if rounding makes that singular.
+    The first iteration linearises at the prediction. It multiplies the noise of an outlier by ``(nis / gate)^2``, with
+    the 99 % gate of the normalised innovation squared. Further iterations divide the noise by the weight at the updated
+    state (iteratively reweighted least squares).
     """
     size, priors = len(covariance), [covariance]
-    if common:  # the common errors are tempered like the sightings: their variance is divided by the exponent
+    if common:  # the variance of the common errors is divided by the tempering exponent, like that of the sightings
         tempering = weight(np.zeros(1))[0]
         priors = [np.eye(size + common) / share for share in sorted({1.0, tempering}, reverse=True)]
         for prior in priors:
@@ -82,7 +81,7 @@ def update_state(
     try:
         solve = [_informed(np.asarray(np.linalg.inv(prior))) for prior in priors]
         correction = _iterated(solve[0], solve[-1], linearize, *iterated)
-        np.linalg.cholesky(correction.covariance)  # LinAlgError if it is invalid because of rounding
+        np.linalg.cholesky(correction.covariance)  # raises LinAlgError if rounding made the covariance invalid
         if not np.all(np.isfinite(correction.delta)):
             raise np.linalg.LinAlgError("an update is not finite")
     except np.linalg.LinAlgError:
@@ -91,8 +90,8 @@ def update_state(
     return replace(correction, delta=correction.delta[:size], covariance=correction.covariance[:size, :size])
 
 
-# A function of a Jacobian (K, g, D), residuals (K, g), their weights (K,), and the correction (D,) at which they are linearised. It
-# returns the correction (S,) and the covariance (S, S).
+# Arguments of a solver: the Jacobian (K, g, D), the residuals (K, g), their weights (K,), and the correction (D,) at
+# which they are linearised. Results: the new correction (S,) and the covariance (S, S).
 _Solver = Callable[[Array, Array, Array, Array], tuple[Array, Array]]
 
 
@@ -109,7 +108,7 @@ def _iterated(
     """Run the iterations of :func:`update_state`. ``solve``: solves one linearised update. ``first_solve``: the same
     without the tempering exponent."""
     zero = np.zeros(len(covariance))
-    # numba would compile `normalised` and `inform` again for another memory order
+    # contiguous arrays, because numba would compile `normalised` and `inform` again for other memory layouts
     residual, blocks = map(np.ascontiguousarray, linearize(zero))
     size = blocks.shape[2]
     squared = normalised(residual, blocks, np.arange(size), np.ascontiguousarray(covariance))

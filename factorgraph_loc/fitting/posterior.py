@@ -24,8 +24,8 @@ MAD_TO_SIGMA = 1.4826  # factor from the median absolute deviation of a Gaussian
 # maximum number of steps; the step at which the fit has converged, and the largest step, both in standard deviations of the prior
 ITERATIONS, CONVERGED, LARGEST = 30, 3e-3, 2.0
 STEP = 1e-4  # step of numerical derivatives, in standard deviations of the prior
-LEAST_SHARE = 1e-3  # minimum of the fraction of independent information, see :func:`independent_share`
-DETERMINED = 0.7  # a parameter is hardly determined if its error exceeds this fraction of its prior standard deviation
+LEAST_SHARE = 1e-3  # minimum of the result of :func:`independent_share`
+DETERMINED = 0.7  # a parameter counts as determined if its standard error is below this fraction of its prior sigma
 CORRELATED = 0.8  # two parameters with a larger absolute correlation are reported
 
 
@@ -41,8 +41,9 @@ class Parameter:
 
 
 class LikelihoodTerms(NamedTuple):
-    """A likelihood at given values of P parameters. ``cost``: the negative log-likelihood. ``scores`` (B, P): its
-    gradient in each of B blocks of time. ``information`` (P, P): the Fisher information of all blocks together."""
+    """A likelihood and its derivatives at given values of P parameters. ``cost``: the negative log-likelihood of all
+    measurements. ``scores`` (B, P): the gradient of the cost, as one summand for each of B time intervals.
+    ``information`` (P, P): the Fisher information of all measurements."""
 
     cost: float
     scores: Array
@@ -54,9 +55,9 @@ Likelihood = Callable[[Array], LikelihoodTerms]
 
 @dataclass(frozen=True)
 class Posterior:
-    """The estimate of P parameters. ``values`` (P,): the values with the largest posterior density. ``covariance`` (P,
-    P): the covariance of their errors. ``share``: the fraction of independent information in the measurements, from 0
-    to 1, because errors of measurements that are close in time are correlated."""
+    """The estimate of P ``parameters``. ``values`` (P,): the values with the largest posterior density. ``covariance``
+    (P, P): the covariance of their errors. ``share``: the exponent of the likelihood in the posterior, from 0 to 1. It
+    is below 1 if the errors of measurements are correlated."""
 
     parameters: tuple[Parameter, ...]
     values: Array
@@ -72,7 +73,7 @@ class Posterior:
         return {p.name: float(v) for p, v in zip(self.parameters, self.values, strict=True)}
 
     def correlations(self) -> list[tuple[str, str, float]]:
-        """The pairs of parameters with an absolute correlation above :data:`CORRELATED`: two names and the correlation."""
+        """Return (name, name, correlation) of all pairs with an absolute correlation above :data:`CORRELATED`."""
         matrix = self.covariance / np.outer(self.errors, self.errors)
         rows, columns = np.nonzero(np.abs(np.triu(matrix, 1)) > CORRELATED)
         names = [p.name for p in self.parameters]
@@ -81,7 +82,7 @@ class Posterior:
 
 @dataclass(frozen=True)
 class FittedConstant:
-    """The calibration result of one constant of a sensor.
+    """The calibration result of the constant ``name`` of the sensor ``sensor``.
 
     ``initial``, ``fitted``: the values before and after the fit. ``error``: the standard error of the fitted value.
     ``prior``: the standard deviation of the prior, or None if there is no prior.
@@ -100,7 +101,7 @@ class FittedConstant:
 
     @property
     def is_determined(self) -> bool:
-        """True if the standard error is clearly smaller than the standard deviation of the prior, or if there is no prior."""
+        """True if there is no prior, or if ``error`` is less than the fraction :data:`DETERMINED` of ``prior``."""
         return self.prior is None or self.error < DETERMINED * self.prior
 
 
@@ -112,7 +113,7 @@ def maximise(
 ) -> Posterior:
     """Estimate parameters by the maximum of their posterior density.
 
-    ``parameters``: P parameters with priors. ``likelihood``: a function of their values (P,).
+    ``parameters``: P parameters with priors. ``likelihood``: returns the likelihood at parameter values (P,).
     ``start``: initial values by name; the default is the mean of the prior.
     ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas of the parameters.
     """
@@ -139,12 +140,12 @@ def maximise(
 
 
 def independent_share(scores: Array, information: Array, precision: Array | float = 0.0) -> float:
-    """The fraction of independent information in correlated measurements, at most 1. A likelihood is multiplied by this fraction.
+    """Return the exponent of a likelihood, at most 1, that corrects for correlated measurement errors.
 
-    ``scores`` (B, P): gradients of the log-likelihood in B blocks of time. ``information`` (P, P): the total Fisher
-    information. ``precision`` (P, P): the inverse covariance of the prior. If measurements are independent, the
-    covariance of the scores equals the information. The fraction is the ratio of the two (Varin, Reid and Firth, "An
-    overview of composite likelihood methods", Statistica Sinica 21, 2011, section 2.2).
+    ``scores`` (B, P): gradients of the log-likelihood of B time intervals. ``information`` (P, P): the Fisher
+    information of all intervals. ``precision`` (P, P): the inverse covariance of the prior. The exponent is the ratio
+    of the information to the empirical covariance of the scores, which are equal for independent errors (Varin, Reid
+    and Firth, "An overview of composite likelihood methods", Statistica Sinica 21, 2011, section 2.2).
     """
     inverse = np.linalg.pinv(information + precision)
     ratio = np.trace(inverse @ information) / max(float(np.trace(inverse @ (scores.T @ scores))), 1e-12)
@@ -155,7 +156,8 @@ def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Param
     """Make a likelihood of ``parameters`` from a function of residuals, with numerical derivatives and the soft-L1 loss.
 
     ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``block`` (M,):
-    the number of the time block of each row. Residuals of different blocks count as independent.
+    the number of the time interval of each row of the residuals, from :func:`blocks`. Residuals of different intervals
+    count as independent.
     """
     steps = STEP * np.diag([p.sigma for p in parameters])
 
@@ -172,15 +174,16 @@ def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Param
 
 
 def by_block(scores: Array, block: Integers) -> Array:
-    """The sums (B, P) of the rows of ``scores`` (M, P) that have the same number in ``block`` (M,)."""
+    """Sum the rows of ``scores`` (M, P) by their numbers ``block`` (M,). Row b of the result (B, P) is the sum of all
+    rows with number b."""
     out = np.zeros((int(block.max(initial=0)) + 1, scores.shape[1]))
     np.add.at(out, block, scores)
     return out
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """Divide several logs into blocks of ``length`` seconds, which are numbered consecutively. ``times``: the times [s]
-    of each log. Returns the block number of each time, for all logs in one array."""
+    """Number time intervals of ``length`` seconds consecutively through several logs. ``times``: an array of times [s]
+    for each log. Returns the interval number of each time, concatenated over the logs."""
     out: list[Integers] = []
     first = 0
     for t in times:
@@ -196,5 +199,5 @@ def robust_sigma(values: Array) -> Array:
 
 
 def centred(parameters: Sequence[Parameter], values: Mapping[str, float]) -> list[Parameter]:
-    """Return the parameters with the means of their priors replaced by ``values``, by name."""
+    """Return copies of the parameters with new prior means ``values``, which are given by name."""
     return [replace(p, mean=values[p.name]) for p in parameters]
