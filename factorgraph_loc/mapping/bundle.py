@@ -67,7 +67,7 @@ def adjust(
     lens: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:
-    """Adjust points and camera poses.
+    """Adjust points and camera poses (bundle adjustment), and optionally the camera's calibration.
 
     ``cameras``, ``covariances`` (F, 6, 6): the prior poses and their covariances, in the cameras' own frames, rotation
     first. ``tracks``: the observations. ``points`` (T, 3): the initial positions. ``focal``: estimate the focal lengths

@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FAR = 10.0  # points farther from the median than so many median absolute deviations are not drawn
+FAR = 10.0  # points are drawn up to this distance from the median, in median absolute deviations
 LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Plot a new map of tags, with the given map and the trajectory. ``log``: the name of the log in the title.
+    """Plot a new map of tags, with the given map and the trajectory, as :func:`figure` does for landmarks.
 
-    Labels are the last characters of EPCs. Candidate positions of ambiguous tags, and given tags that were not located,
-    are drawn in addition to the elements of :func:`figure`.
+    The plot also has the candidate positions of ambiguous tags, and the given tags that were not located. Labels are
+    the last characters of EPCs. ``log``: the name of the log. ``made``: the new map.
     """
     out = figure(log, made.made, made.poses, LABEL)
     axis = out.axes[0]
@@ -49,10 +49,10 @@ def dropped_figure(
     poses: Array,
     walls: Sequence[tuple[float, ...]] = (),
 ) -> Figure:
-    """Plot a map of tags with those that are believed dead crossed out.
+    """Plot a map of tags. The tags that are probably dead are crossed out.
 
-    ``places``: the position (2,) of each tag by EPC. ``dead``: by EPC of each dead tag, the probability that it is
-    dead. ``poses`` (N, 3): the trajectory. ``walls``: (x1, y1, x2, y2) of each wall.
+    ``places``: the position (2,) of each tag by EPC. ``dead``: the EPCs of the dead tags, with the probability that the
+    tag is dead. ``poses`` (N, 3): the trajectory. ``walls``: (x1, y1, x2, y2) of each wall.
     """
     kept = np.array([place for name, place in places.items() if name not in dead]).reshape(-1, 2)
     out, axis = _from_above(f"{log}: dead tags of the map", (np.array(list(places.values())), poses[:, :2]), walls)
@@ -69,8 +69,8 @@ def dropped_figure(
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
     """Plot a new map of landmarks with 2-sigma ellipses, the landmarks of the given map, and the trajectory.
 
-    ``log``: the name of the log. ``poses`` (N, 3): the trajectory in the frame of the new map. ``label``: the number of
-    last characters of a landmark's name that are shown; 0 shows the whole name.
+    ``log``: the name of the log. ``made``: the new map. ``poses`` (N, 3): the trajectory in its frame. ``label``:
+    landmarks are labelled with this many last characters of their name, or with the whole name if it is 0.
     """
     given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
     learnt = [e for e in made.entries if e.learnt is not None]
@@ -111,8 +111,7 @@ def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tup
 
 
 def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float, ...]] = ()) -> tuple[Figure, Axes]:
-    """Create a figure with one pair of axes, in the shape of the area of all ``places`` (N, 2), and draw the walls.
-    Returns figure and axes."""
+    """Return a new figure and its axes, with room for the positions ``places``, each (N, 2), and with the walls."""
     width, depth = np.maximum(np.ptp(np.concatenate(places), axis=0), 1.0)
     out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), title)
     axis: Axes = axes[0, 0]
@@ -124,5 +123,5 @@ def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float
 
 
 def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
-    """True if the given position of a landmark with the verdict ``verdict`` is in the frame of the new map ``made``."""
+    """True if the new map ``made`` has the frame of a landmark's given position. ``verdict``: on the landmark."""
     return made.judged or verdict == "given"

@@ -79,9 +79,9 @@ class Entry:
 class LandmarkMap:
     """A new map of landmarks, and its comparison with the given map.
 
-    ``world``: the new map. ``entries``: one per landmark of both maps. ``frame`` (3,): the pose of the run's frame in
-    the frame of the new map. ``judged``: True if the new map was compared with the given map; both then have the same
-    frame. ``notes``: messages for the user.
+    ``world``: the new map. ``entries``: one per landmark that is in either map. ``frame`` (3,): the pose of the run's
+    frame in the frame of the new map. ``judged``: True if the new map was compared with the given map. Both maps then
+    have the same frame. ``notes``: messages for the user.
     """
 
     world: World
@@ -114,9 +114,9 @@ class LandmarkMap:
 class Alignment:
     """The alignment of a new map with a given map.
 
-    ``pose`` (3,): the transform from the frame of the new map to that of the given map. ``covariance`` (3, 3): of its
-    x, y and angle.
-    ``inliers``: the number of landmarks that agree. ``factor``: the covariances of the new landmarks must be multiplied by it.
+    ``pose`` (3,): the transform x, y, angle from the frame of the new map to that of the given map. ``covariance`` (3,
+    3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: a correction by which the
+    covariances of the new landmarks must be multiplied.
     """
 
     pose: Array
@@ -133,9 +133,9 @@ def make_map(
 ) -> LandmarkMap:
     """Make a map of the ``learnt`` landmarks, which a run on ``log`` estimated.
 
-    ``extend``: True if the run used the log's map and estimated only the landmarks that it lacks. The given landmarks then stay
-    unchanged. False if the run used no map. If the log has a map, the learnt landmarks are aligned and compared with it.
-    ``in_frame``: True if the learnt landmarks are in the frame of the log's map already and need no alignment.
+    ``extend``: True if the run used the log's map and estimated only landmarks that the map lacks. The given landmarks
+    then stay unchanged. False if the run used no map. The learnt landmarks are then aligned and compared with the log's
+    map, if there is one. ``in_frame``: True if the learnt landmarks are in the frame of the log's map already.
 
     A given landmark is wrong if two conditions are met. Its distance from the learnt landmark is more than
     ``TOLERANCE``. The squared Mahalanobis distance exceeds ``GATE``, with the sum of the covariances of learnt
@@ -143,7 +143,7 @@ def make_map(
     """
     if not learnt and not extend:
         raise RunFailedError(
-            f"{log.name}: odometry and sightings determine the position of no landmark, so none was mapped"
+            f"{log.name}: odometry and observations determine the position of no landmark, so none was mapped"
         )
     given = log.world.landmarks
     common = [name for name in given if name in learnt]
@@ -172,11 +172,10 @@ def make_map(
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
-    """Align K points with their targets by one rotation and translation, robust to wrong targets. K must be at least
-    ``MIN_COMMON``.
+    """Return the alignment of K estimated landmarks with their given positions. It is robust to wrong given positions.
 
-    ``points``: the estimated landmarks. ``targets`` (K, 2), ``surveys`` (K, 2, 2): their given positions, and the
-    covariances of these.
+    ``points``: the estimates. ``targets`` (K, 2), ``surveys`` (K, 2, 2): the given positions and their covariances. K
+    must be at least ``MIN_COMMON``.
     """
     positions = np.array([p.position for p in points])
     covariances = np.array([p.covariance for p in points])
@@ -195,7 +194,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))
 
     def cost(pose: Array) -> float:
-        """Return the sum of truncated squared errors of an alignment. An error below the tolerance is no outlier."""
+        """Return the sum of truncated squared errors of an alignment. Errors below ``TOLERANCE`` are not truncated."""
         error, _, squared = errors(pose)
         tolerated = GATE * np.sum(error**2, axis=1) / TOLERANCE**2
         return float(np.minimum(np.minimum(squared / factor, tolerated), GATE).sum())
@@ -286,8 +285,8 @@ def _assemble(
     """Build the new map: first the landmarks of the given map in their order, then the new ones.
 
     ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new
-    map's frame. ``verdicts``: by name; others are "new". ``keep``: names of the landmarks with their given position.
-    ``flagged``: names of the landmarks whose given position is wrong. ``judged``, ``notes``: see :class:`LandmarkMap`.
+    map's frame. ``verdicts``: the verdict on each landmark by name, "new" if missing. ``keep``: names of the landmarks
+    that keep their given position. ``flagged``, ``judged``, ``notes``: see :class:`LandmarkMap`.
     """
     entries, landmarks = [], {}
     sensors = [log.rig.of(BearingRangeSettings, name) for name in log.rig.names("bearing_range")]

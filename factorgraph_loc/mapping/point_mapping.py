@@ -44,8 +44,8 @@ from factors.se2 import Array, Integers
 
 MOST_KEYFRAMES = 600
 WIDER = 1.3  # the distance between keyframes is multiplied by this while there are more than MOST_KEYFRAMES
-DEPTH = 2.0  # m: typical depth of points; gives the pixel error of a wrong camera position
-GATE = 3.0  # matches must be nearer to the epipolar line than so many standard deviations
+DEPTH = 2.0  # m: typical depth of points, to convert an error of the camera position to pixels
+GATE = 3.0  # largest distance of a match from the epipolar line, in standard deviations
 NARROW, WIDE = 3.0, 25.0  # px: bounds of this gate
 MAX_GAP = 0.5  # s: a reference is not interpolated between stamps that are farther apart
 ASKEW, AFLOAT = 0.003, 0.003  # rad, m: standard deviations of tilt and height of a robot on the floor
@@ -65,7 +65,7 @@ class PosedFrames:
 
 
 class PointSettings(FileModel):
-    """Settings of the mapping of points: keyframes, calibration, and the conditions for points of the map."""
+    """Settings of mapping points: keyframes, calibration, and the conditions that a point of the map must meet."""
 
     distance: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.1
     """distance between keyframes; 0 uses all frames"""
@@ -92,11 +92,11 @@ class PointSettings(FileModel):
 class PointReport:
     """Statistics of a map of points.
 
-    ``keyframes``, ``pairs``, ``tracks``, ``triangulated``, ``points``, ``observations``: the counts after each step.
-    ``rms``, ``mad`` [px]: root mean square and median absolute value of the pixel errors of the kept observations.
-    ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard deviation in the worst
-    direction. ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses. ``focal`` [px]: the focal
-    length fx. ``fused``: the number of points that the extended map contained already.
+    ``keyframes``, ``pairs`` (of compared images), ``tracks``, ``triangulated`` (points), ``points`` (of the map),
+    ``observations`` (of these points): numbers of each. ``rms``, ``mad`` [px]: root mean square and median absolute
+    value of the residuals. ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard
+    deviation in the worst direction. ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses.
+    ``focal`` [px]: the focal length fx. ``fused``: the number of points that the extended map contained already.
     """
 
     keyframes: int
@@ -132,11 +132,11 @@ def map_points(
     settings: PointSettings | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> MadePoints:
-    """Make a map of points from images with known camera poses, ``posed``.
+    """Make a map of points from ``posed``, images with known camera poses.
 
-    ``progress``: is called with the fraction done. Raises RunFailedError if no point is observed from several places,
-    if points and cameras cannot be adjusted, or if no point fulfils the settings. Raises InputError if the settings
-    adjust a calibration with an unsupported distortion.
+    ``progress``: is called with the fraction done. Raises RunFailedError if no point is observed from several
+    positions, if points and cameras cannot be adjusted, or if no point meets the settings. Raises InputError if the
+    settings require a new calibration of a camera with another distortion than Brown's.
     """
     settings = settings or PointSettings()
     posed = posed[chosen_keyframes(posed, settings)]
@@ -155,7 +155,7 @@ def map_points(
     total, (chosen, old) = tracks.count, tracks.kept(good[tracks.track])
     if (settings.focal or settings.lens) and not model.is_brown:
         raise InputError(
-            "a camera is adjusted only if its distortion_model is plumb_bob with four numbers: remove the settings focal and lens"
+            "focal and lens need a camera with distortion_model plumb_bob and four numbers: remove both settings"
         )
     try:
         adjusted = bundle.adjust(
@@ -174,8 +174,8 @@ def map_points(
 
 
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
-    """Return the indices of the frames that become keyframes. Their least distances are ``settings.distance`` and
-    ``settings.angle``, which are increased until there are at most :data:`MOST_KEYFRAMES`."""
+    """Return the indices of the frames that become keyframes. They are at least ``settings.distance`` or
+    ``settings.angle`` apart. Both limits are increased until there are at most :data:`MOST_KEYFRAMES`."""
     filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])
     distance, angle = settings.distance, settings.angle
     while True:
@@ -186,7 +186,7 @@ def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
 
 
 def epipolar_gate(model: CameraModel, covariances: Array) -> float:
-    """Return the largest distance [px] of a match from its epipolar line, for camera poses with ``covariances`` (F, 6, 6)."""
+    """Return the allowed distance [px] of a match from its epipolar line. ``covariances`` (F, 6, 6): of the cameras."""
     turn, shift = (np.median(np.trace(covariances[:, i : i + 3, i : i + 3], axis1=1, axis2=2)) / 3.0 for i in (0, 3))
     sigma = np.sqrt(2.0 * (model.sigma**2 + model.fx**2 * (turn + shift / DEPTH**2)))
     return float(np.clip(GATE * sigma, NARROW, WIDE))
@@ -195,7 +195,7 @@ def epipolar_gate(model: CameraModel, covariances: Array) -> float:
 def point_map(
     posed: PosedFrames, cameras: Cameras, tracks: Tracks, points: Array, covariances: Array, views: int
 ) -> PointMap:
-    """Return a map of T points, each with the descriptors of at most ``views`` observations.
+    """Return a map of T points. Each point has the descriptors of at most ``views`` observations.
 
     ``points`` (T, 3), ``covariances`` (T, 3, 3): positions and their covariances. ``cameras``: camera poses.
     ``tracks``: observations.
@@ -216,7 +216,7 @@ def point_map(
 def _made(
     posed: PosedFrames, adjusted: Bundle, settings: PointSettings, pairs: int, total: int, triangulated: int
 ) -> MadePoints:
-    """Return the map of the points that fulfil the settings, with its statistics.
+    """Return the map of the points that meet the settings, with its statistics.
 
     ``pairs``, ``total``, ``triangulated``: the numbers of compared pairs of keyframes, of tracks, and of triangulated points.
     """
@@ -254,18 +254,18 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
     )
     if not good.any():
         raise RunFailedError(
-            f"none of {len(points)} points is seen in {settings.observations} keyframes with a standard deviation of at most "
-            f"{settings.sigma:g} m and a parallax of at least {settings.parallax:g} rad"
+            f"none of {len(points)} points is observed in {settings.observations} keyframes with a standard deviation "
+            f"of at most {settings.sigma:g} m and a parallax of at least {settings.parallax:g} rad"
         )
     kept, old = tracks.kept(good[tracks.track])
     return kept, points[old], covariances[old], angles[old]
 
 
 def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int) -> Integers:
-    """Select at most ``views`` observations of each point, from viewpoints that differ. Returns their indices (V,).
+    """Return the indices (V,) of at most ``views`` observations of each point, with viewpoints that differ.
 
-    The first selected observation is nearest to the mean of direction and logarithmic distance. Each further one
-    differs most from the observations that are selected already.
+    The first selected observation has the most typical direction and distance of the camera. Each further one differs
+    most from the observations that are selected already.
     """
     chosen: list[int] = []
     order = np.argsort(tracks.track, kind="stable")

@@ -30,9 +30,9 @@ LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact
 def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
     """Merge two maps. Returns the merged map, and the number of points that both maps have in common.
 
-    A view is a descriptor of a point with the position of the observing camera. Common points are recognised by their
-    views and keep the names of ``first``. The other points of ``second`` get new names, unless they have no view. Raises InputError
-    if the maps have features of different kinds, or if a point of ``second`` without a view has the name of a point of ``first``.
+    Common points are recognised by the descriptors of their views, and keep their names in ``first``. The other points
+    of ``second`` with views get new names. Points without views keep their names. Raises InputError if the maps have
+    features of different kinds, or if a point of ``second`` without views has the name of a point of ``first``.
     """
     kinds = {points.feature for points in (first, second) if points.feature}
     if len(kinds) > 1:
@@ -57,9 +57,9 @@ def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
 
 
 def thinned(points: PointMap, most: int) -> PointMap:
-    """Select points of a map: at most ``most`` of the points with views, and all points without views.
+    """Return a map with all points without views, and at most ``most`` of the points with views.
 
-    In each cell of space the points with the smallest covariances are kept, and as many cells as possible keep points.
+    Points are removed evenly over space. In each cell of space, the points with the smallest covariances are kept.
     """
     viewed = np.unique(points.owners)
     if len(viewed) <= most:
@@ -107,8 +107,8 @@ def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers
 
 
 def _common(first: PointMap, second: PointMap) -> Array | None:
-    """Return the field ``common`` of the joined map: for each view of ``first`` and then of ``second``, the covariance of the error
-    that the points observed from there share. It is zero for a map without this field. Returns None if neither map has it."""
+    """Return the field ``common`` (V, 3, 3) of the joined map: the values of ``first``, then the values of ``second``.
+    The values are zero where a map lacks this field. Returns None if both maps lack it."""
     if first.common is None and second.common is None:
         return None
     return np.concatenate([np.zeros((len(p.owners), 3, 3)) if p.common is None else p.common for p in (first, second)])

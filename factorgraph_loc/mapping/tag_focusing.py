@@ -26,11 +26,11 @@ from factors.rfid.detection import TagArray
 from factors.rfid.signals import PhaseLikelihood, PhaseModel, PhaseReads
 from factors.se2 import Array
 
-# Exponent of the likelihood. The rig's exponent, which is used for localization, is smaller because of errors of surveyed tags.
+# exponent of the likelihood. The exponent of localization is smaller, to account for errors of the given tag positions.
 TEMPERING = 0.5
 STEP = 0.02  # m: spacing of the lattice, a quarter of the period of the likelihood
 REACH, FARTHEST = 3.0, 1.0  # half the size of the lattice: standard deviations of the prior, and upper bound in m
-SELECTIONS = 3  # iterations: the selection of the used reads depends on the position that they improve
+SELECTIONS = 3  # number of times that the used reads are selected again, because the selection depends on the position
 ITERATIONS, CONVERGED = 20, 1e-4  # of Fisher scoring; the step is in m
 FEWEST = 20  # reads
 INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and largest time between keyframes
@@ -39,11 +39,11 @@ INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and largest t
 def focused(
     log: Log, observations: TagObservations, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
 ) -> dict[int, LearntPoint]:
-    """Improve positions of tags by the phases of their reads. Returns the new positions by index of the tag.
+    """Improve positions of tags by the signal phases of their reads. Returns the new positions by index of the tag.
 
-    ``learnt``: the positions from reads and misses, by index of the tag. ``keyframes``: the estimated robot poses,
-    which are interpolated. If None, the poses of the log's reference are used. A position does not change if the height
-    of the tag is unknown or too few reads have a phase. No position changes if the rig has no section ``[rfid.phase]``.
+    ``learnt``: the initial positions, by index of the tag. ``keyframes``: the estimated trajectory of the robot. If it
+    is None, the log's reference is used. A position does not change if the height of the tag is unknown or too few
+    reads have a phase. No position changes if the rig has no section ``[rfid.phase]``.
     """
     rfid = log.rig.of(RfidSettings)
     if rfid.phase is None:
@@ -93,10 +93,10 @@ def _lattice(covariance: Array) -> Array:
 
 
 def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, offs: Array) -> Array:
-    """Return the displacement of ``offs`` (G, 2) with the largest posterior density.
+    """Return the displacement (2,) of a tag, among ``offs`` (G, 2), that has the largest posterior density.
 
-    ``start`` (2,): the current position relative to the prior. ``information`` (2, 2): the inverse covariance of the
-    prior. The likelihood of a displaced tag is computed by displacing all poses by the opposite vector.
+    ``start`` (2,): the position before the displacement, relative to the mean of the prior. ``information`` (2, 2): the
+    inverse covariance of the prior.
     """
     poses = np.column_stack((-offs, np.zeros(len(offs))))
     moved = offs + start

@@ -36,9 +36,10 @@ Poses = Literal["reference", "odometry"]
 class MadeTags:
     """A new map of tags, and its comparison with the given map.
 
-    ``world``: the map as written to a file, in the frame of the survey. ``made``: the same tags as landmarks in the world frame,
-    and the verdicts on the given tags. ``poses`` (N, 3): the trajectory in the world frame. ``open``: for each tag that was not
-    located, by EPC, the reason. ``modes``: candidate positions of ambiguous tags in the world frame, by EPC.
+    ``world``: the map as written to a file, in the frame of tag positions (rig section ``[rfid.survey]``). ``made``:
+    the same tags as landmarks in the world frame, and the verdicts on the given tags. ``poses`` (N, 3): the trajectory
+    in the world frame. ``open``: the reason why a tag was not located, by EPC. ``modes``: candidate positions of
+    ambiguous tags in the world frame, by EPC.
     """
 
     world: World
@@ -184,10 +185,10 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 def _world(
     log: Log, observations: TagObservations, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
 ) -> World:
-    """Return the map as written to a file: learnt tags in the frame of the rig's survey, and given tags unchanged.
+    """Return the map as written to a file. Learnt tags are in the frame of ``[rfid.survey]``, given tags are unchanged.
 
     ``made``: the map in the world frame. ``facing``: the facings [rad] of learnt tags in the world frame, by EPC.
-    ``in_given_frame``: True if the new map has the frame of the log's map, so that other parts of the log's map remain valid.
+    ``in_given_frame``: True if the new map has the frame of the log's map.
     """
     survey: SurveySettings = log.rig.of(SurveySettings)
     transform = survey.transform()

@@ -31,10 +31,9 @@ APART = 0.9  # least distance between candidates: m for positions, rad for facin
 SAME = 0.05  # m, rad: optima with smaller differences are equal
 # modes are merged if their distance [m] or their squared Mahalanobis distance is smaller
 MERGED, OVERLAP = 0.5, 9.0
-# m, rad: observations from poses within these differences are added up, on the lattice and in the refinement
+# m, rad: read counts are added up while the robot moves less than this: in the search on a lattice, in the refinement
 COARSE, FINE = (0.2, 0.15), (0.05, 0.03)
-# least log-likelihood of a located tag minus that of a tag out of reach. False reads give less, even at the best of thousands
-# of positions
+# least log-likelihood ratio of a located tag to a tag out of reach. Of false reads even the best position has less.
 GAIN = 8.0
 SURE = 0.95  # if the weight of a mode is larger, the other modes are ignored
 LARGEST_SIGMA = 1.0  # m: largest standard deviation of a located tag
@@ -162,7 +161,8 @@ def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCount
 def _lattice_search(
     model: RfidModel, counts: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> TagCandidates:
-    """Return the best candidates of :func:`search` on a lattice of places in reach. ``read`` (T,): mask of searched tags."""
+    """Return the best candidates on a lattice of positions where an antenna can read a tag. ``read`` (T,): mask of the
+    tags to search. The other arguments are those of :func:`search`."""
     cells = _cells(counts.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])

@@ -38,7 +38,7 @@ from factors.se2 import Array
 
 INTERVAL = 1.0  # s between keyframes
 SECTION = 15  # keyframes per section of the trajectory
-WINDOW = 90  # number of last keyframes along which new tags are searched
+WINDOW = 90  # new tags are searched with the reads of this number of last keyframes
 # m: missed reads of a tag are ignored if its distance exceeds the reach of the antennas plus this margin
 MARGIN = 1.0
 ITERATIONS, FINAL_ITERATIONS = 4, 40  # of the optimization after each section, and at the end
@@ -144,8 +144,9 @@ def _rows(
 class TagSlam:
     """The estimated trajectory and map of tags.
 
-    ``t`` (M,) [s], ``poses`` (M, 3): times and poses of the keyframes. ``tags``: the estimated positions of located tags, by index.
-    ``facing`` (T,) [rad]: the facings of all T tags, NaN where unknown. ``posteriors``: the results of the last search, per tag.
+    ``t`` (M,) [s], ``poses`` (M, 3): times and poses of the keyframes. ``tags``: the estimated positions of located
+    tags, by index. ``facing`` (T,) [rad]: the facings of all T tags, NaN where unknown. ``posteriors``: the search
+    results of all T tags.
     """
 
     t: Array
@@ -164,8 +165,8 @@ def tag_slam(
 ) -> TagSlam:
     """Estimate the positions of tags and the trajectory of the robot together.
 
-    ``prior``: the start pose, in the frame of the result. ``known`` (T,): mask of the tags whose positions are fixed at
-    ``observations.positions``. ``progress``: is called with the fraction done.
+    ``log``: supplies odometry and rig. ``prior``: the start pose, in the frame of the result. ``known`` (T,): mask of
+    the tags that are fixed at ``observations.positions``. ``progress``: is called with the fraction done.
     """
     problem = _Problem(log, observations, prior, known)
     count = len(problem.t)
@@ -183,7 +184,7 @@ def tag_slam(
 
 
 class _Problem:
-    """The least-squares problem of keyframes and mapped tags, with their current estimates. Both are added step by step."""
+    """The least-squares problem of keyframe poses and tag positions, with the current estimates of both."""
 
     def __init__(self, log: Log, observations: TagObservations, prior: PosePrior, known: NDArray[np.bool_]) -> None:
         self._observations, self._prior, self._known = observations, prior, known

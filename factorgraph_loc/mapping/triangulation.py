@@ -23,7 +23,7 @@ from factors.se2 import Array, Integers
 NEAREST, FARTHEST = 0.1, 100.0  # m: allowed depths of a point in the cameras that observe it
 PARALLAX = 0.02  # rad: least angle between two rays to a point
 ANY_SPREAD = 1e3  # largest relative standard deviation of a triangulated point: so large that none is rejected
-# a frame is matched with the overlapping frames of these ranks, nearest first
+# a frame is matched with these frames in the list of overlapping frames, sorted by distance: 0 is the nearest
 RANKS = (0, 1, 2, 4, 7, 12, 20, 33)
 APART, ASKEW = 1.0, 0.8  # m, rad: the images of cameras that differ more are assumed not to overlap
 RATIO = 0.85
@@ -147,7 +147,7 @@ def parallax(cameras: Cameras, points: Array, tracks: Tracks) -> Array:
 
 
 def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
-    """Select keyframes. Returns their indices.
+    """Return the indices of the cameras that become keyframes.
 
     The first camera is a keyframe, and each later one that differs from all earlier keyframes by ``distance`` [m] or
     ``angle`` [rad]. A second drive through the same place therefore adds no keyframes.
@@ -161,8 +161,8 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
 
 
 def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of images that probably overlap: for each image the nearest ones, and some that are
-    farther away."""
+    """Return pairs (i, j), i < j, of images that probably overlap. Each image is paired with the nearest ones, and with
+    some that are farther away."""
     pairs = set()
     for i in range(len(cameras)):
         distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
@@ -218,8 +218,9 @@ def matched_pairs(
 
 
 def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Integers, Array]]) -> Tracks:
-    """Chain matches into tracks, the best matches first. A match that would join two features of one image is left out.
+    """Join matches to tracks: features of different images that show the same point.
 
+    Matches are joined in order of descriptor distance. A match that would join two features of one image is omitted.
     ``matches``: the result of :func:`matched_pairs`.
     """
     starts = np.cumsum([0, *(len(frame.pixels) for frame in frames)])
