@@ -47,8 +47,8 @@ _IDEAL: dict[str, Any] = {"color": "black", "linewidth": 1.0, "label": "ideal"}
 class Track:
     """The plotted data of one run.
 
-    ``causal``: trajectory of the estimates at each time, None if the robot was never localized.
-    ``final``: trajectory after the run, which may be empty.
+    ``causal``: poses that were estimated online, None if the robot was never localized. ``final``: poses after all
+    measurements, which may be empty.
     ``nis``: by sensor, rows (K, 3) of time [s], normalised innovation squared, and degrees of freedom.
     ``events``: time [s] and description of each event. ``max_gap`` [s]: errors are not interpolated across longer gaps.
     ``reliability``: by sensor, the observed and the predicted numbers of detections.
@@ -95,13 +95,13 @@ def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:
 
 
 def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
-    """Insert a row of NaN into each gap of times (N,) and values (N, ...), so that a plotted line is interrupted there."""
+    """Insert a row of NaN into times (N,) and values (N, ...) in each long gap, and return both. Plotted lines end there."""
     breaks = pauses(t)
     return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
 
 def gapped_path(trajectory: Trajectory) -> Array:
-    """Return the positions (M, 2) [m] of a trajectory, with a row of NaN in each gap."""
+    """Return the positions (M, 2) [m] of a trajectory, with a row of NaN in each long gap between timestamps."""
     return with_pauses(trajectory.t, trajectory.poses[:, :2])[1]
 
 

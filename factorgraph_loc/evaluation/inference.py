@@ -30,7 +30,7 @@ from factors.se2 import Array
 SIGNIFICANT = 1.0 - CONFIDENCE  # p values below are significant
 _EXACT = 60  # maximum number of pairs for which the signed-rank distribution is computed exactly
 
-# columns of the table of differences, with their types, which a table without rows needs
+# columns of the table of differences and their types; the types are needed if the table is empty
 DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("metric", "a", "b", "log"), str),
     **dict.fromkeys(("value_a", "value_b", "difference", "low", "high"), float),
@@ -44,10 +44,11 @@ Units = Literal["logs", "seeds"]
 
 @dataclass(frozen=True)
 class Pooled:
-    """A score that is pooled over the seeds and logs of many runs.
+    """A score of a method, pooled over the seeds and logs of many runs.
 
-    ``units``: the independent units, "logs", or "seeds" of a single log. ``count``: number of units. ``logs``: number of logs.
-    ``low``, ``high``: 95 % interval over the units, None if there are too few. ``least``, ``most``: range over the units.
+    ``low``, ``high``: 95 % interval of ``value``, None if there are too few units. ``units``: "logs" are the
+    independent units, or "seeds" for a single log. ``count``: number of units. ``least``, ``most``: range over the
+    units. ``logs``: number of logs.
     """
 
     value: float
@@ -64,12 +65,12 @@ class Pooled:
 class Contrast:
     """The difference between the scores of two methods a and b.
 
-    ``difference``: pooled score of a minus that of b, negative if the scores of a are lower. ``low``, ``high``: 95 %
-    interval. ``p``: two-sided p value of the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1.
-    ``units``: "logs", or "seeds" of a single log. ``count``: number of units. Interval and test are over the units;
-    they are None if there are too few.
+    ``difference``: pooled score of a minus that of b. ``low``, ``high``: its 95 % interval. ``p``: two-sided p value of
+    the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1. Interval, p and effect are None if there are
+    too few units.
+    ``units``: "logs" are the independent units, or "seeds" if there is a single log. ``count``: number of units.
     ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of runs. ``left_out``: number of
-    runs that cannot be paired with a run of the other method on the same log and seed.
+    runs without a run of the other method on the same log and seed.
     """
 
     difference: float
@@ -87,8 +88,8 @@ class Contrast:
 def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) -> Pooled | None:
     """Pool a score over seeds, and then over logs with equal weights. Return None if there are no scores.
 
-    ``scores``: by log and seed. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``: by
-    log, a name that the variants of a log have in common. Logs with the same name count as one log.
+    ``scores``: {log: {seed: score}}. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``:
+    {log: name of its group}. All logs of a group count as one log.
     """
     known = {log: np.array([[v] for v in seeds.values() if v is not None]) for log, seeds in scores.items()}
     clusters = _clusters(known, alike)
@@ -105,11 +106,11 @@ def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) 
 def contrast(
     a: ByLog, b: ByLog, *, rms: bool, interval: bool = True, alike: Mapping[str, str] | None = None
 ) -> Contrast | None:
-    """Compare the scores ``a`` and ``b`` of two methods on common logs and seeds. Return None if they have no pair in common.
+    """Compare the scores ``a`` and ``b`` of two methods on common logs and seeds. Return None if they have no pair in
+    common.
 
     If a method ran with a single seed, its run is paired with each seed of the other method. ``rms``, ``alike``: see
-    :func:`pooled`; ``by_log`` of the result lists variants of a log separately. ``interval``: whether to compute the
-    interval, which takes time.
+    :func:`pooled`. ``interval``: whether to compute the interval, which takes time.
     """
     matched = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in matched.values()) + sum(len(b[log]) for log in b if log not in a)
@@ -144,13 +145,13 @@ def contrast(
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the table of differences between the RMSEs of all pairs of estimators ``a`` and ``b``, with :data:`DIFFERENCES`.
+    """Return the rows of a table of differences between the RMSEs of all pairs of estimators ``a`` and ``b``.
 
-    ``rows``: runs with log, estimator, seed and scores. A row of the table has the RMSEs on one log, pooled over pairs
-    of seeds, and their difference, which is negative if ``a`` is better. With enough logs for an interval there is a
-    row with log "(all)".
-    ``pairs``: number of compared pairs of runs. ``left_out``: number of runs that cannot be paired, because the other
-    estimator has no score for the same seed. Values are None if there are no pairs.
+    ``rows``: runs with log, estimator, seed and scores. A row of the result is about one log. It has the columns
+    :data:`DIFFERENCES`. ``value_a``, ``value_b``: RMSEs over pairs of seeds, None without pairs. ``difference``: a
+    minus b. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs without a run of the other
+    estimator. With enough logs there is a row with log "(all)", which alone has the interval ``low``, ``high`` of the
+    difference.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -190,7 +191,7 @@ def signed_rank(differences: Array) -> float:
     positive = int(np.rint(2.0 * ranks[differences > 0.0].sum()))
     extreme = min(positive, total - positive)
     if len(doubled) > _EXACT:
-        # continuity correction: half of the step 1 between rank sums; it is doubled, like ``extreme`` and ``total``
+        # the continuity correction of 1 / 2 is 1 here, because all rank sums are doubled
         z = (extreme + 1.0 - total / 2.0) / math.sqrt(float(np.sum(np.square(doubled.astype(float)))) / 4.0)
         return min(1.0, 2.0 * float(ndtr(z)))
     counts = np.zeros(total + 1)
@@ -208,7 +209,7 @@ def rank_biserial(differences: Array) -> float:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Correct ``p_values`` for the number of tests by Holm's method. A value of None (no test) is not counted."""
+    """Return ``p_values`` corrected for the number of tests by Holm's method. None stands for a test that was not made."""
     tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0
@@ -255,15 +256,15 @@ def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float,
 
 
 def _ranks(differences: Array) -> Array:
-    """Return the ranks (N,) of the absolute values, as ``scipy.stats.rankdata`` does. Its import takes half a
-    second."""
+    """Return the ranks (N,) of the absolute values of ``differences`` (N,), like ``scipy.stats.rankdata``, but without
+    the slow import of ``scipy.stats``."""
     _, which, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1.0))[which])
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """Return one array (K, C) of scores for each log. Logs with the same name in ``alike`` have one array together, and
-    logs without scores have none."""
+    """Return an array (K, C) for each log with scores: C scores of each of K runs. Logs of one group in ``alike`` share
+    an array."""
     merged: dict[str, list[Array]] = {}
     for log, values in scores.items():
         if len(values):

@@ -44,8 +44,8 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The entries of all sensor summaries by key, such as ``unseen`` or ``rfid``. If there are several sensors of a
-        kind, the entries of each are in a dictionary whose key is the name of the sensor."""
+        """The entries of all sensor summaries by key, such as ``unseen`` or ``rfid``. If a kind has several sensors,
+        the key is the name of a sensor, and the value a dictionary of its entries."""
         entries: dict[str, Any] = {}
         for name, summary in self.sensors.items():
             entries |= summary.found if kind_of(name) == name else {name: dict(summary.found)}
@@ -74,7 +74,7 @@ def inspect(log: Log) -> Inspection:
 
 
 def _about(name: str, summary: Summary) -> Summary:
-    """Return a summary whose lines begin with the name of the sensor if there are several sensors of its kind."""
+    """Return a summary that names the sensor in each line if there are several sensors of its kind."""
     if kind_of(name) == name:
         return summary
     text = [replace(paragraph, line=f"{name}: {paragraph.line}") for paragraph in summary.text]

@@ -31,7 +31,7 @@ from factors import chi_squared, positive, se2
 from factors.se2 import Array
 
 FEWEST_SCORED = 10  # minimum number of compared poses; with fewer a trajectory has no scores
-FREE_MAP = "unknown"  # value of an estimator's setting ``landmarks`` if it estimates the map without a given one
+FREE_MAP = "unknown"  # value of the setting ``landmarks`` of an estimator that estimates the map
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ class Errors:
     ``position`` (N,): distance [m]. ``heading`` (N,): absolute difference [rad], NaN if the reference has no heading.
     ``nees`` (N,): normalised estimation error squared of x, y and heading, or of x and y if the reference has no heading.
     ``dof``: number of these components, 3 or 2. ``nees_position`` (N,): normalised estimation error squared of x and y.
-    ``invalid`` (N,): mask of the poses whose covariance is not positive definite. There, and without covariances, NEES are NaN.
+    ``invalid`` (N,): mask of the poses with a covariance that is not positive definite. NEES are NaN if it is invalid or
+    missing.
     """
 
     t: Array
@@ -98,19 +99,19 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
 def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, Any]:
     """Return all scores of a run by key, in metres and radians. A score that is undefined is None.
 
-    - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Only runs with equal values are comparable.
-    - ``causal.*`` and ``final.*``: see :func:`accuracy`. Both are scored from the first causal estimate with a localized robot.
-      All but ``scored`` are None without a reference, or with fewer than :data:`FEWEST_SCORED` scored poses. If the robot was
-      never localized, ``causal.*`` is None, and ``final.*`` is scored from the beginning of the run.
+    - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Only runs with equal values are
+      comparable.
+    - ``causal.*``, ``final.*``: scores of the online and of the final trajectory, see :func:`accuracy`. They begin when the
+      robot is first localized. They are None without a reference, or with fewer than :data:`FEWEST_SCORED` compared poses.
     - ``time_to_localized`` [s]: time from the start of the run until the robot is localized.
     - ``landmarks.*``: see :func:`landmark_figures`; None unless the run estimated the map.
     - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each learnt constant.
     - ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*``, ``timing.*``, and the list ``warnings`` always exist.
 
-    ``align``: an alignment of the trajectories with the reference; ``none`` becomes ``se2`` if the run estimated its map. With an
-    alignment there are also ``scoring.align``, and the errors :data:`ALIGNED` [m, rad] of ``causal`` and ``final`` after it, at the
-    same times (:func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`). These errors are None without a reference. If
-    the poses do not determine the alignment, they are None and there is a warning.
+    ``align``: how to align the trajectories with the reference. If the run estimated its map, "none" becomes "se2". With an
+    alignment there are also ``scoring.align``, and the errors :data:`ALIGNED` [m, rad] after the alignment, by
+    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. If the poses do not determine the alignment, these
+    errors are None and there is a warning.
     """
     causal = result.causal()
     final = result.final
@@ -199,13 +200,13 @@ def landmark_figures(
 ) -> dict[str, Any]:
     """Return the scores of the landmarks of a run that estimated its map. A score that is undefined is None.
 
-    Estimated ``landmarks`` are compared with those of the log's map, after an alignment in the plane that moves
-    ``trajectory`` onto the reference. Without a reference, the alignment moves the landmarks onto those of the map.
+    ``landmarks``: the estimated landmarks. They are compared with the map of the log, after the planar alignment of
+    ``trajectory`` with the reference. Without a reference, the landmarks themselves are aligned with the map.
 
     - ``landmarks.count``: number of estimated landmarks that the log's map has too.
     - ``landmarks.rmse`` [m]: root mean square distance of these landmarks from the map.
-    - ``landmarks.anees``: their mean NEES, ideally 2. It is usually below 2, because the covariances include the uncertainty of the
-      start, which the alignment removes.
+    - ``landmarks.anees``: their mean NEES, ideally 2. It is usually below 2, because the covariances include the
+      uncertainty of the start, which the alignment removes.
     """
     figures: dict[str, Any] = dict.fromkeys(OF_FREE_MAP)
     names = [name for name in landmarks if name in log.world.landmarks]

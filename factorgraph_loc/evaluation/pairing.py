@@ -27,8 +27,8 @@ RATE = 10.0  # Hz; maximum rate of scored poses
 TOLERANCE = 1e-3  # s; tolerance of comparisons of timestamps
 _PAUSE = 1.0  # s; a shorter interval between timestamps is no gap
 _USUAL = 3.0  # an interval below this multiple of the median interval is no gap
-PIECE_TOLERANCE = 0.1  # maximum relative difference between the length of an overlapping piece and the requested length
-DELTA = 1.0  # length of the pieces of relative errors, in m of path and in s
+PIECE_TOLERANCE = 0.1  # maximum relative deviation of a piece's length from the requested length
+DELTA = 1.0  # relative errors are over pieces of this many metres of path, and of this many seconds
 CONFIDENCE = 0.95  # probability of all intervals
 HOW = ("rmse", "mean", "median", "p95", "max", "min", "std")  # names of statistics
 
@@ -48,8 +48,8 @@ class Pairs:
 
 
 def thinned(t: Array) -> Integers:
-    """Return the indices of the ascending timestamps ``t`` (N,) [s] at which poses are scored: the first one, and each
-    next one that is at least 0.1 s after the previously selected one."""
+    """Return the indices of the ascending timestamps ``t`` (N,) [s] at which poses are scored. The first one is
+    selected, and then each one that is at least 0.1 s after the last selected one."""
     kept: list[int] = []
     stamps, i = t.tolist(), 0
     while i < len(stamps):
@@ -144,8 +144,8 @@ def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, i
 def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
     """Return overlapping pieces of a path of N poses, one from each pose, as indices of their first and last pose.
 
-    ``steps``, ``first``: see :func:`successive`. A piece ends at the pose for which its length is nearest to ``length``. Pieces
-    whose length differs from ``length`` by a fraction of more than :data:`PIECE_TOLERANCE` are omitted.
+    ``steps``, ``first``: see :func:`successive`. The length of a piece is as near to ``length`` as possible. A piece is
+    omitted if its length deviates by more than :data:`PIECE_TOLERANCE` times ``length``.
     """
     covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
     pieces: list[tuple[int, int]] = []
@@ -153,7 +153,7 @@ def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, in
         next_index = bisect.bisect_left(covered, start + length, i + 1)
         near = [j for j in (next_index - 1, next_index) if i < j < len(covered)]
         best = min(near, key=lambda j: abs(covered[j] - start - length))
-        best = bisect.bisect_left(covered, covered[best], i + 1)  # of poses at the same distance, the first
+        best = bisect.bisect_left(covered, covered[best], i + 1)  # the first of several poses at this distance
         if abs(covered[best] - start - length) <= PIECE_TOLERANCE * length:
             pieces.append((first + i, first + best))
     return pieces

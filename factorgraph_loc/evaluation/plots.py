@@ -112,9 +112,9 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
 
 
 def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reliability]) -> Figure:
-    """Plot the ratio of observed to predicted numbers of detections, by group, with bars of two standard deviations.
+    """Plot the ratio of observed to predicted numbers of detections, with bars of two standard deviations.
 
-    ``reliability``: by sensor, the numbers of detections in groups, such as ranges of distance.
+    ``reliability``: by sensor, the numbers of detections in groups of measurements, such as ranges of distance.
     """
     figure, axes = grid(
         len(reliability), 1, 3.2 * len(reliability), f"{log.name}, {estimator}: observed over predicted detections"
@@ -214,7 +214,7 @@ def _map(axis: Axes, log: Log, view: Array | None) -> None:
 
 
 def _layers(log: Log) -> list[Marks]:
-    """Return the layers of the map whose objects are drawn individually, unlike the many points of a point map."""
+    """Return the layers of the map that are drawn as individual objects. Layers of many points are omitted."""
     return [m for m in marks(log) if not m.dense]
 
 
@@ -234,7 +234,7 @@ def _joined(segments: Array) -> Array:
 
 
 def _view(places: Array, reference: Trajectory | None) -> Array | None:
-    """Return the lower and the upper corner (2, 2) of a box around map and reference, or None without a reference."""
+    """Return the lower and upper corner (2, 2) of a box around points ``places`` (N, 2) and the reference, None without it."""
     if reference is None or not len(reference):
         return None
     points = np.concatenate((places, reference.poses[:, :2]))
@@ -260,8 +260,8 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Return the limit y of the symmetric y axis (-y to y) of a panel of :func:`_band`. Half a percent of the errors
-    and band limits are larger."""
+    """Return the upper end of the y axis of a panel of :func:`_band`; the lower end is its negative. The panel shows
+    99.5 % of the errors and band limits."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))

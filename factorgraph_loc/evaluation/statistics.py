@@ -121,9 +121,9 @@ def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """Return a quantile of N values, which may be infinite. ``share``: 0.5 for the median. Return NaN if there are no values.
+    """Return a quantile of N values, which may be infinite, by numpy's method "inverted_cdf". NaN if there are no values.
 
-    The result is the smallest of the values that at least this share of them does not exceed.
+    ``share``: probability of the quantile, such as 0.5 for the median.
     """
     known = np.asarray(values, dtype=float)
     return float(np.quantile(known, share, method="inverted_cdf")) if len(known) else math.nan
@@ -149,12 +149,12 @@ def _of_medians(
     if not len(first):
         return Interval(math.nan, lowest, math.inf)
     drawn = np.random.default_rng(_SEED).integers(len(first), size=(DRAWS, len(first)))
-    # the first row are the original cases, whose result is the value
+    # row 0 has the original cases, and each other row has a bootstrap draw
     cases = np.vstack((np.arange(len(first)), drawn))
     with np.errstate(invalid="ignore", divide="ignore"):
         figures = compare(np.median(first[cases], axis=1), np.median(second[cases], axis=1))
     tail = (1.0 - CONFIDENCE) / 2.0
-    # a draw with two infinite medians is undefined and counts at both ends of the interval
+    # a draw with two infinite medians is undefined, so that it must widen the interval at both ends
     unknown = np.isnan(figures[1:])
     low = quantile(np.where(unknown, lowest, figures[1:]), tail)
     high = quantile(np.where(unknown, math.inf, figures[1:]), 1.0 - tail)

@@ -36,12 +36,12 @@ def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ..
 
 
 def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of the table of a comparison. ``shown``: keys of the scores in it, empty for :data:`TABLE`.
+    """Return the header and the rows of a table that compares estimators. ``shown``: keys of the scores, empty for
+    :data:`TABLE`.
 
     RMSEs are pooled over seeds by the root mean square, and other scores by the mean. With several seeds a cell has the
-    standard deviation after ±. The last rows pool each estimator over the logs with equal weights. The column "runs" has the
-    number of successful runs; a pooled row with failures is not comparable with others. The column "poses scored" has the
-    numbers of scored poses (see :func:`counted`). There is a column for the time to localization if it is not always 0.
+    standard deviation after ±. The last rows pool each estimator over the logs with equal weights. The column "runs"
+    has the number of successful runs. The column "poses scored" has the numbers of scored poses (see :func:`counted`).
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -65,7 +65,7 @@ def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[li
 
 
 def unscored(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence with the reason for each log whose successful runs have no errors."""
+    """Return a sentence with the reason for each log on which no successful run has errors."""
     lines = []
     for log in dict.fromkeys(row["log"] for row in rows):
         runs = [row for row in rows if row["log"] == log and row["status"] == "ok"]
@@ -109,7 +109,7 @@ def verdict(rows: Sequence[Row]) -> list[str]:
 
 
 def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown whose columns are aligned in the plain text."""
+    """Return a table in Markdown, with columns that are aligned in the plain text."""
     texts = [list(header), *map(list, lines)]
     widths = [max(len(text[i]) for text in texts) for i in range(len(header))]
     padded = [
@@ -161,10 +161,10 @@ def _pooled(metric: Metric, by_log: Sequence[Sequence[Row]]) -> str:
 
 
 def counted(*by_log: Sequence[Row]) -> str:
-    """Return the number of scored poses on all logs as text, such as "840", or "800 to 840" if the runs of a log differ.
+    """Return the number of scored poses on all logs as text, such as "840". "" if no log has a reference.
 
-    ``by_log``: the runs on each log. The first number is the sum over logs of the smallest number, the second of the
-    largest. "" if no log has a reference.
+    ``by_log``: the runs on each log. If the runs of a log differ, the text is a range such as "800 to 840". Its ends
+    are the sums over logs of the smallest and of the largest numbers.
     """
     counts = [[c for row in runs if (c := scored_of(row)) is not None] for runs in by_log]
     known = [of_log for of_log in counts if of_log]

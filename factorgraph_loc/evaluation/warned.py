@@ -3,9 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-WARNINGS = (
-    "warnings"  # key of the warnings: a list in the scores of a run, in a row a text with one warning a line, or None
-)
+WARNINGS = "warnings"  # key of the warnings: a list in scores, a text with a line for each in a row
 SWEEP = "sweep."  # start of the names of the columns that have the swept settings of a run
 SIMULATION = "simulation"  # start of the names of swept settings of simulated logs
 

@@ -52,13 +52,13 @@ class MatchScores(NamedTuple):
 def evaluate(
     sequence: Sequence, what: Feature, progress: Callable[[], None] = lambda: None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the scores of the feature ``what`` for each pair of the first image and a later image of a sequence.
+    """Yield a dictionary of scores for each pair of the first image and a later image of a sequence.
 
-    The keys are ``feature``, ``sequence``, ``image`` (number of the later image), ``change`` and ``amount`` (see
-    :class:`~factorgraph_loc.evaluation.features.sequences.Sequence`), ``features`` (number in the later image),
-    ``milliseconds`` (time to detect and describe the features of the later image), and the fields of
-    :class:`MatchScores` and :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`. Each image is
-    processed on one thread. ``progress`` is called after each image.
+    The keys are the fields of :class:`MatchScores` and of
+    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`, and also: ``feature``, ``sequence``
+    (names), ``image`` (number of the later image), ``change`` and ``amount`` (of the sequence), ``features`` (number in
+    the later image), and ``milliseconds`` (time to detect and describe these features, on one thread). ``progress`` is
+    called after each image.
     """
     with _one_thread():
         what.find(sequence.first)  # the first call takes longer, and is not measured

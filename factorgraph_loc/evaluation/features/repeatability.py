@@ -23,8 +23,8 @@ from factors.se2 import Array
 
 OVERLAP_ERROR = 0.4  # regions correspond below this error: 1 - intersection / union
 RADIUS = 30.0  # px; radius of a scaled region in the first image
-MEASUREMENT = 3.0  # radius of the region that describes a point, divided by half the point's size (its diameter)
-SCALE_RATIO = 1.2  # maximum ratio between the sizes of two points that correspond in the score ``strict``
+MEASUREMENT = 3.0  # radius of the region that describes a point, in units of the point's radius (half of its size)
+SCALE_RATIO = 1.2  # maximum ratio between the sizes of corresponding points for the score ``strict``
 
 _NODES = 64  # number of nodes of the integration over a disc
 _CHUNK = 20_000  # number of pairs in one comparison, to limit memory
@@ -34,10 +34,10 @@ Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both i
 
 
 class Repeatability(NamedTuple):
-    """Repeatability scores of a pair of images, from 0 to 1. Both are 0 if ``regions`` is 0.
+    """Repeatability scores of a pair of images, from 0 to 1. Both scores are 0 if ``regions`` is 0.
 
-    ``regions``: number of regions in the common part of the images, in the image that has fewer. ``repeatability``: number of
-    corresponding regions (:func:`overlaps`) divided by ``regions``. ``strict``: the same with :func:`alike_regions`.
+    Regions in the common part of both images are counted in each image. ``regions``: the smaller count. ``repeatability``:
+    number of corresponding regions (:func:`overlaps`) divided by ``regions``. ``strict``: the same with :func:`alike_regions`.
     """
 
     regions: int
@@ -49,8 +49,8 @@ class Repeatability(NamedTuple):
 class Candidates:
     """M pairs of regions that may correspond. ``first``, ``second`` (M,): indices of the regions in each image.
 
-    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region, mapped to the first image, divided by that
-    of the first.
+    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region, mapped to the first image, divided by the
+    size of the first region.
     """
 
     first: Integers
@@ -59,7 +59,8 @@ class Candidates:
     ratio: Array
 
     def best(self, chosen: Truths) -> Candidates:
-        """Select one-to-one pairs from those in the mask ``chosen`` (M,), in the order of increasing error."""
+        """Return one-to-one pairs. They are selected in the order of increasing error from the pairs in the mask
+        ``chosen`` (M,)."""
         taken_first: set[int] = set()
         taken_second: set[int] = set()
         rows = []
@@ -91,8 +92,8 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 
 def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
-    """Return one-to-one pairs of points of two images with a ratio of sizes below :data:`SCALE_RATIO` and regions that
-    overlap without magnification (see :func:`overlaps`)."""
+    """Return one-to-one pairs of points that have a ratio of sizes below :data:`SCALE_RATIO` and overlapping regions.
+    Regions are not magnified (see :func:`overlaps`)."""
     pairs = overlaps(first, second, homography, magnified=False)
     alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
     return pairs.best((pairs.error < OVERLAP_ERROR) & alike)
@@ -109,10 +110,11 @@ def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shape
 
 
 def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Candidates:
-    """Return the pairs of points whose regions may have an overlap error below :data:`OVERLAP_ERROR`.
+    """Return candidates for pairs of overlapping regions, with their overlap errors (see :func:`pair_errors`).
 
-    ``magnified``: if true, both regions are scaled by one factor, so that the first has the radius :data:`RADIUS`. The distance
-    of the centres is not scaled. If false, the radius of a region is :data:`MEASUREMENT` times half the size of its point.
+    All pairs with an error below :data:`OVERLAP_ERROR` are among the candidates. ``magnified``: if true, both regions
+    are enlarged by the same factor, so that the first region has the radius :data:`RADIUS`. Otherwise the radius of a
+    region is :data:`MEASUREMENT` times half the size of its point.
     """
     if len(first) == 0 or len(second) == 0:
         none = np.empty(0, dtype=np.int64)
@@ -137,7 +139,7 @@ def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magni
     """
     back = invert(homography)
     radius = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
-    # in units of this radius the first region is the unit disc
+    # lengths are in units of ``radius``, so that the first region is the unit disc
     centre = (project(back, second.points) - first.points) / radius[:, None]
     local = jacobians(back, second.points) * (second.sizes / first.sizes)[:, None, None]
     ellipse = local @ local.transpose(0, 2, 1)
@@ -168,13 +170,13 @@ def shared_area(centres: Array, ellipses: Array) -> Array:
 
 
 def distinct(keypoints: Keypoints) -> Keypoints:
-    """Return the points without those that have the position and the size of an earlier point."""
+    """Return the keypoints without duplicates, which have the same position and size."""
     rows = np.column_stack((keypoints.points, keypoints.sizes))
     _, index = np.unique(rows, axis=0, return_index=True)
     return keypoints[np.sort(index)]
 
 
 def _sizes_in_first(second: Keypoints, homography: Array) -> Array:
-    """Return the sizes of points of the second image in the first image: the diameters of discs that have the mapped area."""
+    """Return the sizes of points of the second image after mapping to the first image, as diameters of discs of equal area."""
     areas = np.abs(np.linalg.det(jacobians(invert(homography), second.points)))
     return np.asarray(second.sizes * np.sqrt(areas))

@@ -66,7 +66,7 @@ def write_scores(scores: pl.DataFrame, out: Path) -> None:
 
 
 def summary(scores: pl.DataFrame) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of a table of features, with the mean of each score over the pairs of images.
+    """Return the header and the rows of a table of the mean scores of each feature over all pairs of images.
 
     For times it has the median, because other processes cause outliers. A dash is a score that the feature does not have.
     """
@@ -96,8 +96,8 @@ def tables(scores: pl.DataFrame) -> str:
 
 
 def figure3(scores: pl.DataFrame) -> Any:
-    """Plot repeatability over the change between the images, with a panel for each sequence. Photographs with the same
-    warp are averaged."""
+    """Plot repeatability over the amount of change, with a panel for each sequence. Sequences that were made from
+    different photographs by the same changes share a panel, and their scores are averaged."""
     panels = _panels(scores)
     names = scores["feature"].unique(maintain_order=True).to_list()
     figure, axes = grid(len(panels), 1, 3.6 * len(panels) + 1.2)
@@ -113,7 +113,7 @@ def figure3(scores: pl.DataFrame) -> Any:
 
 
 def _panels(scores: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """Return the scores for each panel of the plot by its title. Photographs with the same warps have one panel together."""
+    """Return {title of a panel: the scores in it}. Sequences made from photographs by the same changes share a panel."""
     members: dict[tuple[Any, ...], list[str]] = {}
     for sequence in scores["sequence"].unique(maintain_order=True):
         rows = scores.filter(pl.col("sequence") == sequence)

@@ -28,15 +28,15 @@ ROTATIONS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # rotations of photographs, in
 MIN_WARPED = 128  # px; minimum side of a photograph, because it must have features when reduced to a quarter
 
 SCALE, ROTATION, VIEWPOINT, OTHER = "scale change", "rotation [degrees]", "viewpoint (tilt)", "image"
-_SCALED, _TURNED, _TILTED = 1.3, np.radians(10.0), 1.3  # minimum zoom, rotation and tilt of the dominant change
+_SCALED, _TURNED, _TILTED = 1.3, np.radians(10.0), 1.3  # smaller changes are not dominant
 _SUFFIXES = ("", ".txt", ".xml")
 
 
 class ViewChange(NamedTuple):
     """Change of view from a first image to a second one.
 
-    ``zoom``: above 1 if the scene is larger in the second image. ``rotation`` [rad]. ``tilt``: a small circle becomes
-    an ellipse, and this is the ratio of its axes, at least 1.
+    ``zoom``: above 1 if the scene is larger in the second image. ``rotation`` [rad]. ``tilt``: the ratio of the axes of
+    the ellipse to which a small circle is mapped, at least 1.
     """
 
     zoom: float
@@ -45,9 +45,9 @@ class ViewChange(NamedTuple):
 
 
 def project(homography: Array, points: Array) -> Array:
-    """Map points (N, 2) [px] of the first image to the second image (N, 2). Points that lie at or behind infinity become NaN.
+    """Map points (N, 2) [px] of the first image to the second image (N, 2). A point without a finite image becomes NaN.
 
-    ``homography`` (3, 3): a matrix from :func:`checked`, which determines its sign, or the inverse of such a matrix.
+    ``homography`` (3, 3): a matrix that :func:`checked` returned, or its inverse.
     """
     mapped = points @ homography[:, :2].T + homography[:, 2]
     w = np.where(mapped[:, 2] > 0.0, mapped[:, 2], np.nan)
@@ -55,7 +55,7 @@ def project(homography: Array, points: Array) -> Array:
 
 
 def jacobians(homography: Array, points: Array) -> Array:
-    """Return the derivatives (N, 2, 2) of :func:`project` at ``points`` (N, 2). They map small regions around the points."""
+    """Return the Jacobian matrices (N, 2, 2) of :func:`project` at ``points`` (N, 2)."""
     w = points @ homography[2, :2] + homography[2, 2]
     return np.asarray(
         (homography[:2, :2] - project(homography, points)[:, :, None] * homography[2, :2]) / w[:, None, None]
@@ -80,7 +80,7 @@ def corners(shape: tuple[int, ...]) -> Array:
 
 
 def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
-    """Return zoom, rotation and tilt of a ``homography`` at the centre of the first image, which has ``shape``."""
+    """Return zoom, rotation and tilt of a ``homography`` at the centre of the first image of ``shape`` (height, width, ...)."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
     left, axes, right = np.linalg.svd(local)
     turn = left @ right
@@ -90,9 +90,9 @@ def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
 
 
 def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
-    """Check a homography, and scale it so that its third homogeneous coordinate is positive on the whole first image.
+    """Check a homography (3, 3), and return it scaled so that third homogeneous coordinates are positive in the first image.
 
-    ``matrix`` (3, 3). ``shape``: of the first image. Raises InputError with the file ``source`` if it is not a valid homography.
+    ``shape``: of the first image. Raises InputError with the file name ``source`` if it is not a valid homography.
     """
     if matrix.shape != (3, 3):
         raise InputError(f"{source}: has {matrix.size} numbers, expected the 9 numbers of a homography")
@@ -190,13 +190,12 @@ def read_sequence(folder: Path) -> Sequence:
 
 
 def warped(photograph: Image, source: Path) -> list[Sequence]:
-    """Make two sequences from a photograph: one with the photograph reduced by :data:`ZOOMS`, one with it rotated by
+    """Make two sequences from a photograph: reduced by the factors :data:`ZOOMS`, and rotated by the angles
     :data:`ROTATIONS`.
 
-    A reduced photograph (area averaging) is pasted onto the centre of its mirror image at full size. This imitates a
-    more distant camera, which sees many points outside of the scene. Rotated images, and their first image, are cropped
-    to the largest square without empty corners in any of them. Raises InputError with the file ``source`` if the
-    photograph is too small.
+    The background of a reduced photograph is its mirror image at full size. All images of the rotated sequence are
+    cropped to the largest square without empty corners. ``source``: file of the photograph, for the names of the
+    sequences and for messages. Raises InputError if the photograph is too small.
     """
     height, width = photograph.shape[:2]
     if min(height, width) < MIN_WARPED:
@@ -262,8 +261,8 @@ def _images(folder: Path) -> dict[int, Path]:
 
 
 def _change(views: Several[ViewChange]) -> tuple[str, tuple[float, ...]]:
-    """Return the dominant change of a sequence, and its amount in each view. If no view changes much, as with blur or
-    light, the amounts are the numbers of the images."""
+    """Return the dominant change of a sequence, and its amount in each view. If no view changes much, for example with
+    blur, the amounts are the numbers of the images."""
     zooms = [max(v.zoom, 1.0 / v.zoom) for v in views]
     if max(v.tilt for v in views) > _TILTED:
         return VIEWPOINT, tuple(v.tilt for v in views)

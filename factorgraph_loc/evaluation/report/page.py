@@ -84,7 +84,7 @@ def write_report(
 
 
 def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dict[str, Any]:
-    """Return the values of the page that depend only on the rows of the runs."""
+    """Return the variables of the HTML template that depend only on the rows of the runs."""
     best = [results.compare(metric) for metric in metrics]
     against = [results.compare(metric, baseline) for metric in metrics]
     times = _known(results, tuple(TIMINGS), whole=False)
@@ -109,8 +109,8 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
 
 
 def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
-    """Return the values of the page that are read from the files of the runs. Of runs that differ only in the seed, the
-    page shows the trajectory of the one with the median of the score ``metric``."""
+    """Return the variables of the HTML template that are read from the files of the runs. Only one trajectory per
+    variant and log is shown: that of the run with the median of the score ``metric`` over seeds."""
     read = read_runs(results, metric, runs)
     return {
         "tracks": read.tracks,
@@ -126,7 +126,7 @@ def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
 
 def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
     """Return the metrics with the given ``keys`` for which at least one run has a score. If there are none, return all
-    metrics if ``whole`` is set, otherwise an empty list."""
+    metrics, or an empty list if ``whole`` is false."""
     known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return known or ([metric_of(k) for k in keys] if whole else [])
 

@@ -135,10 +135,10 @@ def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
 
 
 def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple[float, float, float, float]]]:
-    """Return the points of each line in a plot of a metric over a swept setting, by name of the line. ``column``: the setting.
+    """Return {name of a line: its points} for a plot of a metric over a swept setting. ``column``: the setting.
 
-    There is a line for each label and each combination of the other swept settings. A point consists of the value of the setting,
-    the pooled metric, and the lower and upper bound of its interval, or of its range if it has no interval.
+    There is a line for each label and each combination of the other swept settings. A point consists of the value of the
+    setting, the pooled metric, and the bounds of its interval. Without an interval, the bounds are the range of the metric.
     """
     lines: dict[str, dict[float, dict[str, dict[int, float | None]]]] = {}
     for variant in results.variants:

@@ -46,8 +46,9 @@ class RunData:
 
     ``tracks``: by log, its map and trajectories with a reduced number of poses.
     ``errors``: by kind of trajectory (causal, final), variant and log, quantiles of the position error [m].
-    ``nees``: by variant and log, the mean NEES of the causal poses. ``trust``: by variant, the mean of ``nees`` over logs and the
-    bounds of its 95 % interval for correct covariances. ``configs``: the configuration of each drawn run by a description.
+    ``nees``: by variant and log, the mean NEES of the causal poses. ``trust``: by variant, the mean of ``nees`` over
+    logs and the bounds of its 95 % interval for correct covariances. ``configs``: {variant, log and seed as text:
+    content of the run's config file}.
     """
 
     tracks: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -160,8 +161,8 @@ class Results:
     """The runs of an experiment by variant and log. A variant is an estimator with certain settings and sensors.
 
     ``variants``: the label of each variant, by its name on the page. ``logs``: the name of each log, by its name on the page.
-    ``rows``: all runs as dictionaries. ``sweeps``: columns of the swept settings that vary. A simulated log appears once for each
-    value of a swept setting of the simulation. Intervals and tests count these variants of a log as one log.
+    If a setting of the simulation is swept, the page lists a log once for each value, but tests count these logs as one.
+    ``rows``: all runs as dictionaries. ``sweeps``: columns of the swept settings that vary.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
@@ -229,7 +230,7 @@ class Results:
         ]
 
     def _pool(self, metric: Metric, variant: str, scores: ByLog) -> Pooled | None:
-        """Return the pooled score of a variant, and keep it for later calls. None if there are no scores."""
+        """Return the pooled score of a variant from a cache, or compute it. Return None if there are no scores."""
         key = (metric.key, variant)
         if key not in self._pooled:
             self._pooled[key] = pooled(scores, rms=metric.rms, alike=self.logs)
@@ -246,7 +247,7 @@ class Results:
         return _named(str(row["log"]), self._swept(row, of_log=True))
 
     def _swept(self, row: Row, *, of_log: bool) -> list[str]:
-        """Return the swept settings of a run as "name value": those of its simulated log (``of_log``) or of its estimator."""
+        """Return the swept settings of a run as texts "name value": of the simulation if ``of_log``, else of the estimator."""
         known = [c for c in self.sweeps if row.get(c) is not None and of_log == c.startswith(f"{SWEEP}{SIMULATION}.")]
         return [f"{short_name(c)} {f'{row[c]:g}' if isinstance(row[c], float) else row[c]}" for c in known]
 
@@ -276,8 +277,8 @@ def score(row: Row, metric: str) -> float | None:
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
-    """Return the best of the complete variants, or None if there is none. A variant is complete if it has a score on
-    every log that any variant has a score on."""
+    """Return the best variant, or None if there is none. Only variants that have a score on every log with scores are
+    compared."""
     if metric.better is None or not figures:
         return None
     complete = {

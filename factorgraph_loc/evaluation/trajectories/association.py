@@ -46,10 +46,10 @@ def associate(
     If a trajectory has no timestamps, poses are paired by index, and both must have the same number of poses. Otherwise
     ``how`` is one of these:
 
-    - "nearest": each pose of the trajectory with fewer poses is paired with the pose of the other trajectory that is nearest in
-      time, if it is at most ``max_diff`` [s] away.
-    - "interpolate": the estimate is interpolated at timestamps of the reference, across gaps of at most ``max_gap`` [s], see
-      :mod:`factorgraph_loc.evaluation.pairing`. If one trajectory is planar, both are compared in the plane.
+    - "nearest": each pose of the trajectory with fewer poses is paired with the pose of the other that is nearest in
+      time. Poses more than ``max_diff`` [s] apart are not paired.
+    - "interpolate": the estimate is interpolated at timestamps of the reference, across gaps of at most ``max_gap``
+      [s], see :mod:`factorgraph_loc.evaluation.pairing`. If one trajectory is planar, both are compared in the plane.
 
     Raises InputError if there are no pairs.
     """
@@ -101,8 +101,7 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
 def in_plane(
     pair: Pairs, estimate: Trajectory, reference: Trajectory, names: tuple[str, str] = ("", ""), t0_ns: int = 0
 ) -> Associated:
-    """Convert ``pair``, the paired poses of two planar trajectories, to poses in space. Pairs with a NaN pose are
-    omitted, and count as gaps.
+    """Convert the paired poses ``pair`` of two planar trajectories to poses in space. Pairs with NaN are omitted as gaps.
 
     ``estimate``, ``reference``: the trajectories that were paired. ``names``: their names. ``t0_ns``: timestamp of the time 0.
     """
@@ -155,7 +154,7 @@ def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Simila
     """Return the transformation that moves the N poses of the ``estimate`` onto the N poses of the ``reference``.
 
     - "none": the identity.
-    - "origin": moves the first pose onto the first pose.
+    - "origin": moves the first pose of the estimate to the first pose of the reference.
     - "se2": the motion in the plane with the least sum of squared distances between the positions.
     - "yaw": the same for a motion in space that turns only about the vertical.
     - "se3": the same for any motion in space.

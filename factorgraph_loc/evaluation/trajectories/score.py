@@ -272,15 +272,15 @@ def _angles(rotations: Array) -> Array:
 
 
 def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
-    """Return the times (N,) [s] of pairs since the first pair, from the timestamps of the estimate if it has any, or
-    else from those of the reference ``truth``. Return None if neither has timestamps."""
+    """Return the times (N,) [s] of pairs since the first pair, by the timestamps of the estimate or else of the
+    reference. Return None if neither has timestamps."""
     t_ns = truth.t_ns if estimate.t_ns is None else estimate.t_ns
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
 
 def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[Notice]:
-    """Return warnings about heights that vary although ``align`` ignores them, and about a planar trajectory that is
-    compared in space with a trajectory at other heights."""
+    """Return warnings about heights: if they vary although ``align`` ignores them, or if a planar trajectory is
+    compared with one at other heights."""
     if align == "se2":
         rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]
         sentence = "{path}: z varies by {rise:.1f} m and is ignored: check that its z axis points up"
