@@ -50,8 +50,8 @@ def calibrate(
     log. ``progress``: called with the number of steps done and the number of all steps.
     ``grids``: path prefix of the files of learnt detection grids, required for logs with tag reads.
 
-    Raises InputError if a log lacks a reference or odometry, is too short, or has other sensors than the first log.
-    It must also have exteroceptive measurements or a reference with headings.
+    Raises InputError if some logs have a reference and others not, or if a log is too short, lacks odometry, or has
+    other sensors than the first log. A log needs exteroceptive measurements, or a reference with headings.
     """
     report = progress or (lambda _done, _total: None)
     blind = bool(logs) and all(log.reference is None for log in logs)
@@ -85,7 +85,7 @@ def calibrate(
 
 
 def _doubted(trials: Sequence[Trial]) -> list[Notice]:
-    """Return warnings about landmarks or tags that the smoother considers moved or dead on held-out logs, one for each kind."""
+    """Return a warning for each kind of error in the map, such as moved tags, with all names from the held-out logs."""
     doubted: dict[str, dict[str, None]] = {}
     for trial in trials:
         for kind, names in trial.doubted.items() if trial.estimator == "smoother" else ():
@@ -97,7 +97,7 @@ def _doubted(trials: Sequence[Trial]) -> list[Notice]:
 def check(logs: Sequence[Log], *, blind: bool = False) -> None:
     """Raise InputError if logs cannot be calibrated together.
 
-    The reasons are a missing reference unless ``blind`` is set, missing odometry or measurements, or different sensors.
+    The logs must have odometry, measurements, equal sensors, and, unless ``blind`` is set, a reference.
     """
     if not logs:
         raise InputError("there is no log to calibrate from")

@@ -26,7 +26,7 @@ RIGS = ("input", "learnt")
 LONGEST = 150.0  # s; maximum duration of a held-out section of a log
 MOST = 4  # maximum number of sections of a log
 FEWEST_POSES = 20  # minimum number of poses of the reference in a section
-WORSE, WORST = 1.02, 1.10  # a rig is refused if its error grows by more: pooled over all logs, or on one log
+WORSE, WORST = 1.02, 1.10  # a rig is refused above these ratios of errors: over all logs, on one log
 
 Scores = Mapping[str, Any]
 
@@ -130,10 +130,10 @@ def growth(trials: Sequence[Trial]) -> float:
 
 
 def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
-    """Return the ratio of a loss with the learnt rig to that with the input rig.
+    """Return the ratio of a loss with the learnt rig to that with the input rig. Return NaN if no trial has scores of both.
 
-    ``loss``: a function (trials, rig, kind) that returns a number, where kind is "causal" or "final". The ratio is the geometric
-    mean over the estimators and over causal and final trajectories, or NaN if no trial has scores of both rigs.
+    ``loss``: a function (trials, rig, kind) that returns a number, where kind is "causal" or "final". The ratio is the
+    geometric mean over the estimators and over causal and final trajectories.
     """
     ratios = [
         loss(mine, "learnt", kind) / max(loss(mine, "input", kind), 1e-9)
@@ -145,7 +145,7 @@ def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], 
 
 
 def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    """Return the factor (at least 1) between the ANEES and its ideal value, the number of dimensions."""
+    """Return the factor (at least 1) between the pooled ANEES of a rig and its ideal value, the number of dimensions."""
     dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
     factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
     return max(factor, 1.0 / factor)
@@ -161,7 +161,7 @@ def refusal(trials: Sequence[Trial]) -> str:
     for log in dict.fromkeys(t.log for t in trials):
         if (own := growth([t for t in trials if t.log == log])) > WORST:
             return f"errors on {log}, held out, are {own:.2f} times those with the input rig"
-    # the limit for standard deviations is the factor WORST, and for ANEES, a ratio of squares, the square of WORST
+    # WORST limits ratios of standard deviations; ANEES is a ratio of variances, so that its limit is squared
     if (away := _ratio(trials, _anees_factor)) > WORST**2 and pooled_growth > 1.0 / WORST:
         ratio = f"{pooled_growth:.2f} times those with the input rig"
         return f"errors on held-out logs are {ratio}, but ANEES is {away:.2f} times as far from its ideal"

@@ -78,11 +78,11 @@ def learn(
     grids: Path | None = None,
     like: Knowledge | None = None,
 ) -> Knowledge:
-    """Learn a rig from logs along their trajectories. Given the trajectory, the sensors are independent and are learnt separately.
+    """Learn a rig from logs with known trajectories. The constants of each sensor are learnt separately.
 
-    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first turn of smoothing
-    and learning, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written.
-    ``like``: a result from more logs, whose choices between models are kept. Raises InputError if a log is too short.
+    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first turn of smoothing and
+    learning, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written. ``like``: a
+    result from more logs; the sensor models selected there are used again. Raises InputError if a log is too short.
     """
     traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]
     sensors, learnt = {}, rig
@@ -94,8 +94,8 @@ def learn(
 
 
 def sensing(rig: Rig, log: Log) -> Rig:
-    """Return ``rig`` with another list ``sensors``: exteroceptive sensors are listed if the log has their measurements.
-    Other sensors stay in the list."""
+    """Return a copy of ``rig`` for a log. Its list ``sensors`` has the exteroceptive sensors with measurements in the
+    log, and all other sensors of ``rig.sensors``."""
     sensed = senses(rig)
     kept = [name for name in rig.sensors if name not in sensed or name in log.streams]
     added = [name for name in sensed if name in log.streams and name not in kept]

@@ -42,9 +42,9 @@ def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = (
 
 
 def accuracy_table(calibration: Calibration) -> Rows:
-    """Return a table of the errors on each held-out log and over all logs, with the input rig and with the learnt rig.
+    """Return a table of the errors on each held-out log and over all logs, with the input rig and with a learnt rig.
 
-    The learnt rig of a held-out log is learnt from the other data.
+    For each held-out log, the rig is learnt from the other data.
     """
     header = ("held-out log", "estimator", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
     rows = []
@@ -71,7 +71,7 @@ def summary(calibration: Calibration) -> list[str]:
     if vague := [_name(c) for c in constants if not c.is_determined]:
         lines.append(f"not determined by the logs, and therefore near the input rig: {listed(vague)}")
     if alike := [f"{a} and {b} ({rho:+.2f})" for a, b, rho in _correlations(calibration)]:
-        lines.append(f"known mainly by their sum or difference (correlation): {listed(alike)}")
+        lines.append(f"strongly correlated, so that only their sum or difference is certain: {listed(alike)}")
     for estimator in ESTIMATORS if calibration.trials else ():
         trials = [t for t in calibration.trials if t.estimator == estimator]
         figures = [
@@ -81,7 +81,7 @@ def summary(calibration: Calibration) -> list[str]:
     if calibration.knowledge.turns:
         turns = len(calibration.knowledge.turns)
         lines.append(
-            f"learnt without a reference, in {turns} turns with the smoother; noise and survey are not determined"
+            f"learnt without a reference, in {turns} turns with the smoother; noise and [survey] are not learnt"
         )
     elif calibration.refused:
         lines.append(f"the input rig is kept: {calibration.refused}")

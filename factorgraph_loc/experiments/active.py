@@ -44,7 +44,8 @@ PLOTS, PICTURE = "plots", "run.png"
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """A planned run of active localization in the simulated world ``simulation``. ``pictured``: whether the run is plotted."""
+    """A planned run of active localization in the simulated world ``simulation``. ``pictured``: whether to plot the
+    run."""
 
     simulation: SimulationSettings
     policy: str
@@ -65,8 +66,8 @@ class ActiveJob:
         return digest_of(given + [model.model_dump(mode="json") for model in (self.simulation, self.settings)])
 
     def make(self) -> Files:
-        """Execute the run. Return its files as {file name: content}: the scores as JSON and the plot as PNG, or for
-        invalid input the file that describes the failure."""
+        """Execute the run. Return its files as {file name: content}: the scores as JSON and the plot as PNG. If the run
+        rejects its input, the only file describes the failure."""
         try:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)
         except InputError as error:
@@ -101,15 +102,17 @@ def active(
     """Simulate robots that drive from an unknown start until they are localized, for each policy, estimator and seed.
 
     ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``out``: folder for the
-    results. ``overwrite``: True to replace results in it. ``changes``: nested settings of robot, policy or world, such
-    as ``{"policy": {"horizon": 8}}``. ``jobs``: number of parallel processes, None for one per core. ``progress``:
-    called with the number of finished runs and of all runs.
+    results. ``overwrite``: whether existing results in ``out`` may be replaced. ``changes``: nested settings of robot, policy
+    or world, such as ``{"policy": {"horizon": 8}}``. ``jobs``: number of parallel processes, None for one per core.
+    ``progress``: called with the number of finished runs and of all runs.
 
     The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
     :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and
-    ``plots/comparison.png``. For each policy and estimator there is a plot of the run with the first seed. A failed run
-    has a row with the reason. The same call resumes an interrupted experiment. Raises InputError if a name is unknown
-    or repeated, if ``out`` contains results and ``overwrite`` is false, or if every run rejects its input.
+    ``plots/comparison.png``. For each policy and estimator there is a plot of the run with the first seed. A failed run has a
+    row with the reason. The same call resumes an interrupted experiment.
+
+    Raises InputError for an unknown or repeated name, for results in ``out`` without ``overwrite``, or if every run fails on
+    its input.
     """
     simulation, settings = _settings(world, changes or {})
     seeds, out = list(seeds), Path(out)
@@ -163,7 +166,7 @@ def _write(table: pl.DataFrame, jobs: Sequence[ActiveJob], out: Path) -> None:
 def _settings(
     world: str | Path | SimulationSettings, changes: Mapping[str, Any]
 ) -> tuple[SimulationSettings, ActiveSettings]:
-    """Return the settings of the simulated world and of the run. Each key of ``changes`` replaces a setting of one of the two."""
+    """Return the settings of the simulated world and of the run, with ``changes``. Raises InputError for an unknown key."""
     of_run, of_world = ActiveSettings.model_fields, SimulationSettings.model_fields
     for key in changes:
         if key not in of_run and key not in of_world:
@@ -179,7 +182,7 @@ def _settings(
 
 
 def figures_of(run: ActiveRun) -> dict[str, float | None]:
-    """Return the columns of a run in the table of results by name, such as ``metres`` and ``planning_ms``."""
+    """Return the scores of a run by column of the table of results, such as ``metres`` and ``planning_ms``."""
     times = run.planning_ms
     return {
         "localized": run.localized,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Case = tuple[str, str]  # world, estimator
 
-# columns of the table of differences, with their types, which a table without rows needs
+# columns of the table of differences and their types; the types are needed if the table is empty
 DIFFERENCES: dict[str, type] = {
     **dict.fromkeys(("world", "estimator", "a", "b"), str),
     "pairs": int,
@@ -102,12 +102,14 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Compare the first policy ``a`` with each further policy ``b``, on common seeds, for each world and estimator.
+    """Return comparisons of the first policy ``a`` with each further policy ``b``, for each world and estimator, by
+    key:
 
     - ``difference``, ``low``, ``high`` [m]: median distance of a minus that of b, and its 95 % interval.
     - ``ratio``, ``ratio_low``, ``ratio_high``: median distance of a divided by that of b, and its 95 % interval.
     - ``failed_only_a``, ``failed_only_b``: number of seeds with a failure of a only, and of b only.
-    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of common seeds.
+    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of common seeds; others are not
+      used.
     """
     results = []
     first, *further = policies(rows)
@@ -193,7 +195,7 @@ def _median(rows: Sequence[Row], key: str) -> float:
 
 
 def comparison(rows: Sequence[Row]) -> Figure:
-    """Plot for each world and estimator the distances until localization as a box per policy, and the fraction of
+    """Plot the distance until localization for each world and estimator: a box for each policy, and the fraction of
     localized runs over distance."""
     panels = cases(rows)
     seeds = len({row["seed"] for row in rows})
@@ -273,7 +275,7 @@ def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 
 def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
-    """Return the largest distance [m] that a robot drove in a run of ``case`` (world, estimator), or 1 if there is no run."""
+    """Return the largest distance [m] driven in a run of ``case`` (world, estimator), or 1 if there is no run."""
     return (
         max((row.get("metres") or 0.0 for row in rows if (row["world"], row["estimator"]) == case), default=0.0) or 1.0
     )
@@ -312,6 +314,7 @@ def _belief_sigma(step: PlanningStep) -> float:
 
 
 def _outline(run: ActiveRun) -> Array:
-    """Return the end points (K, 2) of all walls, or the positions of the robot if there are no walls, to find the plotted area."""
+    """Return points (K, 2) that the plot must show: the ends of all walls, or the robot's positions if there are no
+    walls."""
     walls = np.array(run.world.walls).reshape(-1, 2)
     return walls if len(walls) else run.truth.poses[:, :2]

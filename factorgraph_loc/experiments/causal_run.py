@@ -133,15 +133,15 @@ class CausalRun:
         return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
-        """Record the estimates at the ticks before a measurement at ``t`` [s]. Initialize the estimator first if ``t``
-        is later than the start and it is not initialized."""
+        """Record the estimates at all ticks before ``t`` [s], the time of the next measurement. Initialize the
+        estimator first if it is not initialized and ``t`` is later than the start."""
         if not self._initialized and t > self._start:
             self._initialize()
         for tick in self.ticks.advance(t):
             self._tick(tick)
 
     def _move(self, m: Measurement) -> None:
-        """Process a row of odometry, or several successive rows (``Rows``), which are split at the times of ticks."""
+        """Process a row of odometry, or successive rows (``Rows``). Rows are split so that no tick is inside of a part."""
         if not isinstance(m, Rows):
             self._reach(m.t)
             self.guard.process(self.estimator, m)
@@ -150,7 +150,7 @@ class CausalRun:
         while first < len(times):
             self._reach(times[first])
             last = max(first + 1, bisect.bisect_right(times, self.ticks.due))
-            self.ticks.advance(times[last - 1])  # there are no ticks before this time
+            self.ticks.advance(times[last - 1])
             self.guard.process(self.estimator, m.part(first, last))
             first = last
 
@@ -196,7 +196,7 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 
 @contextmanager
 def rare_garbage_collection() -> Iterator[None]:
-    """Collect garbage less often in this block, and never existing objects. No effect after ``gc.freeze``."""
+    """Let Python collect garbage less often in this block, and only objects that are created in it."""
     if gc.get_freeze_count():
         yield
         return

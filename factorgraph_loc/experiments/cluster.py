@@ -48,9 +48,10 @@ class _Made:
 class Cluster(Executor):
     """Executes runs on the cluster of a scheduler. ``scheduler``: address of the scheduler.
 
-    This class limits the time of a run, and the cluster limits the memory. Used as a context manager, the executor
-    raises InputError if ``distributed`` is not installed, the scheduler does not answer or has no workers, or a worker
-    has other code or libraries. It raises RunFailedError if the connection to the scheduler is lost.
+    This class limits the time of a run, and the cluster limits the memory. On entry of the context, InputError is
+    raised if the package ``distributed`` is not installed, or if the scheduler does not answer or has no workers. It is
+    also raised for a worker with other code or libraries. RunFailedError is raised if the connection to the scheduler
+    is lost.
     """
 
     def __init__(self, scheduler: str, limits: Limits) -> None:
@@ -91,7 +92,7 @@ class Cluster(Executor):
             run, made = self._sent.pop(future), self._result(future)
             yield run.key, made.files
             if made.late is not None:
-                with suppress(Exception):  # a worker without a nanny process cannot restart and continues the run
+                with suppress(Exception):  # a worker that Dask started without a nanny process cannot restart
                     self._client.restart_workers([made.late], timeout=RESTART, raise_for_error=False)
 
     def _done(self) -> list[Any]:

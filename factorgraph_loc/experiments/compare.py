@@ -33,7 +33,7 @@ from factorgraph_loc.model.scoring import MAX_GAP, TICK_GAP, Alignment
 from factorgraph_loc.text import listed, plain
 
 WRITTEN = (*TABLES, PAGE)
-FINISHED = (*WRITTEN, *FILES)  # files of finished comparisons and runs, which only ``overwrite`` permits to replace
+FINISHED = (*WRITTEN, *FILES)  # names of files of results, which are replaced only with ``overwrite``
 
 
 @dataclass(frozen=True, repr=False)
@@ -74,20 +74,22 @@ def compare(
 ) -> Comparison:
     """Run several estimators on several logs with each seed, and compare them.
 
-    ``out``: folder for the results, None for a new folder below the folder ``out``. ``overwrite``: whether existing
-    results in it may be replaced.
-    ``settings``: by estimator, its settings by key. ``rig``, ``world``: replace those of the logs.
+    ``out``: folder for the results, None for a new folder in ``out/``. ``overwrite``: whether existing results in
+    ``out`` may be replaced. ``settings``: by estimator, its settings by key. ``rig``, ``world``: replace those of the
+    logs.
     ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
-    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`.
-    ``rpe``: whether ``table.md`` and the report contain relative errors.
-    ``jobs``: number of parallel processes, None for one per core.
-    ``progress``: called with the number of finished runs and of all runs.
+    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``rpe``: whether ``table.md`` and the report
+    contain relative errors.
+    ``jobs``: number of parallel processes, None for one per core. ``progress``: called with the number of finished runs
+    and of all runs.
 
-    A run that fails, or whose process dies, has a row with the reason, and does not stop other runs. Runs with stored
-    results are not repeated. The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run),
-    ``differences.csv`` (see :func:`~factorgraph_loc.evaluation.inference.differences`), ``table.md``, ``report.html``
-    (see :func:`~factorgraph_loc.evaluation.report.write_report`), ``plots/*.png``, and the files of each run in the
-    folder ``store`` (see :class:`~factorgraph_loc.experiments.store.Store`).
+    A failed run does not stop the others, and the table states the reason. Runs with stored results are not repeated.
+    The files in ``out`` are:
+
+    - ``results.parquet``, ``results.csv``: a row for each run. ``table.md``: the table of the comparison.
+    - ``differences.csv``: see :func:`~factorgraph_loc.evaluation.inference.differences`. ``plots/*.png``.
+    - ``report.html``: see :func:`~factorgraph_loc.evaluation.report.write_report`.
+    - ``store``: folder with the files of each run, see :class:`~factorgraph_loc.experiments.store.Store`.
 
     Raises InputError before any run if the input is invalid, or ``out`` contains results and ``overwrite`` is not set.
     """
@@ -122,8 +124,8 @@ def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]])
 def _experiment(
     logs: Sequence[Log], estimators: Mapping[str, Mapping[str, Any]], keys: Mapping[str, Any], *, rpe: bool
 ) -> Experiment:
-    """Return the comparison as an experiment. ``keys``: its further keys. ``rpe``: whether to report relative
-    errors."""
+    """Return the comparison as an experiment. ``keys``: values of further fields of :class:`Experiment`. ``rpe``:
+    whether to report relative errors."""
     tables = further_tables([{"scoring.align": keys["align"]}] if keys["align"] != "none" else [], rpe=rpe)
     further = [key for keys in tables.values() for key in keys]
     content: dict[str, Any] = {

@@ -17,7 +17,7 @@ LEAST_SHARE = 0.9  # minimum fraction of the estimates' time span that the refer
 
 
 def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, ...]:
-    """Return a warning if the reference has too few poses for scores, or covers only a part of the time span of the estimates.
+    """Return a warning if the reference has too few poses for scores, or covers only part of the time of the estimates.
 
     ``max_gap`` [s]: maximum gap across which estimates are interpolated for scores.
     """
@@ -37,8 +37,8 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, 
 
 
 def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
-    """Return a warning about the error of a map that was made without a reference. ``frame``: has the covariance of
-    this error at each pose. ``final``: the trajectory, along which the warning summarizes the error."""
+    """Return a warning about the error of a map that was made without a reference, with the median and the maximum
+    along the trajectory ``final``. ``frame``: has the covariance of this error at each pose."""
     if frame.error is None or not len(final):
         return ()
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
@@ -81,7 +81,7 @@ def never_localized(
         why = "the map has nothing that its sensors can detect"
     elif "ambiguous" in kinds_of_status:
         why = f"its {names} match several poses"
-    elif len(kinds) > 1:  # an estimator may use only some of these kinds
+    elif len(kinds) > 1:
         why = f"its {names} did not determine the pose"
     else:
         why = f"no {names} of the map were detected" if kinds[0].detects else f"the log has no {names}"

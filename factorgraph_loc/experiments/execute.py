@@ -33,7 +33,7 @@ Files = dict[str, bytes]
 Kind = Literal["error", "timeout", "memory", "killed", "vanished", "refused"]
 RETRY_INTERVAL = 0.5  # s between attempts to claim a run that another process has claimed
 CHECK_INTERVAL = 0.1  # s between checks of memory and time
-ATTEMPTS = 2  # a run fails if its process dies so many times; other processes may cause a single death
+ATTEMPTS = 2  # a run fails if its process dies this many times; a single death may be due to other processes
 SHARE = 0.9  # fraction of the machine's memory that all workers together may use
 PRELOADED = ("cv2", "factorgraph_loc.experiments.output")  # modules that a worker imports before its first run
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
@@ -64,12 +64,12 @@ class Take(Protocol):
     """A function that claims and returns the next run, or None if there is none now."""
 
     def __call__(self, loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
-        """Prefer a run with the source ``loaded``, which is in memory. Avoid sources that other workers use,
-        ``avoided``."""
+        """Return the next run. Prefer a run with the source ``loaded``, which is in memory. Avoid the sources
+        ``avoided``, which other workers use."""
 
 
 class Executor(AbstractContextManager[Any], Protocol):
-    """Computes runs by :func:`compute` in other processes. It is a context manager, whose end stops all computations."""
+    """Computes runs by :func:`compute` in other processes. It is a context manager, and stops all computations on exit."""
 
     def submit(self, take: Take, left: int) -> None:
         """Start as many runs as possible. ``take``: returns the next run. ``left``: number of runs that are not stored yet."""
@@ -79,7 +79,7 @@ class Executor(AbstractContextManager[Any], Protocol):
 
 
 class _Queue:
-    """The runs to compute. ``later``: runs that another process has claimed, with the time of the next attempt to claim them."""
+    """The runs to compute. ``later``: runs that another process has claimed, each with the time to try again to claim it."""
 
     def __init__(self, runs: Sequence[Planned]) -> None:
         self._runs: dict[Hashable, list[Planned]] = {}
@@ -190,7 +190,8 @@ def _forget_peak_memory() -> None:
 
 @dataclass(eq=False)
 class _Worker(Worker):
-    """A worker process. ``source``: source of its last run, whose data are in memory. ``since``: start of its current run [s]."""
+    """A worker process. ``source``: source of its last run, which is still in memory. ``since``: start of its current
+    run [s]."""
 
     source: Hashable = None
     since: float = 0.0
@@ -249,7 +250,7 @@ class Processes(Executor):
                 yield run.key, failure(*failed)
 
     def _died(self, worker: _Worker) -> tuple[Kind, str] | None:
-        """Return the kind and the reason of the failure of a run whose worker died. Return None if the run is repeated."""
+        """Return the kind and the reason of the failure of the run of a dead ``worker``. Return None if the run is repeated."""
         if not worker.ready:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:

@@ -82,8 +82,8 @@ class Done:
 class ExperimentStatus:
     """The state of an experiment. ``folder``: folder of its results.
 
-    ``labels``: by label of an estimator, the numbers of runs that are ok, failed, missing and damaged. ``failures``: a row for each
-    failed run, with its ``reason``. ``damaged``: descriptions of the runs whose stored results are damaged.
+    ``labels``: by label of an estimator, the numbers of runs that are ok, failed, missing and damaged. ``failures``: a
+    row for each failed run, with its ``reason``. ``damaged``: descriptions of the runs with damaged results.
     """
 
     folder: Path

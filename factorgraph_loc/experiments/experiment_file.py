@@ -83,10 +83,10 @@ def _seeds(value: Any) -> Any:
 class LogEntry(FileModel):
     """An entry of ``logs``: either recorded logs (``log``) or simulated logs (``simulate``).
 
-    ``log``: a name that ``fgloc datasets`` lists, a path relative to the folder of the experiment file, or a glob for
-    several names or paths. With ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world``
-    that replace those of the log. ``simulate``: a preset or a TOML file. With ``simulate`` there may be ``settings`` of
-    the simulation, and ``seeds``. There is one simulated log per seed.
+    ``log``: a name that ``fgloc datasets`` lists, a path relative to the experiment file, or a glob of names or paths. With
+    ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world`` that replace those of the log.
+    ``simulate``: a preset or a TOML file. With ``simulate`` there may be ``settings`` of the simulation, and ``seeds``. There
+    is one simulated log per seed.
     """
 
     log: Name | None = None
@@ -157,10 +157,10 @@ class Sweep(FileModel):
         return self
 
     def points(self, *words: str) -> list[dict[str, Scalar]]:
-        """Return the combinations of values of swept settings, without duplicates. Each is a dictionary by dotted name.
+        """Return the combinations of values of swept settings, without duplicates. Each is a dictionary {dotted name: value}.
 
-        ``words``: only settings whose names start with one of these words are combined; none for all settings. Without
-        settings, the result is one empty combination. At most :data:`MOST_RUNS` + 1 combinations are returned.
+        ``words``: only settings with names that start with one of these words are combined. Without ``words`` all settings are
+        combined. Without settings, the result is [{}]. At most :data:`MOST_RUNS` + 1 combinations are returned.
         """
         columns = {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
         combined: Iterable[tuple[Scalar, ...]] = itertools.product(*map(dict.fromkeys, columns.values()))
@@ -293,9 +293,9 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def _tables(content: dict[str, Any], key: str, named: str, source: object) -> list[dict[str, Any]]:
-    """Return the entries of the list ``key`` in the content of a file. An entry that is only a name becomes a table.
+    """Return the list ``key`` in the content of a file. An entry that is only a name becomes a dictionary {``named``: name}.
 
-    ``named``: the key of the name in that table. Raises InputError if there is no list of names or tables.
+    Raises InputError if the value is not a list of names or tables.
     """
     entries = content.setdefault(key, [])
     if not isinstance(entries, list):

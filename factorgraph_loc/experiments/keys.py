@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "opencv-python-headless", "numba")
 PACKAGES = (__name__.partition(".")[0], "factors")
-_UNSETTLED = 2.0  # s; a file that was modified later may change again without a new modification time
+_UNSETTLED = 2.0  # s; a file modified less than this time ago is not cached, because clocks of file systems are coarse
 
 
 def digest_of(content: Any) -> str:
@@ -117,7 +117,7 @@ class _Kept(BaseModel):
     """The content of a cache of facts. ``version``: hash of the code and libraries that computed them.
 
     ``files``: by path, the size, modification time and sha256 of a file. ``logs``: by hash of a source, facts about its
-    logs. ``estimators``: by name and settings.
+    logs. ``estimators``: facts about an estimator, by its name and settings as text.
     """
 
     version: str = ""
@@ -129,7 +129,7 @@ class _Kept(BaseModel):
 class Facts:
     """Computes hashes of files, and facts about logs and estimators.
 
-    ``cache``: a JSON file that keeps them, None for none. Cached facts are used if files, code and libraries are unchanged.
+    ``cache``: a JSON file that stores the results, or None. They are used again if files, code and libraries are unchanged.
     """
 
     def __init__(self, cache: Path | None = None) -> None:
@@ -161,7 +161,8 @@ class Facts:
         return digest
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
-        """Return facts about all logs of a source, which has the hash ``digest``. Raises InputError if they cannot be loaded."""
+        """Return facts about all logs of a source with the hash ``digest``. Raises InputError if a log cannot be
+        loaded."""
         if digest not in self._known.logs:
             self._known.logs[digest] = [_facts(log) for log in source.load_all()]
         return self._known.logs[digest]

@@ -223,7 +223,7 @@ def _of_folder(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
-    """Yield names and paths of a file of settings and, recursively, of files in its folder whose paths it contains."""
+    """Yield names and paths of a file of settings, and of the files that it names. This is repeated for each of those files."""
     if path is None:
         return
     folder = Path(path).parent

@@ -142,7 +142,7 @@ def make_map(log: Log, options: MapOptions | None = None, progress: Progress = l
 
 
 def _mapped_kind(log: Log, options: MapOptions) -> str:
-    """Return the kind of map to make: that of ``options.of``, or of other options, or the default for the log.
+    """Return the kind of map to make: ``options.of``, or the kind that other options imply, or the default for the log.
 
     Raises InputError if an option belongs to another kind.
     """
@@ -215,8 +215,8 @@ def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _at_height(world: World, names: Iterable[str], height: float | None) -> World:
-    """Return the world with ``height`` [m] for the landmarks ``names``. Those that the world lacks are added at its
-    origin, for estimators that use only their heights. Without a height the world is returned unchanged."""
+    """Return the world with the landmarks ``names`` at ``height`` [m], or unchanged if it is None. Landmarks that are
+    not in the world are added at x = y = 0, because their estimators use only the height."""
     if height is None:
         return world
     marks = {name: world.landmarks.get(name, Landmark(x=0.0, y=0.0)).model_copy(update={"z": height}) for name in names}
@@ -237,7 +237,7 @@ def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _without_dead(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
-    """Return the log's map without dead tags: tags that were not read although the smoother expected reads."""
+    """Return the log's map without its dead tags: tags that were not read although the smoother expected reads."""
     if options != MapOptions(drop_dead=True, prior=options.prior):
         raise InputError("--drop-dead edits the log's map and maps nothing, expected no other option but --prior")
     if "tags" not in _mappable(log) or not log.world.tags:

@@ -91,8 +91,8 @@ def write_run(
 def save_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Write the files of a run as :func:`write_run`. If that fails, they are written to a new folder in the temporary
-    folder of the system, and the raised InputError names this folder."""
+    """Write the files of a run as :func:`write_run`. If that fails, write them to a new temporary folder instead, and
+    raise an InputError that names this folder."""
     try:
         return write_run(result, log, out, align=align, overwrite=overwrite)
     except InputError as error:
@@ -146,8 +146,7 @@ def map_of(result: RunResult, log: Log) -> World | None:
 def with_ending(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
     """Return the path of a second file next to ``out``: its ``suffix`` is replaced by ``ending``.
 
-    Raises InputError if the name of ``out`` has another suffix, if its folder is missing, or if either file exists and
-    ``overwrite`` is not set.
+    Raises InputError if ``out`` has another suffix, its folder is missing, or either file exists without ``overwrite``.
     """
     name = out.name.removesuffix(suffix)
     if name in ("", out.name):

@@ -106,8 +106,8 @@ def plan(
     Swept settings of one estimator do not multiply the runs of other estimators. Deterministic estimators run only with
     the first seed.
 
-    Raises InputError for more than :data:`MOST_RUNS` runs, an unreadable log, two logs with the same name, invalid
-    settings, an invalid prior, or a sensor that no log has.
+    Raises InputError for an unreadable log, two logs with the same name, invalid settings or an invalid prior. It is
+    also raised for a sensor that no log has, and for more than :data:`MOST_RUNS` runs.
     """
     facts = Facts(cache / "facts.json")
     experiment = _placed(experiment, folder, data_root)
@@ -157,7 +157,7 @@ def _all_runs(experiment: Experiment, recorded: Mapping[int, Sequence[LogSource]
 
 
 def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
-    """Return a lower bound for the number of runs. ``recorded``: number of sources of recorded logs, each with a log or more."""
+    """Return a lower bound for the number of runs. ``recorded``: number of sources of recorded logs."""
     simulated = sum(len(entry.seeds) for entry in experiment.logs if entry.simulate is not None)
     total = 0
     for entry in experiment.estimators:
@@ -176,8 +176,8 @@ def _check_count(count: int, experiment: Experiment) -> None:
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
-    """Return the combinations of swept settings of an estimator and of simulated logs. Combinations with equal settings
-    of the simulation form a group, whose key is the tuple of their values."""
+    """Return the combinations of swept settings of an estimator and of simulated logs, as {key: combinations}. A key is
+    the tuple of the values of the settings of the simulation."""
     points: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
         points.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)
@@ -187,7 +187,7 @@ def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...],
 def _runs(
     experiment: Experiment, log: _PlannedLog, entry: EstimatorEntry, point: Mapping[str, Any], facts: Facts
 ) -> Iterator[PlannedRun]:
-    """Yield the runs of an estimator on a log at a ``point`` of the sweep: one for each set of sensors and each seed."""
+    """Yield the runs of an estimator on a log: one per set of sensors and seed. ``point``: values of swept settings."""
     settings = _settings(entry, point)
     estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
@@ -239,7 +239,7 @@ def _recorded(entry: LogEntry, folder: Path, data_root: str | None) -> list[Reco
 
 
 def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSource]:
-    """Return the sources of an entry with simulated logs, one per seed, at a ``point`` of the sweep of the simulation."""
+    """Return one source per seed for an entry with simulated logs. ``point``: {dotted name: value} of swept settings."""
     assert entry.simulate is not None
     settings = json.loads(canonical(entry.settings))
     for key, value in point.items():
@@ -256,7 +256,7 @@ def _logs(sources: Sequence[LogSource], facts: Facts) -> Iterator[_PlannedLog]:
 
 
 def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of an estimator at a ``point`` of the sweep."""
+    """Return the settings of an estimator, with the values of its swept settings in ``point`` {dotted name: value}."""
     settings: dict[str, Any] = json.loads(canonical(entry.settings))
     for key, value in _part(point, (entry.shown, entry.name)).items():
         set_key(settings, key.partition(".")[2], value, "the sweep")
@@ -264,7 +264,7 @@ def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _part(point: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """Return the values of a ``point`` of the sweep whose names start with one of ``words``."""
+    """Return those swept settings in ``point`` {dotted name: value} that have a name starting with one of ``words``."""
     return {key: value for key, value in point.items() if key.partition(".")[0] in words}
 
 

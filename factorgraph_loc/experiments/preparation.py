@@ -99,8 +99,8 @@ def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
 def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
     """Return the names of the sensors that a run uses.
 
-    ``asked``: the requested sensors, None for all sensors of the rig whose measurements the log has. Raises InputError
-    if a requested sensor is not available, or if no sensor is available.
+    ``asked``: the requested sensors. If it is None, all sensors of the rig with measurements in the log are used.
+    Raises InputError if a requested sensor is not available, or if no sensor is available.
     """
     available = (*log.streams, *_filled_columns(log))
     asked = None if asked is None else log.rig.expanded(asked)

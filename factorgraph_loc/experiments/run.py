@@ -41,7 +41,7 @@ from factorgraph_loc.sensors.registry import detecting, functions, moving
 from factorgraph_loc.text import Notice, notice
 from factorgraph_loc.version import __version__
 
-_REHEARSAL = 2.0  # s; duration of a rehearsal, see _rehearse, after the first observation
+_REHEARSAL = 2.0  # s; a rehearsal (see _rehearse) ends this long after the first observation
 _REHEARSED: set[tuple[str, tuple[str, ...]]] = set()  # estimators and sensors that this process has rehearsed
 
 
@@ -53,19 +53,19 @@ def run(
 ) -> RunResult:
     """Run an estimator on a log.
 
-    ``progress``: called with the fraction done. If features are extracted from images, this is the first half.
-    ``watch``: called with the time and the estimator after each tick, for instance to inspect its belief.
+    ``progress``: called with the fraction done. If features are extracted from images, this is the first half. ``watch``:
+    called with the time and the estimator after each tick, for instance to inspect its belief.
 
-    Causal estimates are recorded at ticks, which are at 10 Hz from the time of the prior on, except inside long gaps
-    between measurements (``config.tick_gap``). The estimator processes all measurements that arrive up to a tick before
-    the estimate is recorded. Odometry older than the prior is processed before the estimator is initialized, because it
-    determines the initial velocity. Other measurements older than the prior are counted as ignored.
+    Causal estimates are recorded at ticks. Ticks are at 10 Hz from the time of the prior on, except inside gaps between
+    measurements longer than ``config.tick_gap``. The estimator processes all measurements that arrive up to a tick before the
+    estimate is recorded. Odometry older than the prior determines the initial velocity. Other measurements older than the
+    prior are counted as ignored.
 
-    With an unknown start, ticks begin at the first measurement. The final trajectory begins at the first estimate and may be empty.
-    A log with neither start nor reference, and without a map that its sensors observe, starts at the pose (0, 0, 0).
+    With an unknown start, ticks begin at the first measurement. The final trajectory begins at the first estimate and may be
+    empty. A log with neither start nor reference, and without a map that its sensors observe, starts at the pose (0, 0, 0).
 
-    Raises InputError if the configuration does not fit the log. Raises RunFailedError, with the time and the measurement, if the
-    estimator fails, or if a pose is not finite or a covariance not positive definite; see :mod:`factorgraph_loc.fusion.guarded`.
+    Raises InputError if the configuration does not fit the log. Raises RunFailedError if the estimator fails, or if a pose or
+    a covariance is invalid; see :mod:`factorgraph_loc.fusion.guarded`.
     """
     use = _use(log, config)
     stated = resolve_prior(log, config.prior)
@@ -208,7 +208,7 @@ def _result(
 def _rehearse(
     config: RunConfig, setup: model_setup.Setup, settings: FileModel, log: Log, prior: PosePrior | None
 ) -> None:
-    """Run an estimator on the first seconds with observations, so that compiled functions are loaded before times are measured.
+    """Run an estimator on the beginning of a log, so that compiled functions are loaded before computing times are measured.
 
     A process does this once for each estimator and set of sensors. Errors are ignored, because the run itself repeats them.
     """

@@ -135,7 +135,7 @@ class Store:
         """Return the columns of a run for the table of results.
 
         They are ``status`` (ok, failed), the ``kind`` and ``reason`` of a failure, scores and times that are single
-        numbers, and ``warnings``, one on each line. Raises DamagedError as :meth:`read`.
+        numbers, and ``warnings`` with one warning per line. Raises DamagedError as :meth:`read`.
         """
         return self._row(self._manifest(key))
 
