@@ -27,15 +27,15 @@ from factors.se2 import Array
 from factors.sighting import Marginalized, SightingFactor
 from factors.update import CONVERGED, Correction, update_state
 
-# values (d,) of blocks of the state, such as constants of a sensor or a landmark, by the name of the block; or their covariances
+# the value (d,) or the covariance (d, d) of each block of the state, by the name of the block
 Blocks = Mapping[str, Array]
-Columns = Mapping[str, slice]  # the components of an error state that belong to each block, by the name of the block
+Columns = Mapping[str, slice]  # the indices of each block in the vector of the error state, by the name of the block
 
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of a graph on the pose and on the ``blocks`` of the state with these names. ``rows``: number of its
-    residuals."""
+    """A factor of the graph that depends on one pose and on blocks of the state. ``blocks``: the names of the blocks.
+    ``rows``: the number of residuals."""
 
     factor: Factor
     blocks: tuple[str, ...]
@@ -43,10 +43,10 @@ class Term:
 
 
 class Observation(Protocol):
-    """Information of a measurement, or of a part of it, on the pose at one time and on blocks of the state. Immutable.
+    """A measurement, or a part of one, as a constraint on one pose and on blocks of the state (such as a landmark).
 
-    ``t``: time of the measurement [s]. ``found``: number of detections, possibly 0. ``is_judged``: True if
-    :meth:`Sensor.judge` must be called. ``iterations``: number of linearisations, or None if the estimator decides.
+    ``t``: time of the measurement [s]. ``found``: number of detections, possibly 0. ``is_judged``: True if the
+    estimator must call :meth:`Sensor.judge`. ``iterations``: number of linearisations; None if the estimator decides.
     """
 
     @property
@@ -59,7 +59,7 @@ class Observation(Protocol):
     def found(self) -> int: ...
     @property
     def work(self) -> int:
-        """The approximate time to compute the likelihood of one pose, relative to the time for an observation of one RFID tag."""
+        """Approximate time to compute the likelihood of one pose, as a multiple of the time for one RFID tag."""
 
     @property
     def things(self) -> frozenset[Hashable]:
@@ -71,38 +71,37 @@ class Observation(Protocol):
 
     @property
     def blocks(self) -> tuple[str, ...]:
-        """Names of all blocks that the terms depend on."""
+        """The names of all blocks of the state that the observation depends on."""
 
     def correct(
         self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = 1
     ) -> Correction:
-        """Return the correction of a Gaussian with mean ``pose`` (3,) and ``values`` of the blocks.
+        """Return the Kalman correction of a Gaussian estimate of the pose and the blocks by this observation.
 
-        ``covariance`` (S, S): of the error state, whose first three components are the body-frame perturbation of the
-        pose. ``columns``: the components of each block. All other components are corrected through their correlation.
-        ``iterations``: the number of linearisations.
+        ``pose`` (3,), ``values``: the mean. ``covariance`` (S, S): the covariance of the error state. Its first three
+        components are the body-frame perturbation of the pose. ``columns``: the indices of each block in the error
+        state. ``iterations``: the number of linearisations.
         """
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
-        """Return the log-likelihood (N,), up to a constant, of ``poses`` (N, 3) with ``values`` (N, P) of each block. A
-        sensor's constants have the rig's values if their block is missing."""
+        """Return the log-likelihood (N,) of ``poses`` (N, 3), up to a constant. ``values``: the value (N, P) of each
+        block at these poses. Calibration constants that are missing in ``values`` are taken from the rig."""
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Observation:
-        """Return the observation as a function of the pose only. Blocks are fixed at ``values``, and their covariances
-        ``spreads`` are added to the noise."""
+        """Return an observation that depends on the pose only, with all blocks fixed at ``values``. Its noise includes
+        the uncertainty of the blocks. ``spreads``: their covariances (d, d) by name."""
 
     def at_its_time(self) -> Observation | None:
-        """Return the observation on the pose at the time of the measurement, or None if it depends on blocks or other poses."""
+        """Return an observation that depends only on the pose at the time ``t``, or None if this is impossible."""
 
 
 @dataclass(frozen=True)
 class NewVariable:
     """A new block of the state: the position of a landmark that is seen for the first time, or a variable with a prior.
 
-    ``name``: the name of the block. ``mean`` (d,): initial estimate. ``by_pose`` (d, 3) and ``by_block`` (d, P):
-    Jacobians of the mean by the pose and by other blocks.
-    ``noise`` (d, d): the covariance that results from measurement noise alone. ``sightings``: the observations that the
-    estimate consists of, each with the time [s] of its pose. Without sightings, ``mean`` and ``noise`` are a prior.
+    ``mean`` (d,): the initial estimate. ``by_pose`` (d, 3): its Jacobian by the pose. ``by_block``: its Jacobians
+    (d, P) by other blocks. ``noise`` (d, d): the covariance of ``mean`` if the pose and the other blocks were exact.
+    ``sightings``: times [s] and observations that give the estimate. If empty, ``mean`` and ``noise`` are a prior.
     """
 
     name: str
@@ -113,9 +112,8 @@ class NewVariable:
     sightings: tuple[tuple[float, Observation], ...]
 
     def joint(self, covariance: Array, columns: Columns) -> tuple[Array, Array]:
-        """Return the cross-covariance (d, S) of the block with an error state of ``covariance`` (S, S), and the
-        covariance (d, d) of the block. ``columns``: the components of each block in the error state. Missing blocks are
-        treated as exact."""
+        """Return the cross-covariance (d, S) of the block with an error state, and the covariance (d, d) of the block.
+        ``covariance`` (S, S): of the error state. ``columns``: the indices of each other block in the error state."""
         jacobian = np.zeros((len(self.mean), len(covariance)))
         jacobian[:, :3] = self.by_pose
         for name, block in self.by_block.items():
@@ -127,8 +125,8 @@ class NewVariable:
 
 @dataclass(frozen=True)
 class EarlierPose:
-    """A pose variable of an estimator at or before a requested time. ``t``: its time [s]. ``offset``: the motion from
-    ``t`` to the requested time, or None if the times are equal."""
+    """A pose in the state of an estimator at or before a requested time. ``t``: the time of the pose [s]. ``offset``:
+    the motion from ``t`` to the requested time, or None if the times are equal."""
 
     t: float
     offset: Increment | None
@@ -136,8 +134,8 @@ class EarlierPose:
 
 @dataclass(frozen=True)
 class Link:
-    """A factor on two poses. Its first value is the pose that a measurement at ``t`` [s] refers to. Its second value is
-    the pose at ``earlier`` [s], which :meth:`View.earlier` returned. ``rows``: number of its residuals."""
+    """A factor on the robot's poses at the times ``t`` and ``earlier`` [s], in this order. ``t``: the time of the
+    measurement. ``earlier``: the time of a pose that :meth:`View.earlier` returned. ``rows``: number of residuals."""
 
     t: float
     earlier: float
@@ -147,12 +145,12 @@ class Link:
 
 @dataclass(frozen=True)
 class Binding:
-    """The arguments that bind a sensor to a run.
+    """The arguments with which a run constructs a :class:`Sensor`.
 
     ``setup``: rig, map and sensors of the run. ``motion``: the odometry. ``diagnostics``: receives the innovations.
-    ``use``: known to use the map's landmarks only, extended to estimate other landmarks too, unknown to estimate all landmarks.
-    ``points``: as ``use``, for image points and for landmarks that are observed by range alone or bearing alone.
-    ``calibration``: which uncertain constants the estimator learns. ``name``: the name of one of several sensors, otherwise "".
+    ``use``: "known" to use the landmarks of the map, "extended" to estimate further landmarks, "unknown" to estimate
+    all landmarks. ``points``: the same for image points, and for landmarks with range alone or bearing alone.
+    ``calibration``: which constants are estimated. ``name``: "" unless the rig has several sensors of this type.
     """
 
     setup: Setup
@@ -165,11 +163,11 @@ class Binding:
 
 
 class View(Protocol):
-    """The current estimate as a sensor sees it, after all observations applied so far.
+    """The estimator's current estimate, for sensors to read while they process a measurement.
 
-    ``t``: time [s] of the pose that new observations depend on. ``offset``: the motion from ``t`` to the measurement,
-    None if the times are equal. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate at ``t``. ``newest``:
-    True if the estimator has no later pose. ``localized``: True if the robot is localized.
+    ``t``: time [s] of the pose that new observations must depend on. ``offset``: the motion from ``t`` to the time of
+    the measurement, or None if the times are equal. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate
+    at ``t``. ``newest``: True if the estimator has no later pose. ``localized``: True if the robot is localized.
     """
 
     @property
@@ -191,20 +189,21 @@ class View(Protocol):
         """Return the covariance (d, d) of a block that exists."""
 
     def joint(self) -> tuple[Array, Columns]:
-        """Return the covariance (S, S) of the error state, and the components of each block in it."""
+        """Return the covariance (S, S) of the error state, and the indices of each block in the error state."""
 
     def poses_at(self, times: Array) -> Array:
-        """Return poses (R, 3) by odometry at ``times`` (R,) [s], in the frame of the pose at ``t``."""
+        """Return the poses (R, 3) that the odometry gives at ``times`` (R,) [s], relative to the pose at ``t``."""
 
     def earlier(self, t: float) -> EarlierPose | None:
-        """Return the pose at or before ``t`` [s] that a :class:`Link` may depend on. Returns None if there is none, as
-        in filters."""
+        """Return the last pose at or before ``t`` [s] that a :class:`Link` may depend on. Returns None if the estimator
+        keeps no such pose. Filters always return None."""
 
 
 class Finder(Protocol):
-    """Finds the pose from the measurements of one sensor without a prediction: at an unknown start or after a kidnapping.
+    """Global localization by one sensor: finds the pose without a prior, at the start or after the robot was carried.
 
-    ``start``: the known start position if only the heading is sought. ``at_once``: True if one measurement may be enough.
+    ``start``: the known start position, or None. With it, only the heading is sought. ``at_once``: True if one
+    measurement can be enough.
     """
 
     start: KnownPosition | None
@@ -225,43 +224,43 @@ class Finder(Protocol):
         """The pose at the last informative measurement if it is unambiguous, otherwise None."""
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process a measurement ``m`` at the odometry state ``odometry``. Returns False if ``m`` is uninformative."""
+        """Process ``m``, measured at the odometry state ``odometry``. Returns False if it gives no information."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` poses (N, 3) at the last informative measurement, sampled from the hypotheses."""
+        """Return ``count`` random poses (N, 3) at the last informative measurement, drawn from ``hypotheses``."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        """Record an observation at the odometry state ``odometry``. ``view``: the prediction, not corrected yet."""
+        """Store an observation for :meth:`refuted_since`. ``view``: the estimate before the observation corrects it."""
 
     def refuted_since(self, m: Any, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """Return the time [s] since which the track must have been wrong, or None. Call this after a measurement was applied.
+        """Return the time [s] since which the estimated pose has been wrong, or None if the estimate may be right.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the measurement. If the track is wrong,
-        ``best`` is the correct pose.
+        Call this after an estimator has processed the measurement ``m``. ``pose`` (3,) with body-frame ``covariance``
+        (3, 3): the estimate at ``odometry``. If it is wrong, ``best`` is the correct pose.
         """
 
     def clear(self) -> None:
-        """Discard the history, because a new track starts or the current track is trusted."""
+        """Discard the stored observations, because the estimated pose was replaced or confirmed."""
 
 
 class Sensor:
-    """A sensor of the robot's surroundings, bound to one run. Sensors derive from this class and override what they need.
+    """Base class of exteroceptive sensors. An object belongs to one run. Subclasses override the methods they need.
 
-    ``name``: the name of the sensor, by default its modality. It is also the name of the block of its estimated constants.
+    ``name``: the name of the sensor, by default ``modality``. The state block of its constants has the same name.
     """
 
-    modality: ClassVar[str]  # the modality of its measurements
-    lost: ClassVar[str] = ""  # message: the reason for which the sensor gives up a track
-    constants: Estimated = NOTHING  # the constants of the sensor that are estimated
+    modality: ClassVar[str]  # the kind of the sensor's measurements, such as "rfid"
+    lost: ClassVar[str] = ""  # the reason in the message if this sensor rejects the estimated pose
+    constants: Estimated = NOTHING  # the calibration constants of the sensor that are estimated
     follows_constants: ClassVar[bool] = False  # True if `observe` needs the covariance of the constants
     keyframe_every: ClassVar[float] = 0.09  # s between the keyframes of a graph
-    gathers: ClassVar[bool] = False  # True if a graph must merge the observations of a keyframe by `gathered`
-    links: ClassVar[bool] = False  # True if its observations are links between two poses; many links may be false
-    evidence_every: ClassVar[float] = 1.0  # s between the measurements that a search of the pose uses
+    gathers: ClassVar[bool] = False  # True if a graph must merge the observations of each keyframe by `gathered`
+    links: ClassVar[bool] = False  # True if the sensor yields `Link` objects, of which many may be false
+    evidence_every: ClassVar[float] = 1.0  # s between the measurements that a global localization uses
     work: int = 10  # approximate time to add a measurement to a graph, relative to one RFID tag
-    solve_every: float = 0.0  # s; longest delay of a solver update of a graph
-    finder: Finder | None = None  # localizes the robot without a prediction
-    bounds: Array | None = None  # (2, 2) [m]: corners of the area where the robot may be; for a sensor without finder
+    solve_every: float = 0.0  # s; a graph with new measurements is solved after at most this time
+    finder: Finder | None = None  # localizes the robot without a prior
+    bounds: Array | None = None  # (2, 2) [m]: two corners of the area in which particles search for the robot
 
     def __init__(self, name: str = "") -> None:
         self.name = name or self.modality
@@ -271,55 +270,55 @@ class Sensor:
         raise NotImplementedError
 
     def judge(self, observation: Any, correction: Correction, view: View) -> bool:
-        """Decide whether an observation is applied: returns False to reject it. Also records its innovation.
+        """Return False if an observation must be rejected, otherwise True. Also record its innovation.
 
-        ``correction``: the result of :meth:`Observation.correct`, not yet applied. ``view``: the prediction.
+        ``correction``: the result of :meth:`Observation.correct`. ``view``: the estimate before the correction.
         """
         return True
 
     def evidence(self, m: Any) -> Observation | None:
-        """Return the observation of a measurement for the search of an unknown pose, or None without information."""
+        """Return a measurement as an observation for global localization, or None if it gives no information."""
         return None
 
     @property
     def suspicious_since(self) -> float | None:
-        """The time [s] since which the track does not explain the measurements, or None if it explains them."""
+        """The time [s] since which the measurements contradict the estimated pose, or None if they agree with it."""
         return None
 
     @property
     def silent(self) -> bool:
-        """True if nothing is detected although detections are expected."""
+        """True if the sensor detects nothing although detections are expected at the estimated pose."""
         return False
 
     @property
     def doubts_model(self) -> bool:
-        """True if detections contradict the sensor's model. Covariances are too small then."""
+        """True if the detections contradict the sensor's model. The estimated covariances are then too small."""
         return False
 
     def accept(self) -> None:
-        """End the suspicion that the pose is wrong (``suspicious_since``), because a search found no better pose. The
-        sensor's model or the map is wrong instead."""
+        """Reset ``suspicious_since``. The estimator calls this if global localization finds no better pose, because the
+        sensor's model or the map must then be wrong."""
 
     def gathered(self, observations: Sequence[Any]) -> list[Term]:
-        """Merge the observations on one pose into few factors of a graph."""
+        """Return the graph factors of several observations that depend on the same pose, merged into few factors."""
         return [term for observation in observations for term in observation.terms]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return the factor for the solution of the whole graph after a run, with the scale of its robust loss times ``width``.
+        """Return the factor that replaces ``factor`` when the whole graph is solved after a run, or None to omit it.
 
-        A width above 1 occurs in the first steps of graduated non-convexity. Returns None to omit the factor in these steps.
+        ``width``: multiplies the scale of the robust loss. It exceeds 1 in the first steps of graduated non-convexity.
         """
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
-        """Return the multiple (at least 1) of the scale of ``factor``'s loss that makes it convex at ``values``."""
+        """Return the smallest ``width`` of :meth:`at_end` that makes the loss of ``factor`` convex at ``values``."""
         return 1.0
 
     def rewind(self, t: float) -> None:
-        """Undo the effects of measurements after ``t`` [s], which will be processed again."""
+        """Undo the effects of all measurements after ``t`` [s], because the estimator processes them once more."""
 
     def restart(self, t: float) -> None:
-        """Prepare for a new track at ``t`` [s]. Measurements after ``t`` will be processed again."""
+        """Reset the sensor, because the estimator starts again with a new pose at ``t`` [s]."""
 
 
 WORK = 20  # computing time of one residual and its robust loss, relative to one RFID tag
@@ -329,14 +328,14 @@ WORK = 20  # computing time of one residual and its robust loss, relative to one
 class ResidualObservation:
     """An observation that consists of residual factors (:class:`~factors.sighting.SightingFactor`) of one sensor.
 
-    The log-likelihood is evaluated pose by pose. A sensor that must be fast with particles overrides it.
+    ``log_likelihood`` evaluates one pose after the other. Override it if the sensor must be fast with particles.
     """
 
     t: float
     terms: tuple[Term, ...]
     is_judged: ClassVar[bool] = True
     iterations: ClassVar[int | None] = None
-    settled: ClassVar[float] = CONVERGED  # m, rad: iterations end if the step is smaller
+    settled: ClassVar[float] = CONVERGED  # m, rad: iterations end if a step is smaller than this
 
     @property
     def found(self) -> int:
@@ -359,7 +358,7 @@ class ResidualObservation:
 
     @property
     def factors(self) -> list[SightingFactor]:
-        """The factors of the terms."""
+        """The factors of all ``terms``."""
         return [cast(SightingFactor, term.factor) for term in self.terms]
 
     def correct(

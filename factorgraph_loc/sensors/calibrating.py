@@ -32,8 +32,9 @@ BLOCK = 20.0  # s; errors in the same block of time may be correlated, errors in
 class Residuals:
     """Residuals of a sensor in one log, for plots of the calibration report.
 
-    ``errors`` (K, D) with standard deviations ``sigmas`` (K, D): NaN if not measured. ``t`` (K,): timestamps [s].
-    ``distance`` (K,): a distance [m] that errors may depend on. ``units``: the name and the unit of each of the D columns.
+    ``log``: the name of the log. ``t`` (K,): timestamps [s]. ``errors`` (K, D): residuals, NaN if not measured.
+    ``sigmas`` (K, D): their standard deviations. ``distance`` (K,): the measured or driven distance [m], the abscissa
+    of a plot. ``units``: the unit of each of the D columns, by the name of the column.
     """
 
     log: str
@@ -51,11 +52,10 @@ class SensorKnowledge:
     ``sections``: the new sections of the rig by name.
     ``constants``: the fitted constants.
     ``notes``: warnings.
-    ``figures``: plain values for the report, by name.
+    ``figures``: values for the report by name, as JSON types.
     ``residuals``: the residuals of each log.
-    ``details``: data for :meth:`Calibrator.pictures`.
-    ``correlations``: pairs of strongly correlated constants
-    (:meth:`~factorgraph_loc.fitting.posterior.Posterior.correlations`).
+    ``details``: data of a subclass of :class:`Calibrator` for its plots.
+    ``correlations``: the names of two strongly correlated constants, and their correlation coefficient.
     """
 
     sections: Mapping[str, Any] = field(default_factory=dict)
@@ -72,8 +72,8 @@ class Calibrator:
 
     ``section``: the section of the rig that is calibrated.
     ``channel``: the stream that a log must have.
-    ``senses``: True if the sensor can localize the robot.
-    ``first``: initial settings if the rig has no such section.
+    ``senses``: True for exteroceptive sensors.
+    ``first``: initial settings for rigs without the section.
     """
 
     section: str
@@ -86,18 +86,16 @@ class Calibrator:
     ) -> SensorKnowledge:
         """Estimate the sensor's constants and noise from logs with trajectories.
 
-        ``traced``: the logs. ``rig``: initial values.
-        ``first``: the rig of the user. It differs from ``rig`` if logs without references are smoothed and calibrated
-        repeatedly. ``grids``: path with name prefix of files that may be written, None to write none. ``like``: a
-        result whose discrete choices are kept. It is given if ``traced`` is only a part of the logs of that result.
-        Raises InputError if a log is too short.
+        ``traced``: the logs. ``rig``: the rig with initial values. ``first``: the rig before the first iteration, if
+        logs without references are smoothed and calibrated in turns. ``grids``: path and name prefix of files that may
+        be written, or None. ``like``: an earlier result with more logs. Its discrete choices, such as the type of the
+        sensor model, are kept. Raises InputError if a log is too short.
         """
         raise NotImplementedError
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
-        """Return ``rig`` with the uncertainties of constants from ``first``, for another repetition of smoothing and
-        calibration. Learnt uncertainties are smaller. With them the constants would stay near the values of the
-        previous repetition."""
+        """Return ``rig`` with the uncertainties of its constants replaced by those of ``first``. If logs are smoothed
+        and calibrated in turns, smaller learnt uncertainties would keep the constants near their last values."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return rig
         uncertainty = first.section(self.section).uncertainty
@@ -105,11 +103,11 @@ class Calibrator:
         return rig.model_copy(update={self.section: settings})
 
     def settings(self, rig: Rig) -> Any:
-        """Return the sensor's section of a rig, or the initial settings if the rig has none."""
+        """Return the sensor's section of ``rig``, or the initial settings ``first`` if the rig lacks the section."""
         return rig.section(self.section) or self.first
 
     def is_complete(self, rig: Rig) -> bool:
-        """True if the rig has the sensor's section, or does not use the sensor."""
+        """True unless ``rig`` uses the sensor but lacks its section."""
         return self.channel not in rig.sensors or rig.section(self.section) is not None
 
     def pictures(self, _knowledge: SensorKnowledge) -> Sequence[Part]:
@@ -118,7 +116,10 @@ class Calibrator:
 
 
 class OneOfSeveral(Calibrator):
-    """The calibration of the sensor ``name`` of a rig with several sensors of its kind, as if it was the only one."""
+    """The calibration of one sensor of a rig with several sensors of its type. The other sensors are ignored.
+
+    ``calibrator``: the calibration of this type of sensor. ``name``: the name of the sensor in the rig.
+    """
 
     def __init__(self, calibrator: Calibrator, name: str) -> None:
         self._calibrator = calibrator
@@ -128,8 +129,7 @@ class OneOfSeveral(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Estimate the sensor's constants and noise, with all other sensors of its kind removed. See
-        :meth:`Calibrator.learn`."""
+        """Estimate the sensor's constants and noise. See :meth:`Calibrator.learn`."""
         kind, name = self._calibrator.section, self.section
         alone = [
             replace(
@@ -154,30 +154,29 @@ class OneOfSeveral(Calibrator):
 class ConstantsCalibrator(Calibrator):
     """Base class of calibrations by least squares. Constants and noise are estimated alternately, ``rounds`` times.
 
-    The data of a log, which :meth:`part` returns, have timestamps ``t`` (K,) [s] and a method ``residuals(settings)``.
-    It returns residuals (K, D) in standard deviations.
+    :meth:`part` returns the data of one log: an object with timestamps ``t`` (K,) [s] and a method
+    ``residuals(settings)``, which returns residuals (K, D) in standard deviations.
     """
 
     rounds: ClassVar[int] = 2
 
     def part(self, log: Log) -> Any:
-        """Return the data of a log. Raises InputError if there are too few."""
+        """Return the data of one log. Raises InputError if the log has too few measurements."""
         raise NotImplementedError
 
     def parameters(self, parts: Sequence[Any], settings: Any) -> Sequence[Parameter]:
-        """Return the constants to estimate, with priors around the values of ``settings``. ``parts``: the data of each log."""
+        """Return the constants to estimate, with priors around their values in ``settings``. ``parts``: the data of
+        each log."""
         raise NotImplementedError
 
     def with_noise(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any]:
-        """Return ``parts``, the data of each log, and ``settings``, both with the noise that the residuals show. The
-        residuals are those at the constants of ``settings``."""
+        """Estimate the noise from the residuals at the constants in ``settings``. Returns ``parts``, the data of each
+        log, and ``settings``, both updated with the estimated noise."""
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return ``knowledge`` with additions of a subclass, such as noise or plots.
-
-        ``_parts``: the data of each log, from :meth:`part`. ``_rig``: the rig with the estimated constants.
-        """
+        """Return the result ``knowledge``, to which a subclass adds noise or plots. ``_parts``: the data of each log.
+        ``_rig``: the rig with the estimated constants."""
         return knowledge
 
     def learn(
@@ -201,9 +200,10 @@ class ConstantsCalibrator(Calibrator):
         return self.finished(parts, rig.model_copy(update=dict(knowledge.sections)), knowledge)
 
     def estimated(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any, Posterior | None]:
-        """Estimate the constants and the noise of maximal posterior density, from the data ``parts`` of the logs.
+        """Return maximum a posteriori estimates of constants and noise. ``parts``: the data of each log.
 
-        Returns the data and ``settings``, both with the estimates, and the posterior of the constants, None without constants.
+        Returns ``parts`` and ``settings``, both updated with the estimates, and the posterior of the constants. The
+        posterior is None if no constants are estimated.
         """
         parameters = self.parameters(parts, settings)
         start = {p.name: p.mean for p in parameters}
@@ -227,8 +227,8 @@ class ConstantsCalibrator(Calibrator):
     def _constants(
         self, parts: Sequence[Any], settings: Any, initial: Any, posterior: Posterior
     ) -> list[FittedConstant]:
-        """Return the fitted constants of ``posterior``. With several logs, each log is also fitted alone, and the
-        differences between logs give the uncertainty of each constant. ``initial``: the settings before the fit."""
+        """Return the fitted constants of ``posterior``. With several logs, the uncertainty of a constant comes from the
+        differences between fits of single logs. ``initial``: the settings before the fit."""
         values = posterior.as_dict()
         own = centred(posterior.parameters, values)
         alone = [
@@ -248,8 +248,8 @@ class ConstantsCalibrator(Calibrator):
         return out
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
-        """Return the result for logs whose trajectories are smoothed: the mean over the logs of each constant that the
-        smoother estimated. ``first``: the rig of the user."""
+        """Return the result for logs with smoothed trajectories. Each constant is the mean of the estimates of the
+        smoother over the logs. ``first``: see :meth:`Calibrator.learn`."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""

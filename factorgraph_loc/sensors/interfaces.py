@@ -26,27 +26,26 @@ from factorgraph_loc.sensors.registry import channels, functions, sensor_of
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array
 
-# the search for an offset between the clocks of two signals
-STEP = 0.05  # s between compared times, and between tried time shifts
+# the search for a time shift between two signals
+STEP = 0.05  # s; sampling interval of the signals, and difference between successive time shifts
 FARTHEST = 2.5  # s; largest time shift
 SHIFTS = np.arange(-round(FARTHEST / STEP), round(FARTHEST / STEP) + 1)  # time shifts as multiples of STEP
 LARGE = 0.15  # s; smallest time shift that is reported
 BETTER = 0.7  # a time shift is reported if it reduces the residual to less than this fraction
 FEWEST = 200  # minimum number of compared times or sightings
-SLOWEST = 1.0  # s; with longer intervals between reference poses nothing is compared
+SLOWEST = 1.0  # s; the time shift is not searched if reference poses are further apart
 Array32 = NDArray[np.float32]
 Places = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Use:
-    """A planned run of a log by an estimator.
+    """A planned run of an estimator on a log.
 
-    ``sensors``: names of the channels that the run may use.
-    ``estimator``: the name of the estimator. ``settings``: its settings. ``given``: names of the settings that the user
-    has set. ``modalities``: modalities of the measurements that the estimator uses.
-    ``estimates_points``: True if the estimator can estimate image points that are not in the map.
-    ``warnings``: warnings about the settings.
+    ``sensors``: names of the measurement channels that the run may use, such as "rfid". ``estimator``: the name of the
+    estimator. ``settings``: the settings of the estimator. ``given``: names of the settings that the user has set.
+    ``modalities``: kinds of sensors that the estimator supports. ``estimates_points``: True if the estimator can
+    estimate image points that are not in the map. ``warnings``: warnings about the settings.
     """
 
     log: Log
@@ -63,8 +62,8 @@ class Use:
 class Ending:
     """The results of a finished run.
 
-    ``diagnostics``: diagnostics of the causal estimates. ``final_diagnostics``: diagnostics of the ``final``
-    trajectory, which uses all measurements. ``learnt``: estimated constants and landmarks.
+    ``final``: the trajectory estimated from all measurements. ``final_diagnostics``: its diagnostics.
+    ``diagnostics``: diagnostics of the causal estimates. ``learnt``: estimated constants and landmarks.
     """
 
     diagnostics: Diagnostics
@@ -82,9 +81,8 @@ class Review:
 
 
 def lacking_section(rig: Rig, sensor: str) -> str:
-    """Return the name of the section of the rig that a sensor requires but the rig lacks. Returns "" if nothing is
-    missing. A section whose settings all have defaults is required only for one of several sensors, such as
-    ``bearing_range.front``."""
+    """Return the name of the section that ``sensor`` requires and ``rig`` lacks, or "" if the rig lacks none. A section
+    is not required if all its settings have defaults and the rig has only one sensor of this type."""
     kind = kind_of(sensor)
     known = channels().get(kind)
     if known is None or not known.section:
@@ -98,7 +96,7 @@ def lacking_section(rig: Rig, sensor: str) -> str:
 
 @dataclass(frozen=True)
 class Paragraph:
-    """A line of text. If ``header`` has C titles, a table with ``rows`` (R, C) of text follows."""
+    """A line of text, and optionally a table below it. ``header``: C column titles. ``rows``: R rows of C cells."""
 
     line: str
     header: tuple[str, ...] = ()
@@ -109,9 +107,9 @@ class Paragraph:
 class Summary:
     """The summary of one sensor in a log, for ``fgloc info``.
 
-    ``found``: entries of the output of ``fgloc info --json``. ``in_map``: number of detectable elements of each map
-    layer. ``problems``: warnings. ``text``: printed paragraphs. ``undetected``: warnings about elements that the sensor
-    never detects. One of these warnings is omitted if another sensor of the same kind detects the element.
+    ``found``: entries of the output of ``fgloc info --json``. ``in_map``: the number of detectable elements, such as
+    tags, by map layer. ``problems``: warnings. ``text``: printed paragraphs. ``undetected``: warnings about elements
+    that this sensor never detects. They are not shown if another sensor of the same type detects the element.
     """
 
     found: Mapping[str, Any] = field(default_factory=dict)
@@ -122,10 +120,10 @@ class Summary:
 
 
 def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
-    """Return the warning that the timestamps of ``name`` are ``shift`` [s] later than those of ``than``.
+    """Return a warning that the timestamps of the stream ``name`` are ``shift`` [s] later than those of ``than``.
 
-    ``setting``: the section of the rig whose ``time_offset`` the warning proposes to set to ``offset`` [s]. If the
-    shift is at the limit of the search, the true one may be larger, and the warning proposes to correct the manifest.
+    The warning proposes to set ``time_offset`` to ``offset`` [s] in the section ``setting`` of the rig. If ``shift`` is
+    the largest that was tried, the warning proposes to correct ``clock_offset`` in the manifest.
     """
     if abs(shift) > FARTHEST - STEP:
         sentence = (
@@ -141,7 +139,7 @@ def line(name: str, shift: float, than: str, setting: str, offset: float) -> Not
 
 
 def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
-    """Return the ``names`` that are in ``in_map`` only with other upper and lower case letters."""
+    """Return the ``names`` that differ from a name of ``in_map`` only in upper and lower case."""
     mapped = set(in_map)
     known = {name.casefold() for name in mapped}
     return [name for name in names if name not in mapped and name.casefold() in known]
@@ -149,11 +147,11 @@ def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """The marks of one ``layer`` of the map in plots and viewers.
+    """The elements of one ``layer`` of the map, such as tags, and how plots and viewers draw them.
 
-    ``names`` (K) and ``positions`` (K, 3) [m]: the elements of the layer. ``t`` (N,) and ``seen`` (N): time [s of the
-    log] and element name of each detection. ``marker``, ``size``: matplotlib style. ``order``: layers with a higher
-    order are drawn on top. ``dense``: True if there are too many elements to label.
+    ``names`` (K), ``positions`` (K, 3) [m]: the elements. ``t`` (N,), ``seen`` (N): the time [s] and the element name
+    of each detection in the log. ``marker``, ``size``: the matplotlib marker. ``order``: layers with a higher order are
+    drawn on top. ``dense``: True if there are too many elements to label.
     """
 
     layer: str
@@ -168,7 +166,7 @@ class Marks:
 
 
 def marks(log: Log) -> list[Marks]:
-    """Return the drawings of all map layers of a log. Detections by several sensors in one layer are merged."""
+    """Return the marks of each map layer of ``log``. Detections of one layer by several sensors are merged."""
     layers: dict[str, Marks] = {}
     for name, draw in functions("draw", log.rig):
         new: Marks = draw(log.alone(name))
@@ -182,9 +180,9 @@ def marks(log: Log) -> list[Marks]:
 class Ride:
     """A simulated drive through a world.
 
-    ``settings``: settings of the simulation, with the sections of the sensors. ``rig``: the rig that estimators will
-    use. ``world``: the true world. ``truth``: the true trajectory, from t = 0.
-    ``rng``, ``rng_of_world``: return a random generator by name, from the seed of the log or of the world.
+    ``settings``: settings of the simulation. ``rig``: the rig that estimators will use. ``world``: the true world.
+    ``truth``: the true trajectory, from t = 0. ``rng(name)``: returns a random generator, seeded by log and ``name``.
+    ``rng_of_world(name)``: the same, seeded by the world.
     """
 
     settings: Any
@@ -195,7 +193,7 @@ class Ride:
     rng_of_world: Callable[[str], np.random.Generator]
 
     def times(self, rate: float) -> Array:
-        """Return the measurement times (N,) [s] of a sensor with ``rate`` [Hz], from one period after the start."""
+        """Return the times (N,) [s] at which a sensor with ``rate`` [Hz] measures during the drive."""
         return times(rate, self.truth)
 
 
@@ -203,8 +201,8 @@ class Ride:
 class Simulated:
     """The simulated measurements of a sensor.
 
-    ``streams``: by channel. ``layers``: map layers as surveyed, if they differ from the true world. ``metadata``:
-    entries for the metadata of the log.
+    ``streams``: the streams of measurements by channel. ``layers``: map layers with survey errors, by name, if they
+    differ from the true world. ``metadata``: entries for the metadata of the log.
     """
 
     streams: Mapping[str, Stream] = field(default_factory=dict)
@@ -215,7 +213,8 @@ class Simulated:
 class LiveSensor(Protocol):
     """A simulated sensor on a robot that chooses its path (active localization).
 
-    ``rate``: measurements per second. ``decides``: True if the robot checks after each measurement whether it is localized.
+    ``rate``: measurements per second. ``decides``: True if the robot checks after each measurement of this sensor
+    whether it is localized.
     """
 
     channel: str
@@ -227,13 +226,13 @@ class LiveSensor(Protocol):
 
 
 def times(rate: float, truth: Trajectory) -> Array:
-    """Return the measurement times (N,) [s] of a sensor with ``rate`` [Hz] on a drive, from one period after the start."""
+    """Return the times (N,) [s] at which a sensor with ``rate`` [Hz] measures during the trajectory ``truth``."""
     count = int(float(truth.t[-1]) * rate + 1e-9)
     return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))
 
 
 class Forecast(Protocol):
-    """Predicts what a sensor will measure on candidate paths, in a world whose map is exact.
+    """Predicts the information of a sensor's measurements on candidate paths. The map is assumed to be exact.
 
     ``goals`` (K, 2): positions [m] near which the sensor is most informative. K is 0 for a sensor with long range.
     """
@@ -241,17 +240,18 @@ class Forecast(Protocol):
     goals: Array
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Return the expected Fisher information (N, 3, 3) on the body-frame perturbation of ``poses`` (N, 3) along a path.
+        """Return the expected Fisher information (N, 3, 3) of the measurements at each pose of a path.
 
-        ``ways`` (N,): the length [m] of the part of the path at each pose. The duration of a turn counts as the
-        distance that the robot travels in that time.
+        The information is that on the body-frame perturbation of the pose. ``poses`` (N, 3): the poses of the path.
+        ``ways`` (N,): the length [m] of the path segment that ends at each pose. Turns count by their duration, as the
+        length that the robot drives in that time.
         """
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate measurements from each of the first J particles along a path. Add to ``out[j, m]`` the
-        log-likelihood of particle m, given the measurements from particle j.
+        """Simulate measurements of the first J of M particles along a path, and compute how likely they are for all M.
 
-        ``poses`` (S, M, 3): the poses of M particles at S stops on the path. ``metres``: length of the path, with turns
-        as in :meth:`information`. ``stops`` (M,): number of stops at which each particle measures. ``out`` (J, M).
-        Random draws are the same for all paths with the same ``seed``.
+        ``out`` (J, M): the log-likelihood of particle m for the measurements of particle j is added to ``out[j, m]``.
+        ``poses`` (S, M, 3): the poses of the particles at S stations of the path. ``metres``: the length of the path,
+        with turns as in :meth:`information`. ``stops`` (M,): the number of stations that each particle reaches.
+        ``seed``: paths with the same seed use the same random numbers.
         """

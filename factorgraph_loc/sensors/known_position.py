@@ -16,14 +16,14 @@ from factors.motion import ChainState
 from factors.se2 import Array
 
 HEADINGS = 72  # number of initial headings
-START_KEPT = 300.0  # s; if the heading is found within this time, the final trajectory includes the start
+START_KEPT = 300.0  # s; if the heading is found later, the final trajectory does not begin at the start
 
 
 @dataclass
 class KnownPosition:
     """A start at a known position with unknown heading.
 
-    ``prior``: the start pose with its covariance; the heading is not used. ``motion``: the odometry of the run.
+    ``prior``: the start pose with its covariance. Its heading is ignored. ``motion``: the odometry of the run.
     """
 
     prior: PosePrior
@@ -32,8 +32,7 @@ class KnownPosition:
 
     @property
     def odometry(self) -> ChainState:
-        """The odometry state at the time of the prior. It may change with new rows of odometry until :meth:`settle` is
-        called."""
+        """The odometry state at the time of the prior. It may change with further odometry before :meth:`settle`."""
         return self.motion.state(self.t) if self._odometry is None else self._odometry
 
     def settle(self) -> None:
@@ -45,27 +44,26 @@ class KnownPosition:
         return self.prior.t
 
     def facing(self, heading: float) -> PosePrior:
-        """Return the start as a Gaussian. Its heading has the mean ``heading`` [rad] and the standard deviation pi."""
+        """Return the start as a Gaussian with mean ``heading`` [rad] and standard deviation pi of the heading."""
         covariance = self.prior.covariance.copy()
         covariance[2, 2] = math.pi**2
         return PosePrior(self.t, np.append(self.prior.pose[:2], heading), covariance)
 
     def mode(self, now: ChainState) -> Mode:
-        """Return mean and covariance of the pose at the odometry state ``now``, from the start and the odometry alone."""
+        """Return a Gaussian of the pose at the odometry state ``now``, from start position and odometry alone."""
         x, y, turned = self.motion.relative(self.odometry, now).delta
         covariance = self.prior.covariance.copy()
         covariance[:2, :2] += 0.5 * (x**2 + y**2) * np.eye(2)  # displacement in an unknown direction
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Return candidates (N, 3) of the pose at the odometry state ``now``: the poses after starts at the mean
-        position with evenly spaced headings."""
+        """Return the poses (N, 3) to which the odometry leads until ``now``, from N evenly spaced start headings."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)
 
     def drawn(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
-        """Return ``count`` random samples (N, 3) of the pose at the odometry state ``now``. Their headings are stratified."""
+        """Return ``count`` random poses (N, 3) at the odometry state ``now``, with stratified headings."""
         moved = self.motion.relative(self.odometry, now)
         positions = self.prior.pose[:2] + positive.draws(self.prior.covariance[:2, :2], count, rng)
         headings = (rng.permutation(count) + rng.random(count)) * 2.0 * math.pi / count - math.pi
@@ -73,8 +71,11 @@ class KnownPosition:
         return se2.compose(poses, se2.exp(positive.draws(moved.covariance, count, rng)))
 
     def loss(self, poses: Array, now: ChainState, noise: Array | None = None) -> Array:
-        """Return half the squared Mahalanobis distance (N,) between the known start position and the start positions that
-        ``poses`` (N, 3) at the odometry state ``now`` imply. ``noise`` (3, 3): an additional body-frame covariance of the poses."""
+        """Return half the squared Mahalanobis distances (N,) of N start positions from the known start position.
+
+        The start positions follow from ``poses`` (N, 3) at the odometry state ``now`` and the odometry. ``noise`` (3,
+        3): an additional body-frame covariance of the poses.
+        """
         error, _, covariance = self._linearized(poses, now, noise)
         return np.asarray(0.5 * np.einsum("ni,ni->n", error, positive.solve(covariance, error[..., None])[..., 0]))
 
@@ -85,19 +86,17 @@ class KnownPosition:
         return np.asarray(-self.loss(poses, now) - normaliser)
 
     def normal_equations(self, poses: Array, now: ChainState, noise: Array | None = None) -> tuple[Array, Array]:
-        """Return information (N, 3, 3) and gradient (N, 3) of :meth:`loss` by the body-frame perturbation of ``poses`` (N, 3).
-
-        The other arguments are those of :meth:`loss`.
-        """
+        """Return the Gauss-Newton Hessian (N, 3, 3) and the gradient (N, 3) of :meth:`loss`, both by body-frame
+        perturbations of ``poses`` (N, 3). The arguments are those of :meth:`loss`."""
         error, jacobian, covariance = self._linearized(poses, now, noise)
         weighted = positive.solve(covariance, jacobian).transpose(0, 2, 1)
         return weighted @ jacobian, (weighted @ error[..., None])[..., 0]
 
     def whitened(self, pose: Array, now: ChainState) -> tuple[Array, Array, Array]:
-        """Return the residual (2,) of the start position that ``pose`` (3,) at the odometry state ``now`` implies.
+        """Return the whitened residual (2,) of the start position that follows from ``pose`` (3,) and the odometry.
 
-        The residual is in standard deviations of the known position, without the odometry error. Also returns its Jacobian (2, 3)
-        by the body-frame perturbation of the pose, and the covariance (3, 3) of the odometry since the start.
+        It is whitened with the prior covariance. Also returns its Jacobian (2, 3) by the body-frame perturbation of
+        the pose, and the covariance (3, 3) of the odometry since the start. ``now``: see :meth:`loss`.
         """
         error, jacobian, _ = self._linearized(pose[None], now, None)
         root = positive.root(self.prior.covariance[:2, :2])
@@ -105,8 +104,8 @@ class KnownPosition:
         return np.linalg.solve(root, error[0]), np.linalg.solve(root, jacobian[0]), moved.covariance
 
     def _linearized(self, poses: Array, now: ChainState, noise: Array | None) -> tuple[Array, Array, Array]:
-        """Return the errors (N, 2) of the start positions that ``poses`` (N, 3) imply, the Jacobians (N, 2, 3) of the errors by the
-        poses, and their covariances (N, 2, 2) from prior and odometry. For the arguments see :meth:`loss`."""
+        """Return errors (N, 2) of the start positions that follow from ``poses`` (N, 3), Jacobians (N, 2, 3) of the
+        errors by the poses, and covariances (N, 2, 2) of the errors. For the arguments see :meth:`loss`."""
         moved = self.motion.relative(self.odometry, now)
         back = se2.inverse(moved.delta)
         error = se2.compose(poses, back)[:, :2] - self.prior.pose[:2]

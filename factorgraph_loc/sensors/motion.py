@@ -31,8 +31,8 @@ from factors.odometry.model import (
 )
 from factors.se2 import Array
 
-MOTION = "motion"  # name of the state block with the odometry's constants
-# distance [m], rotation [rad] and time [s] over which the error of a constant accumulates before other sensors correct it
+MOTION = "motion"  # the state block with the calibration constants of the odometry
+# distance [m], rotation [rad] and time [s] after which other sensors are assumed to correct the error of a constant
 WAY, TURN, TIME = 4.0, 4.0, 8.0
 HORIZON = 5.0  # s; older odometry is discarded during a run
 
@@ -40,10 +40,10 @@ HORIZON = 5.0  # s; older odometry is discarded during a run
 def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
     """Return the odometry model of a rig.
 
-    ``use_gyro``: bias and noise of the heading are those of the gyro.
-    ``constants_as_noise``: for an estimator that does not estimate the uncertain constants. Their errors are added to
-    the noise as a random walk. Its variance equals that of the error after the distance :data:`WAY`, the rotation
-    :data:`TURN` or the time :data:`TIME`.
+    ``use_gyro``: True to take the noise of the heading from the gyro.
+    ``constants_as_noise``: True to add the uncertainty of the calibration constants to the noise. Use this if the
+    constants are not estimated. The variances are those after the distance :data:`WAY`, the rotation :data:`TURN` and
+    the time :data:`TIME`.
     """
     s = rig.of(OdometrySettings)
     along, heading = s.noise.along.model(), s.noise.heading.model()
@@ -79,8 +79,8 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
 class Motion(OdometryChain):
     """Collects rows of wheel odometry and gyro, and computes the relative motion between any two recent times.
 
-    The gyro replaces the rotation of the wheels if ``sensors`` include ``imu``. ``constants``: the P calibration
-    constants that are estimated. Without ``self_calibration`` there are none, and their errors are part of the noise.
+    If ``sensors`` include "imu", the rotation is that of the gyro. ``self_calibration``: True to estimate the P
+    calibration constants in the attribute ``constants``. Otherwise their uncertainty is part of the noise.
     """
 
     def __init__(
@@ -93,8 +93,8 @@ class Motion(OdometryChain):
         self._diagnostics = diagnostics
 
     def add(self, m: Measurement) -> None:
-        """Add one row, or several as :class:`~factorgraph_loc.model.measurement.Rows`. Rows of an unused sensor are
-        counted as ignored. Rows that are too old are counted as late."""
+        """Add one row, or several as :class:`~factorgraph_loc.model.measurement.Rows`. The diagnostics count rows of
+        unused sensors as ignored and rows that are too old as late."""
         kept: int
         match m:
             case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
@@ -112,21 +112,21 @@ class Motion(OdometryChain):
             self._diagnostics.drop_late("odometry", m.count - kept)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
-        """Return the logarithm (3,) of an increment's motion, corrected for ``constants`` (P,), and its Jacobian (3, P)
-        by the constants."""
+        """Return the logarithm (3,) of the motion of an increment, corrected with the estimated ``constants`` (P,).
+        Also return its Jacobian (3, P) by the constants."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
-        """Return the increment after its motion is corrected with the estimated ``constants`` (P,)."""
+        """Return a copy of an increment, with its motion corrected with the estimated ``constants`` (P,)."""
         if not self.constants.names:
             return increment
         delta = kernels.recalibrated(increment.delta, increment.moving, constants, self._indices)
         return Increment(delta, increment.covariance, increment.duration, increment.still)
 
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
-        """Return poses (R, 3) at times ``t`` (R,) [s], in the frame of the pose at ``start``. They are corrected for
-        ``constants`` (P,) with the linearisation of :func:`factors.odometry.kernels.recalibrate`."""
+        """Return the robot's poses (R, 3) at times ``t`` (R,) [s], relative to the pose at ``start``. The motion is
+        corrected with the estimated ``constants`` (P,), to first order."""
         states = self.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:
@@ -138,13 +138,13 @@ class Motion(OdometryChain):
         return np.asarray(se2.exp(moved))
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
-        """Return the additional covariance (3, 3) of an increment if the wheels slip, and the negative log-probability
-        of slip."""
+        """Return the covariance (3, 3) that wheel slip adds to that of an increment, and the negative logarithm of the
+        probability of slip."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
 
 
 def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
-    """Return the motion of a whole log, from the odometry and the gyro if ``sensors`` include them."""
+    """Return the motion in a whole log. ``sensors``: names of the sensors to use, "odometry" or "imu" or both."""
     motion = Motion(log.rig, tuple(sensors), Diagnostics())
     motion.horizon = math.inf
     for m in log.measurements(sensors):
@@ -161,14 +161,14 @@ def odometry_of(log: Log) -> VelocityStream | IncrementStream:
 
 
 def overlap(log: Log) -> tuple[float, float]:
-    """Return the first and the last time [s] for which a log has both odometry and reference."""
+    """Return the start and the end [s] of the time for which a log has odometry and a reference trajectory."""
     assert log.reference is not None
     t = odometry_of(log).t + log.rig.time_offset("odometry")
     return max(float(t[0]), float(log.reference.t[0])), min(float(t[-1]), float(log.reference.t[-1]))
 
 
 def integrated(log: Log, model: OdometryModel) -> OdometryChain:
-    """Return the odometry of a log, integrated from its first to its last row. ``model``: the odometry model."""
+    """Integrate all odometry rows of a log with the odometry model ``model``. Returns the chain of states."""
     chain = OdometryChain(model, horizon=np.inf)
     stream = odometry_of(log)
     t = stream.t + log.rig.time_offset("odometry")

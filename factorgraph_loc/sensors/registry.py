@@ -27,16 +27,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Channel:
-    """A kind of measurement of a sensor. Its ``name`` is used in the option ``--sensors`` and as the name of a log's stream.
+    """One kind of measurement of a sensor. ``name``: its name in the option ``--sensors`` and in ``Log.streams``.
 
-    ``section``: the section of the rig with the channel's ``time_offset``.
-    ``tables``: descriptions (:class:`~factorgraph_loc.files.columns.Table`) of the channel's tables in a log. A channel
-    without tables is an optional column of the sensor's first channel, such as ``rssi`` of ``rfid``.
-    ``described``: descriptions of further tables, whose columns are the fields of measurements but not of files.
-    ``assemble``: ``(rows by table, reading) -> stream``, if the fields of the stream are not columns of a table.
+    ``section``: the section of the rig with the channel's ``time_offset``. All further fields are strings
+    ``package.module:name`` of objects and functions.
+    ``tables``: the files (:class:`~factorgraph_loc.files.columns.Table`) of the channel in a log. A channel without
+    files is an optional column in the files of the sensor's first channel, such as ``rssi`` of ``rfid``.
+    ``described``: tables that are not files. They describe the fields of measurements.
+    ``assemble``: ``(rows by table, reading) -> stream``. Required if fields of the stream are not columns of a file.
     ``disassemble``: ``(stream, writing) -> columns by table``, the inverse of ``assemble``.
-    ``check``: ``(measurement, where) -> validated fields``, for pushed measurements whose fields are not columns of a table.
-    ``intake``: a subclass of :class:`~factorgraph_loc.sensors.tables.Intake`, which is constructed from rig and world.
+    ``check``: ``(measurement, where) -> validated fields``. Required if the fields are not columns of a file.
+    ``intake``: a subclass of :class:`~factorgraph_loc.sensors.tables.Intake`. Its arguments are rig and world.
     """
 
     name: str
@@ -50,23 +51,23 @@ class Channel:
 
     @property
     def streams(self) -> list[type[Any]]:
-        """The classes of the channel's streams. The attribute ``kind`` of a stream class is the class of its measurements."""
+        """The classes of the channel's streams. The attribute ``kind`` of each is the class of its measurements."""
         tables = [load(place) for place in (*self.tables, *self.described)]
         return [load(table.stream) for table in tables if table.stream]
 
 
 @dataclass(frozen=True)
 class SensorType:
-    """The description of a sensor: names, sections, and functions as strings ``package.module:name``, "" for none.
+    """All that the program must know of a type of sensor. A function is a string ``package.module:name``, or "".
 
-    - ``channels``: kinds of measurements. ``settings``: sections of the rig. ``layers``: layers of the world.
-    - ``detects``: the layer of the world with the elements that the sensor detects, "" for none.
+    - ``channels``: kinds of measurements. ``settings``: sections of the rig. ``layers``: layers of the map.
+    - ``detects``: the layer of the map with the elements that the sensor detects, "" for none.
     - ``locates``: True if the sensor localizes the robot without a map.
     - ``bind``: ``(binding) ->`` :class:`~factorgraph_loc.sensors.base.Sensor`, or None if the run does not use it.
     - ``summarize``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Summary`, for ``fgloc info``.
     - ``draw``: ``(log) ->`` :class:`~factorgraph_loc.sensors.interfaces.Marks`, for plots and viewers.
-    - ``check``: ``(use) -> use``, before a run. It may change settings. It raises InputError if they do not fit the log.
-    - ``review``: ``(use, ending) ->`` :class:`~factorgraph_loc.sensors.interfaces.Review`, after a run.
+    - ``check``: ``(use) -> use``, called before a run. It may change settings. It raises InputError for wrong settings.
+    - ``review``: ``(use, ending) ->`` :class:`~factorgraph_loc.sensors.interfaces.Review`, called after a run.
     - ``simulation``: sections of the settings of simulated logs.
     - ``simulate``: ``(ride) ->`` :class:`~factorgraph_loc.sensors.interfaces.Simulated`, for simulated logs.
     - ``looks``: ``(settings) ->`` expected detections per second in a simulated log, such as {"tags": 80.0}. It raises
@@ -98,13 +99,13 @@ class SensorType:
 
 
 def sensors() -> Mapping[str, SensorType]:
-    """Return all sensors by name, built-in ones first. Raises InputError if a sensor cannot be loaded, or if two have
-    the same name."""
+    """Return all types of sensors by name. Built-in sensors come before those of other packages. Raises InputError if a
+    sensor cannot be loaded or if two sensors have the same name."""
     return registered()
 
 
 def sensor(name: str) -> SensorType:
-    """Return the sensor with this name, or with a channel of this name. Raises InputError if there is none."""
+    """Return the sensor that has this name, or that has a channel with this name. Raises InputError for other names."""
     if name in sensors():
         return sensors()[name]
     if name in channels():
@@ -113,7 +114,7 @@ def sensor(name: str) -> SensorType:
 
 
 def sections_of(sensor: SensorType) -> dict[str, list[Setting]]:
-    """Return the settings in each section of the rig that belongs to the sensor."""
+    """Return the settings of each section of the rig that belongs to ``sensor``, by the name of the section."""
     return {name: settings_in(load(section.kind)) for name, section in sensor.settings.items()}
 
 
@@ -142,20 +143,20 @@ def sensor_of(channel: str) -> SensorType:
 
 
 def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
-    """Return the channels among ``names`` that measure motion on the floor. If ``rank`` is
-    :data:`~factorgraph_loc.model.measurement.TURN`, channels that measure only rotation are included."""
+    """Return those of the channels ``names`` that measure the motion of the robot. Channels that measure only rotation
+    are included if ``rank`` is :data:`~factorgraph_loc.model.measurement.TURN`."""
     streams = {name: channels()[kind_of(name)].streams for name in names if kind_of(name) in channels()}
     return tuple(name for name, kinds in streams.items() if kinds and kinds[0].rank <= rank)
 
 
 def parent_of(channel: str) -> str:
-    """Return the channel whose tables have ``channel`` as an optional column, or "" if ``channel`` has tables itself."""
+    """Return the channel whose files have ``channel`` as an optional column, or "" if ``channel`` has its own files."""
     known = channels().get(channel)
     return "" if known is None or known.tables else sensor_of(channel).channels[0].name
 
 
 def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
-    """Return the sensors with a channel among ``names`` that can localize the robot in ``world``."""
+    """Return the sensors that can localize the robot in the map ``world`` with the channels ``names``."""
     return [
         sensor
         for sensor in sensors().values()
@@ -165,17 +166,17 @@ def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
 
 
 def channel(name: str) -> Channel:
-    """Return the channel with this name. It may be the name of one of several sensors, such as ``bearing_range.front``.
-    Raises InputError if it is unknown."""
+    """Return the channel ``name``. For one of several sensors, such as "bearing_range.front", this is the channel
+    "bearing_range". Raises InputError if the name is unknown."""
     return next(own for own in sensor_of(name).channels if own.name == kind_of(name))
 
 
 def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
-    """Yield the name and the function of each sensor that registers a function ``kind``, a field of :class:`SensorType`.
+    """Yield the name of each sensor that registers a function ``kind``, and the function.
 
-    If the ``rig`` has several sensors of one type, each is yielded by its own name, such as ``bearing_range.front``.
-    The function then expects a rig or log that has no other sensor of its type
-    (:meth:`~factorgraph_loc.model.rig.Rig.alone`).
+    ``kind``: a field of :class:`SensorType`, such as "draw". If the ``rig`` has several sensors of one type, each is
+    yielded by its own name, such as "bearing_range.front". Call the function with a rig or log that
+    :meth:`~factorgraph_loc.model.rig.Rig.alone` has reduced to this sensor.
     """
     for name, sensor in sensors().items():
         if place := getattr(sensor, kind):
@@ -185,7 +186,7 @@ def functions(kind: str, rig: Rig | None = None) -> Iterator[tuple[str, Any]]:
 
 
 def bound_sensors(binding: Binding) -> dict[str, Sensor]:
-    """Return the sensors of the robot's surroundings that a run uses, by name."""
+    """Return the exteroceptive sensors that a run uses, by name. ``binding``: the arguments of the sensors."""
     named = [("" if kind_of(name) == name else name, bind) for name, bind in functions("bind", binding.setup.rig)]
     sensors = [bind(replace(binding, setup=binding.setup.alone(name), name=name)) for name, bind in named]
     return {sensor.name: sensor for sensor in sensors if sensor is not None}

@@ -1,8 +1,8 @@
-"""Trajectories for the calibration of sensors: references, or trajectories that a smoother estimated in logs without reference.
+"""Trajectories for the calibration of sensors: reference trajectories, or smoothed ones in logs without a reference.
 
-In each log the smoother estimates the sensors' constants as corrections of the rig's values, with standard deviations. The mean
-of a correction over the logs updates the rig's value. The scatter of a correction between logs is the uncertainty of the
-constant (empirical Bayes: Efron and Morris, "Data analysis using Stein's estimator and its generalizations", JASA 70, 1975).
+In a log without reference, the smoother also estimates corrections of the calibration constants in the rig. The mean
+correction over all logs updates a constant. The scatter between logs is the new uncertainty of the constant. Source
+(empirical Bayes): Efron, Morris, "Data analysis using Stein's estimator and its generalizations", JASA 70, 1975.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,17 +17,17 @@ from factorgraph_loc.model.trajectory import Trajectory
 from factorgraph_loc.sensors.registry import moving
 from factors.se2 import Array
 
-WORTH = 2.0  # the uncertainty of the input rig has the weight of this many logs, because the scatter of few logs is uncertain
+WORTH = 2.0  # weight of the uncertainty in the input rig, as a number of logs
 REFERENCE_GAP = 0.35  # s; longest interpolated gap between reference poses
 
 
 @dataclass(frozen=True)
 class Traced:
-    """A log for calibration, whose reference is a measured or a smoothed trajectory.
+    """A log for calibration. Its reference is a measured trajectory or one that a smoother estimated.
 
-    ``constants``: None for a measured reference. For a smoothed trajectory: the estimated constants by their names in
-    :class:`~factorgraph_loc.model.belief.Learnt`. Each value is a correction of the rig's value, and its standard
-    deviation. ``doubted``: names of elements that are probably not at their position in the map.
+    ``constants``: None for a measured trajectory. For a smoothed one: the estimated correction of each constant of the
+    rig and its standard deviation, by the name in :class:`~factorgraph_loc.model.belief.Learnt`. ``doubted``: names of
+    tags or landmarks that are probably not at their position in the map.
     """
 
     log: Log
@@ -36,8 +36,8 @@ class Traced:
 
 
 def recordings(logs: Sequence[Log]) -> list[int]:
-    """Return the number of the recording that each log belongs to, which is the index of its first log. Logs that
-    differ only in their odometry belong to the same recording, because they are not independent."""
+    """Return a number for each log, which is equal for logs of the same recording: the index of the first such log.
+    Logs belong to the same recording if they differ only in their odometry."""
     keys = [_exteroceptive(log) or i for i, log in enumerate(logs)]
     return [keys.index(key) for key in keys]
 
@@ -51,7 +51,7 @@ def _exteroceptive(log: Log) -> bytes:
 
 @dataclass(frozen=True)
 class Corrections:
-    """Corrections of one constant in N logs: ``each`` (N,), their ``mean``, and their standard deviation ``scatter``."""
+    """Corrections ``each`` (N,) of a constant in N logs, their ``mean`` and their standard deviation ``scatter``."""
 
     each: Array
     mean: float
@@ -64,10 +64,10 @@ class Corrections:
 
 
 def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Corrections:
-    """Return mean and scatter of ``corrections``, each given with its standard deviation.
+    """Return the mean of corrections of a constant over N logs, and their scatter without estimation errors.
 
-    The variance between logs is the variance of the corrections minus the part that their own errors explain. It is averaged
-    with the square of ``known``, the standard deviation in the input rig, which has the weight of :data:`WORTH` logs.
+    ``corrections``: N pairs of a correction and its standard deviation. ``known``: the standard deviation in the input
+    rig, with which the scatter is averaged. It has the weight of :data:`WORTH` logs.
     """
     each, errors = np.array(corrections).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))
@@ -76,8 +76,8 @@ def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Correcti
 
 
 def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, float]]:
-    """Return the correction of a constant and its standard deviation in each log. Returns [] if it was not estimated in
-    all logs."""
+    """Return the correction of the constant ``name`` and its standard deviation in each log. Returns [] if a log lacks
+    an estimate of the constant."""
     corrections = [trace.constants[name] for trace in traced if trace.constants and name in trace.constants]
     return corrections if len(corrections) == len(traced) else []
 
@@ -85,11 +85,11 @@ def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, flo
 def pooled_constants(
     section: str, prefix: str, settings: Any, first: Any, traced: Sequence[Traced]
 ) -> tuple[Any, list[FittedConstant]]:
-    """Update the constants of a section that were estimated in all logs. Returns the new settings and the fitted constants.
+    """Return the settings of a section with updated constants, and a list of the constants that changed.
 
-    ``prefix``: the prefix of the constants' names in the logs. ``settings``: the settings that the logs were smoothed
-    with. ``first``: the settings before the first repetition of smoothing and calibration. Corrections of scales are
-    relative, others are absolute. With several logs, the uncertainties of the constants are updated as well.
+    Constants that were estimated in all logs get the mean of the estimates. With several logs, their uncertainties are
+    updated too. ``prefix``: the prefix of the constants' names in ``Traced.constants``. ``settings``: the settings with
+    which the logs were smoothed. ``first``: the settings before the first iteration of smoothing and calibration.
     """
     values: dict[str, float] = {}
     uncertainties: dict[str, float] = {}
@@ -114,9 +114,8 @@ def pooled_constants(
 def possible_poses(trajectory: Trajectory, t: Array) -> Array:
     """Return one random pose (N, 3) at each time ``t`` (N,) [s] of a trajectory with covariances.
 
-    Each pose is drawn from the six cubature points of the pose's distribution. A mean over many times is therefore also a mean
-    over the errors of the trajectory. Poses are NaN outside of the trajectory and in gaps longer than :data:`REFERENCE_GAP`.
-    The random draws are the same at each call. Source: Arasaratnam and Haykin, "Cubature Kalman filters", IEEE TAC 54(6), 2009.
+    Each pose is one of the six cubature points of its Gaussian, chosen with a fixed seed. It is NaN in gaps longer than
+    :data:`REFERENCE_GAP`. Source: Arasaratnam, Haykin, "Cubature Kalman filters", IEEE TAC 54(6), 2009.
     """
     poses = trajectory.at(t, max_gap=REFERENCE_GAP)
     covariances = np.nan_to_num(trajectory.covariances_at(t, max_gap=REFERENCE_GAP)) + 1e-12 * np.eye(3)

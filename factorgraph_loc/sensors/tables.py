@@ -1,4 +1,4 @@
-"""Converts tables of files into streams and back, and validates pushed measurements, by the descriptions of their columns.
+"""Converts tables of files into streams and back, and validates measurements, by the descriptions of their columns.
 
 A channel whose stream has one field per column only needs a :class:`~factorgraph_loc.files.columns.Table`. Other
 channels define the functions ``assemble`` and ``disassemble``.
@@ -36,8 +36,8 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """The context of a reader of rows. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``:
-    receives warnings. ``shared``: values that several sensors have in common by name, such as the origin of latitudes.
+    """Arguments of ``Channel.assemble``. ``rig``: the robot. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``:
+    a list to append warnings to. ``shared``: values that several sensors use, by name, such as the origin of latitudes.
     """
 
     rig: Rig
@@ -48,8 +48,8 @@ class Reading:
 
 @dataclass(frozen=True)
 class Writing:
-    """The context of a writer of one stream. ``log``: the name of its log. ``t0_ns``: the absolute time of t = 0
-    [ns]. ``folder``: the folder of the tables."""
+    """Arguments of ``Channel.disassemble``. ``log``: the name of the log. ``t0_ns``: the absolute time of t = 0
+    [ns]. ``folder``: the folder of the files to write."""
 
     log: str
     t0_ns: int
@@ -58,13 +58,13 @@ class Writing:
 
 @cache
 def tables_of(channel: Channel) -> tuple[Table, ...]:
-    """Return the descriptions of a channel's tables in a log. Several descriptions with the same name are alternatives."""
+    """Return the descriptions of the files of a channel in a log. Descriptions with the same name are alternatives."""
     return tuple(load(place) for place in channel.tables)
 
 
 @cache
 def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
-    """Return the tables of the native format by name: the channel of each table, and its alternative descriptions."""
+    """Return all tables of the native format by name: the channel and the alternative descriptions of each table."""
     return {
         table.name: (channel, tuple(candidate for candidate in tables_of(channel) if candidate.name == table.name))
         for channel in channels().values()
@@ -73,8 +73,8 @@ def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
 
 
 def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
-    """Return the channel name and the alternative descriptions of the table ``name`` of the native format. Returns None
-    if there is no such table. The table of one of several sensors has a name such as ``bearing_range.front``."""
+    """Return the channel of the table ``name`` of the native format, and the alternative descriptions of the table.
+    Returns None for other names. A table of one of several sensors has a name such as "bearing_range.front"."""
     kind, _, own = name.partition(".")
     if kind not in native_tables() or (kind != name and not (kind in several() and is_name(own))):
         return None
@@ -83,8 +83,8 @@ def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
 
 
 def all_tables(*chosen: SensorType) -> Iterator[Table]:
-    """Yield the descriptions of the tables of the ``chosen`` sensors, by default of all sensors. For each sensor,
-    tables of measurements come before tables of map layers."""
+    """Yield the descriptions of all tables of the sensors ``chosen``, by default of all sensors. The tables of
+    measurements of a sensor come before the tables of its map layers."""
     for sensor in chosen or sensors().values():
         for channel in sensor.channels:
             yield from (load(place) for place in (*channel.tables, *channel.described))
@@ -92,8 +92,8 @@ def all_tables(*chosen: SensorType) -> Iterator[Table]:
 
 
 def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of a channel from the ``rows`` of its tables, by table name. Raises InputError for invalid
-    rows, and appends to ``reading.warnings`` for rows that are skipped."""
+    """Return the stream of a channel. ``rows``: the rows of each table of the channel, by table name. Raises InputError
+    for invalid rows. Warnings about skipped rows are appended to ``reading.warnings``."""
     if channel.assemble:
         made: Stream = load(channel.assemble)(rows, reading)
         return made
@@ -106,11 +106,11 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
 
 
 def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """Return the stream of a table's rows. Of repeated rows the last one is kept. ``warnings``: receives warnings.
+    """Return the rows of a table as a stream of measurements. ``warnings``: a list to append warnings to.
 
-    Rows are repeated if they have the same timestamp. If the rows of one timestamp form one measurement, repeated rows
-    also have the same name. Raises InputError with file, row and column for values out of bounds, decreasing
-    timestamps, and rows without values.
+    If several rows have the same timestamp, only the last one is kept. If a measurement consists of several rows with
+    names, the last row of each name is kept. Raises InputError with file, row and column for values out of bounds,
+    decreasing timestamps, and rows without values.
     """
     values: dict[str, Any] = dict(rows.names)
     measured = [column for column in table.columns if column.name in rows.numbers]
@@ -140,12 +140,12 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice])
 
 
 def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
-    """Return a mask (N,) that is True for rows without a number in any of the ``columns``, each (N,)."""
+    """Return a mask (N,) that is True for rows in which all ``columns`` (each (N,)) are NaN."""
     return np.asarray(np.isnan(columns).all(axis=0))
 
 
 def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> Array:
-    """Return the numbers (N,) of a column. Numbers below the column's ``left_out_below`` become NaN, with a warning."""
+    """Return the numbers (N,) of a column. Numbers below ``column.left_out_below`` become NaN, with a warning."""
     values = rows.numbers[column.name]
     small = np.flatnonzero(values < column.left_out_below)
     if not len(small):
@@ -157,8 +157,8 @@ def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> A
 
 
 def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of a stream's tables, by table name. Files that the stream refers to are copied into the
-    folder. Raises InputError if the native format has no table for the stream."""
+    """Return the columns of the files in which a stream is stored, by table name. Images of the stream are copied into
+    ``writing.folder``. Raises InputError if the native format has no table for the stream."""
     if channel.disassemble:
         made: dict[str, Columns] = load(channel.disassemble)(stream, writing)
         return made
@@ -170,7 +170,7 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
 
 
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
-    """Yield the descriptions of a stream's numeric fields, each named as the field instead of the file's column."""
+    """Yield the description of each numeric field of ``stream``. Its ``name`` is the name of the field."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):
         if table.stream and load(table.stream) is type(stream):
             measured = [column.measured for column in table.columns if column.kind == "number"]
@@ -181,24 +181,24 @@ M = TypeVar("M", bound=Measurement)
 
 
 class Intake:
-    """Processes the measurements of a channel that a program pushes one by one. The default accepts them unchanged."""
+    """Checks and converts each measurement that a program passes to the live localizer. This class changes nothing."""
 
     def measured(self, m: Measurement) -> Measurement:
-        """Return the measurement for the estimators, such as the features of an image. This may be called in any thread."""
+        """Return ``m`` in the form that estimators need, such as the features of an image. Any thread may call this."""
         return m
 
     def require(self, m: Measurement) -> None:
-        """Raise InputError if a measurement is inconsistent with the previous ones."""
+        """Raise InputError if the measurement ``m`` is inconsistent with earlier measurements."""
 
 
 @cache
 def kinds() -> Mapping[type[Any], Channel]:
-    """Return the channel of each class of measurements."""
+    """Return all classes of measurements, each with its channel."""
     return {stream.kind: channel for channel in channels().values() for stream in channel.streams}
 
 
 def channel_of(kind: type[Any]) -> Channel:
-    """Return the channel of a class of measurements. Raises InputError if ``kind`` is no such class."""
+    """Return the channel of the measurement class ``kind``. Raises InputError if ``kind`` is another class."""
     if kind not in kinds():
         known = ", ".join(each.__name__ for each in kinds())
         raise InputError(f"{kind.__name__} is not a measurement, expected one of {known}")
@@ -206,8 +206,8 @@ def channel_of(kind: type[Any]) -> Channel:
 
 
 def checked(m: M) -> M:
-    """Return a validated copy of a measurement, or the measurement itself if it only consists of valid floats, which
-    are immutable. Raises InputError with the first invalid field, its value and the expected values."""
+    """Validate a measurement. Returns ``m`` if all fields are valid floats, otherwise a copy with validated fields.
+    Raises InputError with the name and value of the first invalid field."""
     if (floats := _floats_of(type(m))) is not None:
         for name, low, high in floats:
             value = getattr(m, name)
@@ -227,8 +227,8 @@ def checked(m: M) -> M:
 
 @cache
 def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] | None:
-    """Return name and inclusive bounds of each field of a class of measurements, such as those of odometry. Returns
-    None if not all fields are single numbers. Raises InputError if ``kind`` is no class of measurements."""
+    """Return the name, the minimum and the maximum of each field of the measurement class ``kind``. Returns None if a
+    field is not a single number. Raises InputError if ``kind`` is not a measurement class."""
     channel = channel_of(kind)
     if channel.check:
         return None
@@ -240,9 +240,10 @@ def _floats_of(kind: type[Measurement]) -> tuple[tuple[str, float, float], ...] 
 
 
 def _described(m: Measurement, where: str, channel: Channel) -> Iterator[tuple[str, Any]]:
-    """Yield name and validated value of each field of a measurement whose fields are the columns of a table of ``channel``.
+    """Yield the name and the validated value of each field of a measurement. The fields are columns of a table.
 
-    Values are numbers, or names and arrays (K,) if a measurement consists of K rows. ``where``: the measurement's name in errors.
+    A value is a number, or a list of names or an array (K,) if a measurement consists of K rows. ``where``: the name of
+    the measurement in error messages. ``channel``: the channel of the measurement.
     """
     table = _table_of(type(m), channel)
     count: int | None = None
