@@ -25,7 +25,7 @@ from factors.sighting import delayed
 from factors.update import CONVERGED, Correction, update_state
 
 TILTS = 2  # the number of errors that all points of an image have in common: roll and pitch of the robot
-# Arguments of compiled code if there is no offset, if the offset has no covariance, and if the points are exact.
+# Arguments of compiled code that replace None: a zero offset, an offset without covariance, and exact points.
 NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 
@@ -34,18 +34,17 @@ class ReprojectionFactor:
     """A factor on the robot's pose from K known points in one image. The pose may be the pose at a slightly earlier time.
 
     ``points`` (K, 3): world positions. ``pixels`` (K, 2): their measured pixels.
-    ``offset`` (3,): the robot's pose at the image's time, in the frame of the pose variable. Odometry measures it. None
-    if both poses are the same.
-    ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
+    ``offset`` (3,): the robot's pose at the time of the image in the frame of the estimated pose, from odometry. None
+    if the two poses are equal. ``offset_covariance`` (3, 3): its body-frame covariance, which is added to the noise.
     ``point_covariances`` (K, 3, 3): covariances of the points of an inexact map. They are added to the noise.
     ``estimated``: indices in :data:`PARAMETERS` of the P camera constants that are estimated.
-    ``moved_by`` (K,): for each point, the number of the displacement variable that is added to the point, or -1. Empty
-    if there are no such variables.
-    ``twist`` (3,): the robot's body-frame velocity at the image's time. The Jacobian by the time offset needs it.
+    ``moved_by`` (K,): for each point, the index of the displacement that is added to the point, or -1. Empty if there
+    are no displacements.
+    ``twist`` (3,): the robot's body-frame velocity at the time of the image. Required if the time offset is estimated.
 
     The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P
-    > 0, and the displacements (3,) of points in the world. The robot's tilt (roll and pitch) is an unknown error that
-    all points have in common.
+    > 0, and the displacements (3,) in the world. The robot's roll and pitch are an unknown error that all points have
+    in common.
     """
 
     model: CameraModel
@@ -82,10 +81,8 @@ class ReprojectionFactor:
         )
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (2K,) and its Jacobian (2K, d) by each value, with robust weights and tempering.
-
-        The unknown tilt is marginalised: its variance is part of the noise.
-        """
+        """The whitened residual (2K,) and its Jacobian (2K, d) by each value, with robust weights and tempering. The
+        variances of roll and pitch are part of the noise."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]
@@ -96,14 +93,14 @@ class ReprojectionFactor:
         return residual, np.split(jacobian, ends[:-1], axis=1)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss for the tilt that fits best, multiplied by the tempering exponent."""
+        """Return the robust loss for the best-fitting roll and pitch, multiplied by the tempering exponent."""
         error, tilt = self.levelled(values)
         loss = np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)) + 0.5 * tilt @ tilt
         return self.model.tempering * float(loss)
 
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Fit the robot's tilt to the image. Returns the whitened residual (K, 2) with this tilt, and the tilt (2,):
-        roll and pitch in standard deviations."""
+        """Fit the robot's roll and pitch to the image. Returns the whitened residual (K, 2) after the fit, and roll and
+        pitch (2,) in standard deviations."""
         error, (*_, by_tilt) = self.whitened(values)
         roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
         tilt = np.array((roll, pitch))
@@ -114,9 +111,10 @@ class ReprojectionFactor:
         return self.model.tempering * huber_weight(squared, self.model.robust)
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (K, 2) of a level robot, predicted minus measured, and its Jacobians, without robust weights.
+        """Return the whitened residual (K, 2) of a level robot, predicted minus measured, and a list of Jacobians.
 
-        The Jacobians (K, 2, d) are by each value and, as last element, by the tilt in standard deviations (K, 2, 2).
+        The list has the Jacobian (K, 2, d) by each value, and as last element the Jacobian (K, 2, 2) by roll and pitch
+        in standard deviations. Robust weights are not included.
         """
         moved_by, displacements = np.array(self.moved_by, dtype=np.int64), values[1 + bool(self.estimated) :]
         moves = None if not self.moved_by else np.array((*displacements, np.zeros(3)))[moved_by]
@@ -136,10 +134,10 @@ class ReprojectionFactor:
         return residual, [*blocks, jacobian[..., TILT:POINT]]
 
     def fixed(self, parameters: Sequence[Array], displacement: Array | None) -> ReprojectionFactor:
-        """A factor on the pose only, with all other values fixed.
+        """Return a factor on the pose only. The constants and displacements are fixed.
 
         ``parameters``: a sequence of one array (P,), the corrections of the estimated constants, or an empty sequence.
-        ``displacement`` (K, 3): is added to the points; None for zero.
+        ``displacement`` (K, 3): is added to the points. None for zero.
         """
         if not parameters and displacement is None:
             return self
@@ -171,11 +169,10 @@ def image_update(
     ``pose`` (3,): the predicted pose.
     ``covariance`` (S, S): covariance of the error state. Its first three components are the pose's body-frame
     perturbation. ``iterations``, ``converged``: limits of the iterations.
-    ``values``: the values of the factor besides the pose, at the prediction. ``columns``: the components of each in the
-    error state.
+    ``values``: the predicted values of the factor's variables except the pose. ``columns``: for each of these
+    variables, its components in the error state.
 
-    With ``values``, the resulting covariance is converted to perturbations of the updated pose instead of the predicted
-    pose. The difference matters because pixels are much more accurate than a surveyed map.
+    With ``values``, the resulting covariance is in the body frame of the updated pose instead of the predicted pose.
     """
     size = len(covariance)
     packed = factor.packed() if factor.of_pose_alone else None
@@ -202,11 +199,8 @@ def image_update(
 
 
 def turns(estimated: tuple[int, ...], changes: Array) -> Array:
-    """The Jacobian (3, 3) of the camera's rotation by the estimated corrections of its roll, pitch and yaw. The rotation is a
-    perturbation about the robot's axes. Computed as the left Jacobian of SO(3), the right Jacobian of the opposite rotation.
-
-    ``changes`` (P,): corrections of the constants with indices ``estimated`` in :data:`PARAMETERS`.
-    """
+    """The left Jacobian (3, 3) of SO(3) at the corrected rotation vector of the camera about the robot's axes.
+    ``changes`` (P,): corrections of the constants with indices ``estimated`` in :data:`PARAMETERS`."""
     full = np.zeros(len(PARAMETERS))
     full[list(estimated)] = changes
     return np.asarray(gtsam.Rot3.ExpmapDerivative(-full[3:6]))

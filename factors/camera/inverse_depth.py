@@ -18,12 +18,12 @@ from factors.se2 import Array
 
 SIZE = 6  # number of values of a ray
 LEAST_FLAT = 1e-6  # minimum horizontal part of a direction, because a vertical direction has no azimuth
-LINEAR = 0.1  # below this linearity index, x, y, z of a point are nearly Gaussian (section VI)
+LINEAR = 0.1  # below this index of :func:`linearity`, x, y, z of a point are nearly Gaussian (section VI)
 
 
 def directions(rays: Array) -> tuple[Array, Array]:
-    """The directions of ``rays`` (K, 6) as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth
-    and elevation. A ray is x, y, z of its start, azimuth, elevation, and the inverse depth of the point on it."""
+    """Return the directions of rays as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and
+    elevation. ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, and the inverse depth of a point."""
     azimuth, elevation = rays[:, 3], rays[:, 4]
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     by_angles = np.zeros((len(rays), 3, 2))
@@ -42,8 +42,8 @@ def turned(angles: Array) -> Array:
 
 
 def positions(rays: Array) -> tuple[Array, Array]:
-    """The positions (K, 3) in the world of points given as ``rays`` (K, 6), and their Jacobian (K, 3, 6) by the rays. A
-    ray is x, y, z of its start, azimuth, elevation, and inverse depth, which must be positive."""
+    """Return the world positions (K, 3) of points, and their Jacobian (K, 3, 6) by the rays. ``rays`` (K, 6): x, y, z
+    of the start, azimuth, elevation, and inverse depth of each point. Inverse depths must be positive."""
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5]
     jacobian = np.zeros((len(rays), 3, SIZE))
@@ -59,7 +59,7 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
 
     Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6), as in
     :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6). A pixel depends only on the direction
-    from the camera to the point, so the inverse depth may be zero (section III).
+    from the camera to the point, so the inverse depth may be zero.
     """
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5, None]
@@ -78,10 +78,11 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
 def begin(
     model: CameraModel, position: Array, rotation: Array, pixel: Array, inverse_depth: float
 ) -> tuple[Array, Array, Array]:
-    """Initialise the ray of a point from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m] (section IV).
+    """Initialise the ray of a point from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m].
 
-    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,) (camera position, azimuth,
-    elevation, inverse depth) and its Jacobians by the camera's perturbation (6, 6), and by pixel and inverse depth (6, 3).
+    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,) (camera position,
+    azimuth, elevation, inverse depth), and its Jacobians by the perturbation (6, 6) of the camera's pose, and by pixel
+    and inverse depth (6, 3).
     """
     (local,) = rays(model, pixel[None])
     _, _, by_local = linearize_in_space(model, np.zeros(3), np.eye(3), local[None])
@@ -106,11 +107,11 @@ def begin(
 
 
 def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
-    """The linearity index (K,) of ``rays`` (K, 6) for a camera at ``position`` (3,) (section VI).
+    """Return an index (K,) of how far the x, y, z of K points are from a Gaussian (section VI of the source).
 
-    A ray is x, y, z of its start, azimuth, elevation, and inverse depth. ``sigmas`` (K,): standard deviations of the
-    inverse depths. If the index is below :data:`LINEAR`, the point's x, y, z are nearly Gaussian and can replace the
-    ray. The index is infinite if the inverse depth is not positive.
+    ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, and inverse depth of each point. ``sigmas`` (K,):
+    standard deviations of the inverse depths. ``position`` (3,): the position of the camera. If the index is below
+    :data:`LINEAR`, x, y, z can replace the ray. It is infinite if the inverse depth is not positive.
     """
     inverse = rays[:, 5]
     index = np.full(len(rays), np.inf)

@@ -133,21 +133,21 @@ def in_camera(
 def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
     """Invert the distortion of the lens ``k`` by Newton's method.
 
-    ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and the remaining errors (K,)
-    of their distortion. Only directions at which the lens's Jacobian has a positive determinant are found. The result
-    of a direction that is NaN is NaN, with an infinite error.
+    ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and errors (K,): the distance
+    from each distorted direction to the distorted result. Results have a positive determinant of the lens's Jacobian.
+    If ``distorted`` is NaN, the result is NaN with an infinite error.
     """
     n = len(distorted)
     directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)
     for i in range(n):
-        # start on the axis, where every lens is invertible, towards the direction without distortion
+        # start on the axis, where every lens is invertible. The first step is the solution without distortion
         x, y, step_x, step_y, share = 0.0, 0.0, distorted[i, 0], distorted[i, 1], 1.0
         for _ in range(MOST_STEPS):
             to_x, to_y = x + share * step_x, y + share * step_y
             xd, yd, xx, xy, yx, yy = _distorted(k, to_x, to_y)
             eu, ev, determinant = distorted[i, 0] - xd, distorted[i, 1] - yd, xx * yy - xy * yx
             error = math.sqrt(eu * eu + ev * ev)
-            if not (determinant > 0.0 and error < errors[i]):  # the step is too long, or crosses a fold of the lens
+            if not (determinant > 0.0 and error < errors[i]):  # the step is too long
                 share *= 0.5
                 continue
             x, y, errors[i] = to_x, to_y, error
@@ -202,7 +202,7 @@ def project_planar(
     ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame.
     ``pose`` (3,), ``tilt`` (2,) [rad]: the robot's planar pose, and its roll and pitch. ``turn`` (3, 3): :func:`turned`
     of the tilt.
-    ``jacobian`` (2, WIDTH): output, the derivatives of the pixel.
+    ``jacobian`` (2, WIDTH): output, the derivatives of the pixel by pose, tilt, point and the camera's constants.
 
     Returns the pixel coordinates u and v, and the depth [m].
     """
@@ -247,8 +247,8 @@ def project_planar(
 
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
-    """The pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobian (K, 2,
-    WIDTH). ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame."""
+    """Return the pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and the Jacobians (K, 2,
+    WIDTH) of :func:`project_planar`. ``camera``: lens, and position (3,) and rotation (3, 3) in the robot frame."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
     for i in range(len(points)):
@@ -294,12 +294,12 @@ def whiten(
     residual, jacobian, squared = np.empty((n, 2)), np.empty((n, 2, WIDTH)), np.zeros(n)
     for i in range(n):
         at = poses[i], tilts[i], points[i], measured[i]
-        squared[i] = see((k, position, rotation), at, sigma, robust, residual[i], jacobian[i])
+        squared[i] = linearize_one((k, position, rotation), at, sigma, robust, residual[i], jacobian[i])
     return residual, jacobian, squared
 
 
 @compiled(error_model="numpy")
-def see(
+def linearize_one(
     camera: tuple[Lens, Array, Array],
     at: tuple[Array, Array, Array, Array],
     sigma: float,
@@ -307,8 +307,9 @@ def see(
     residual: Array,
     jacobian: Array,
 ) -> float:
-    """Linearise one measurement of :func:`whiten`. ``camera``: lens, position, rotation. ``at``: pose, tilt, point,
-    pixel. Writes ``residual`` (2,) and ``jacobian`` (2, WIDTH). Returns the squared residual without robust weight."""
+    """Linearise one pixel measurement, as :func:`whiten` does for many. ``camera``: lens, position and rotation.
+    ``at``: pose, tilt, point and measured pixel. Writes the whitened ``residual`` (2,) and ``jacobian`` (2, WIDTH).
+    Returns the squared residual without robust weight."""
     pose, tilt, point, measured = at
     u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
     residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma

@@ -193,7 +193,7 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Find a pixel (2,) at which the lens model is not invertible, on a grid over the image. Returns None if there is none.
+    """Return a pixel (2,) of a grid over the image at which the lens model is not invertible, or None.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
     determinant of the lens's Jacobian.
@@ -215,8 +215,7 @@ def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Ar
     """Predict the pixels of world ``points`` (K, 3) from the robot's planar ``pose`` (3,), with derivatives.
 
     Returns the pixels (K, 2) and their Jacobians by the pose's body-frame perturbation (K, 2, 3), by the points (K, 2,
-    3), and by corrections of :data:`PARAMETERS` (K, 2, 8). The derivative by the time offset is zero here, because it
-    needs the robot's velocity.
+    3), and by corrections of :data:`PARAMETERS` (K, 2, 8). The derivative by the time offset is set to zero.
     """
     camera = lens_of(model), model.position, model.rotation
     pixels, jacobian = reprojection_kernels.linearize(camera, pose, np.ascontiguousarray(points, dtype=float))
@@ -224,11 +223,8 @@ def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Ar
 
 
 def by_tilt(model: CameraModel, by_parameters: Array) -> Array:
-    """The Jacobian (K, 2, 2) of pixels by the robot's roll and pitch, in units of their standard deviation ``model.tilt``.
-
-    ``by_parameters`` (K, 2, 8): the Jacobian by :data:`PARAMETERS`. A robot that tilts about its axes on the floor
-    rotates the camera and also moves it.
-    """
+    """Return the Jacobian (K, 2, 2) of pixels by the robot's roll and pitch, in units of their standard deviation
+    ``model.tilt``. ``by_parameters`` (K, 2, 8): the Jacobian by the camera's :data:`PARAMETERS`."""
     x, y, z = model.position
     arm = np.array(((0.0, z), (-z, 0.0), (y, -x)))
     return np.asarray(model.tilt * (by_parameters[..., 3:5] + by_parameters[..., :3] @ arm))
@@ -274,11 +270,9 @@ def log_likelihood(
 
 
 def lens_of(model: CameraModel) -> Lens:
-    """The camera's intrinsic constants as a tuple for compiled code.
-
-    One element is the maximum radius of a valid distortion. This is the radius where the radial part stops
-    growing, and at most the radius of :data:`WIDEST` or :data:`WIDEST_FISHEYE`.
-    """
+    """Return the camera's intrinsic constants as a tuple for compiled code, see :data:`factors.camera.kernels.Lens`.
+    The distortion is valid up to the radius at which its radial part stops growing, or up to the limit
+    :data:`WIDEST` (:data:`WIDEST_FISHEYE` of a fisheye lens)."""
     focal = model.fx, model.fy, model.cx, model.cy
     if not any(model.distortion) and not model.fisheye:
         return (*map(float, focal), *(0.0,) * 5)
@@ -297,7 +291,7 @@ def lens_of(model: CameraModel) -> Lens:
     return (*lens[:8], 1.0 / falls[0] if falls else lens[8], *lens[9:])
 
 
-# Possible standard deviations of the robot's tilt. Most images have the same, but an image on a door sill may have any of them.
+# Possible standard deviations of the robot's tilt. Most images have the same one. On a door sill it may be any other.
 SCALES = 0.0005 * 2.0 ** (0.5 * np.arange(15))  # rad: from half a millimetre per metre up to 0.064
 VAGUE = math.log(3.0)  # standard deviation of the logarithm of the initial guess
 MEMORY = 60.0  # number of images after which old images are forgotten

@@ -42,15 +42,15 @@ class PointFactor:
         return id(self.model)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (2,) with robust weights, and its Jacobian (2, d) by each value. The residual of a
-        point behind the camera is constant, because no gradient leads to the true position."""
+        """The whitened residual (2,) with robust weights, and its Jacobian (2, d) by each value. If the point is behind
+        the camera, the residual is constant and the Jacobian is zero."""
         residuals, blocks = self.linearize_all([self], [values])
         return residuals[0], [block[0] for block in blocks]
 
     @staticmethod
     def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
-        """Linearise N factors of one camera, each at its own values. The constants must be equal in all. Returns
-        residuals (N, 2) and the Jacobian (N, 2, d) by each value."""
+        """Linearise N factors of one camera, each at its own values. The camera's constants must be equal in all
+        values. Returns residuals (N, 2) and the Jacobian (N, 2, d) by each value."""
         estimated, constants = factors[0].estimated, values[0][1]
         residual, jacobian, _ = _linearize_all(factors, values)
         if TIME_OFFSET in estimated:
@@ -109,7 +109,7 @@ class PointPrior:
     ``mean`` (3,) [m]: the expected position in the robot frame. ``sigma`` [m]: the standard deviation of each
     coordinate. The methods take a list of two values: the robot's pose (3,) and the point (3,) in the world.
 
-    A prior in the world frame would constrain the robot: a thousand such priors with 30 m would fix its position to a metre.
+    A prior in the world frame would constrain the robot: a thousand priors with 30 m would fix its position to a metre.
     """
 
     mean: Array
@@ -117,7 +117,8 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """The prior of a world ``point`` (3,) that was estimated from the robot's ``pose`` (3,). ``sigma`` [m]: as of the class."""
+        """Make the prior of a world ``point`` (3,) with the standard deviation ``sigma`` [m] relative to a robot at
+        ``pose`` (3,)."""
         return cls(_from_robot(pose, point), sigma)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:

@@ -71,9 +71,10 @@ def triangulated(
 
 @compiled(error_model="numpy")
 def inverse_depths(first: Array, second: Array, position: Array, motion: Array) -> Array:
-    """The inverse depths (K,) [1/m] of points in the first of two images, where the rays of both images are nearest to each other.
+    """Triangulate K points from two images. Returns their inverse depths (K,) [1/m] in the first image, at the point of
+    the first ray that is nearest to the second ray.
 
-    ``first``, ``second`` (K, 3): viewing rays of each image in the robot frame, scaled to depth 1 along the optical axis.
+    ``first``, ``second`` (K, 3): viewing rays in the robot frame at each image, scaled to depth 1 in the camera.
     ``position`` (3,): position of the camera in the robot frame. ``motion`` (3,): the robot's planar motion between the images.
 
     An inverse depth is negative for a point behind the camera.
@@ -85,7 +86,7 @@ def inverse_depths(first: Array, second: Array, position: Array, motion: Array) 
     for k in range(len(first)):
         a, b = first[k], second[k]
         u, v, w = c * b[0] - s * b[1], s * b[0] + c * b[1], b[2]  # the second ray in the first frame
-        # a / inverse depth = (x, y, 0) + mu (u, v, w), crossed with (u, v, w)
+        # the cross product of the equation a / inverse_depth = (x, y, 0) + mu (u, v, w) with (u, v, w) eliminates mu
         far_x, far_y, far_z = y * w, -x * w, x * v - y * u
         squared = max(far_x * far_x + far_y * far_y + far_z * far_z, 1e-18)
         across = (a[1] * w - a[2] * v) * far_x + (a[2] * u - a[0] * w) * far_y + (a[0] * v - a[1] * u) * far_z
@@ -137,8 +138,7 @@ def _inform(
 
 @compiled(error_model="numpy")
 def _is_below(covariance: Array, most: float) -> bool:
-    """True if the largest eigenvalue of a covariance (3, 3) is less than ``most``. This is so if ``most`` times the
-    identity minus the covariance is positive definite."""
+    """True if the largest eigenvalue of a covariance (3, 3) is less than ``most``."""
     a, b, c = most - covariance[0, 0], most - covariance[1, 1], most - covariance[2, 2]
     d, e, f = covariance[0, 1], covariance[0, 2], covariance[1, 2]
     two = a * b - d * d

@@ -22,7 +22,7 @@ class PackedImage(NamedTuple):
     """A :class:`~factors.camera.factor.ReprojectionFactor` on the pose only, for compiled code.
 
     ``point_covariances``: (K, 3, 3), or (0, 3, 3) for an exact map.
-    ``offset`` (3,), ``offset_covariance`` (3, 3): zeros if the factor has none.
+    ``offset`` (3,), ``offset_covariance`` (3, 3): zeros if these fields of the factor are None.
     The remaining fields are those of the factor and its camera model.
     """
 
@@ -42,7 +42,7 @@ class PackedImage(NamedTuple):
 
 @compiled(error_model="numpy")
 def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array, Array]:
-    """The whitened residual (K, 2) of a level robot at ``pose`` (3,), predicted minus measured, and its Jacobian (K, 2, width).
+    """Return the whitened residual (K, 2) of a level robot at ``pose`` (3,), and its Jacobian (K, 2, width).
 
     The columns of a full Jacobian are the pose (3), the tilt (2) in standard deviations, the point (3), and the
     camera's constants (8). ``width``: the number of columns to compute. The derivative by the time offset is zero.
@@ -51,7 +51,7 @@ def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, width))
     camera, scale = (image.lens, image.position, image.rotation), 1.0 / image.sigma
     at, level, upright = compose_one(pose, image.offset), np.zeros(2), np.eye(3)
-    # the pose variable in the frame of the pose at the image's time
+    # the estimated pose in the frame of the pose at the time of the image
     back = between_one(image.offset, np.zeros(3))
     co, so = math.cos(image.offset[2]), math.sin(image.offset[2])
     exact, common = len(image.point_covariances) == 0, np.trace(image.offset_covariance) > 0.0
@@ -92,8 +92,8 @@ def _widened(
 ) -> tuple[float, float, float]:
     """Add the effect of three uncertain variables to the covariance (uu, uv, vv) of a pixel.
 
-    ``covariance`` (3, 3): covariance of the variables. ``row`` (2, WIDTH): the pixel's Jacobian. ``first``: its first
-    column for the variables. ``count``: a factor of the added covariance. Returns the new uu, uv and vv.
+    ``covariance`` (3, 3): covariance of the variables. ``row`` (2, WIDTH): the pixel's Jacobian. ``first``: the column
+    of the first variable. ``count``: the added covariance is multiplied by it. Returns the new uu, uv and vv.
     """
     p = row[0, first], row[0, first + 1], row[0, first + 2]
     q = row[1, first], row[1, first + 1], row[1, first + 2]
@@ -224,8 +224,7 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
 @compiled(error_model="numpy")
 def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
     """The covariances (K, 2, 2) of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian of the pixels
-    by the points.
-    ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel noise."""
+    by the points. ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel noise."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):
         of = covariances[k]

@@ -29,8 +29,8 @@ class LoopFactor:
     ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are known to be
     equal. ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If
     ``measured`` is None, the standard deviation (1,) [m] of each coordinate of the difference of the positions.
-    ``offset``: the motion from the later pose variable to the pose at the time of the loop closure. Its covariance is
-    added to the noise. None if both are the same pose. ``earlier_offset``: the same for the earlier pose variable.
+    ``offset``: the motion from the later estimated pose to the pose at the time of the loop closure. Its covariance is
+    added to the noise. None if both poses are equal. ``earlier_offset``: the same for the earlier pose.
     ``robust``: scale of the loss in standard deviations.
 
     The methods take a list of two values: the later pose (3,) and the earlier pose (3,).
@@ -82,14 +82,13 @@ class LoopFactor:
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:
-        """The multiple, at least 1, of the scale of the loss that makes the loss convex at these values."""
+        """Return the smallest factor of at least 1 for :meth:`widened` that makes the loss convex at these values."""
         error, _, _ = self.whitened(values)
         return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)
 
     @cached_property
     def _whitener(self) -> Array:
-        """The matrix that whitens the residual. If only positions are measured, it adds the mean variance of the
-        odometry's x and y, because the direction of the error is unknown."""
+        """The matrix that whitens the residual. If only positions are measured, the noise is isotropic."""
         covariances = [o.covariance for o in (self.offset, self.earlier_offset) if o is not None]
         if self.measured is None:
             added = sum(float(np.trace(covariance[:2, :2])) / 2.0 for covariance in covariances)

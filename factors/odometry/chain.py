@@ -176,8 +176,8 @@ class OdometryChain:
         return bool(self._constants[SLIPPING])
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
-        """The motion from ``start`` to ``end``, two results of :meth:`state`. If rows before ``start`` arrived after
-        ``start`` was computed, the motion includes their corrections."""
+        """The motion from ``start`` to ``end``, two results of :meth:`state`. A row before ``start`` that is added
+        between the two calls of :meth:`state` also changes this motion."""
         return Increment(*relative(self._noise, tuple(start), tuple(end)))
 
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
@@ -244,7 +244,7 @@ class OdometryChain:
         covariance (3, 3), and its covariance (3, 3) of (x, y, heading) in the world frame.
         """
         known = self._knots, self._count, self._constants, self._noise
-        contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order
+        contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for other memory layouts
         at, body, world = moved_to(*known, tuple(start), t, pose, contiguous, constants, self._indices)
         return at, body, world
 

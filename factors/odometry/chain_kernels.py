@@ -37,10 +37,10 @@ def copy(row: Array, to: Array) -> None:
 
 @compiled
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
-    """Delete rows, and the integrated states at these rows (knots), that are more than ``horizon`` seconds older than
-    the newest row. ``count``: the number of rows. Returns the new number.
+    """Delete the rows that are more than ``horizon`` seconds older than the newest row, and the states ``knots`` at
+    these rows. ``count``: the number of rows. Returns the new number.
 
-    Nothing is deleted before the oldest row is two horizons old, because each deletion moves all remaining rows to the front.
+    Nothing is deleted before the oldest row is two horizons old, so that deletions are rare.
     """
     newest = knots[count - 1, T]
     if newest - knots[0, T] <= 2.0 * horizon:
@@ -67,8 +67,8 @@ def append(
     """Append velocities to the ``count`` existing rows, integrate them into ``knots`` (the state at each row), and delete old rows.
 
     ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the
-    times. ``constants``: the model as an array. Rows older than ``horizon`` [s] are old. Returns the new count. If the
-    first new row is older than the last existing one, returns -1 and changes nothing.
+    times. ``constants``: the model as an array. ``horizon`` [s]: as of :func:`without_old`. Returns the new count. If
+    the first new row is older than the last existing row, returns -1 and changes nothing.
     """
     if count and t[0] + delay < knots[count - 1, T]:
         return -1

@@ -30,8 +30,8 @@ class Steps(NamedTuple):
 class OdometryStack:
     """Several odometry factors with the same estimated constants, linearised together.
 
-    ``factors``: K factors. ``first`` (K,): the number of the first pose of each factor; the second pose is the next
-    one. ``column``: the index of the first estimated constant among the parameters of the graph.
+    ``factors``: K factors. ``first`` (K,): the index of the first pose of each factor. The second pose is the next one.
+    ``column``: the index of the first estimated constant in the parameters of the graph.
     """
 
     def __init__(self, factors: Sequence["OdometryFactor"], first: Sequence[int], column: int) -> None:
@@ -42,12 +42,12 @@ class OdometryStack:
 
     @property
     def first(self) -> Integers:
-        """The number (3 K,) of the first pose that each residual depends on."""
+        """The index (3 K,) of the first pose that each residual depends on."""
         return np.repeat(self._first, 3)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Write the whitened residuals into ``residual`` (3 K,) and their Jacobian into ``jacobian`` (3 K, 6 + P),
-        whose columns :mod:`factors.chain` defines."""
+        """Write the whitened residuals into ``residual`` (3 K,), and their Jacobian by the first pose, the second pose
+        and the P parameters into ``jacobian`` (3 K, 6 + P)."""
         given = self._steps, self._constants(parameters), self._indices
         linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
 
@@ -62,8 +62,9 @@ class OdometryStack:
 class OdometryFactor:
     """An odometry increment as a factor on two poses, and optionally on constants of the odometry.
 
-    ``estimated``: the indices in :data:`factors.odometry.model.PARAMETERS` of the P constants that are estimated. The methods take
-    a list of values: the pose (3,) at the start, the pose (3,) at the end, and the corrections (P,) of the constants if P > 0.
+    ``estimated``: the indices in :data:`factors.odometry.model.PARAMETERS` of the P constants that are estimated. The
+    methods take a list of values: the pose (3,) at the start, the pose (3,) at the end, and the corrections (P,) of the
+    constants if P > 0.
     """
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
@@ -105,19 +106,18 @@ class OdometryFactor:
 
 
 class ScaleFreeOdometryFactor(OdometryFactor):
-    """An odometry factor for graphs whose map has no other source of scale than the wheels. The residual is in the
-    unit of the wheels' report.
+    """An odometry factor for graphs in which only odometry measures the scale of the map. The translation in the
+    residual is in the distance unit of the wheels, that is, divided by the estimated scale of distances.
 
-    A residual in metres becomes smaller if the estimated world shrinks, and no other measurement opposes that. The most
-    probable world would be too small by the fraction ``n s^2``, where ``n`` is the number of increments and ``s`` the
-    standard deviation of the scale.
+    A residual in metres would decrease if the whole map shrinks. The estimated map would be too small by the fraction
+    ``n s^2`` with the number ``n`` of increments and the standard deviation ``s`` of the scale.
     """
 
     kind = None  # always linearised alone
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, whose translation is divided by the estimated
-        scale, and its Jacobian by each value."""
+        """Return the whitened residual (3,) and its Jacobian by each value. The residual is that of
+        :class:`OdometryFactor` with the translation divided by the estimated scale of distances."""
         start, end, *constants = values
         if not constants:
             return super().linearize(values)
@@ -177,8 +177,8 @@ def linearize(
 def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Linearise an increment for changed constants, as :func:`linearize` does. ``twist`` (3,): the logarithm of the
-    increment. ``moving``, ``constants``, ``indices``: as of :func:`factors.odometry.kernels.changed`."""
+    """Apply :func:`linearize` to an increment that is corrected by :func:`~factors.odometry.kernels.changed` with
+    ``twist``, ``moving``, ``constants`` and ``indices``."""
     delta, by_changes = changed(twist, moving, constants, indices)
     return linearize(start, end, delta, by_changes, whitener)
 
@@ -187,8 +187,8 @@ def linearize_changed(
 def linearize_as_reported(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """:func:`linearize_changed`, but with the residual's translation divided by the estimated scale of distances. The
-    translation is then in the unit that the wheels report, as its noise is."""
+    """Compute :func:`linearize_changed` with the translation of the residual divided by the estimated scale of
+    distances. The translation is then in the distance unit of the wheels, like the noise."""
     unit = 1.0 + all_changes(constants, indices)[0]
     as_reported = whitener.copy()
     for i in range(3):
@@ -215,8 +215,8 @@ def linearize_all(
     residual: Array,
     column: int,
 ) -> None:
-    """Linearise K increments. Writes the whitened residuals (3 K,) and their Jacobian (3 K, 6 + P), whose columns
-    :mod:`factors.chain` defines.
+    """Linearise K increments ``steps``. Writes the whitened residuals into ``residual`` (3 K,), and their Jacobian by
+    the first pose, the second pose and the parameters of the graph into ``jacobian`` (3 K, 6 + P).
 
     ``poses`` (N, 3), ``first`` (K,): increment k is between the poses ``first[k]`` and ``first[k] + 1``.
     ``constants``, ``indices``: as of :func:`factors.odometry.kernels.changed`.

@@ -19,7 +19,8 @@ from factors.se2 import (
 # If the variance of the position exceeds FAR [m^2], the fraction ROUNDING of it is added, so that the covariance is invertible.
 ROUNDING, FAR = 1e-12, 1e4
 
-# s; in each second of a slip, the robot moves another fraction of its reported way. The variance of a uniform fraction is 1/12.
+# While the wheels slip, the robot moves a fraction of the reported distance, which is uniform in [0, 1] and independent
+# in each second. The variance of this fraction is 1/12.
 SHARE_VARIANCE = 1.0 / 12.0
 SHORTEST = 1e-6  # s; minimum of a duration, against division by zero
 
@@ -172,8 +173,8 @@ def predicted(
 
 @compiled(inline="always")
 def _widen(covariance: Array) -> None:
-    """Increase the variances of the position in a covariance (3, 3) if they are large, so that it stays invertible. See
-    :data:`FAR`."""
+    """Increase the variances of the position in a covariance (3, 3) if they exceed :data:`FAR`, so that the covariance
+    stays invertible."""
     variance = covariance[0, 0] + covariance[1, 1]
     if variance > FAR:
         covariance[0, 0] += ROUNDING * variance

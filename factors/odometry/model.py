@@ -44,7 +44,7 @@ class Growth:
     per_time: float = 0.0
 
     def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> "Growth":
-        """The growth after adding independent errors with the given standard deviations, in the same units."""
+        """Return the growth after adding independent errors with these standard deviations."""
         return Growth(
             math.hypot(self.per_distance, per_distance),
             math.hypot(self.per_rotation, per_rotation),
@@ -104,10 +104,11 @@ def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) ->
 
 
 def slip(model: OdometryModel, increment: Increment, *, use_gyro: bool) -> tuple[Array, float]:
-    """The additional covariance (3, 3) of an increment whose wheels slip, and the negative log-probability of a slip in it.
+    """Return the additional covariance (3, 3) of an increment with slipping wheels, and the negative log-probability of
+    a slip during the increment.
 
-    During a slip the errors along the motion and of the heading are those of an unknown motion. The heading error displaces the end
-    of the motion as in :func:`relative_motion`. With ``use_gyro`` the heading has no additional error. Wheels do not slip sideways.
+    The additional errors are those of an unknown motion along the direction of travel and, without a gyro, of an
+    unknown rotation. Wheels do not slip sideways.
     """
     duration = max(increment.duration, SHORTEST)
     along, heading = model.unknown_distance**2 * duration, 0.0 if use_gyro else model.unknown_rotation**2 * duration

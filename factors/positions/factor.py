@@ -64,8 +64,8 @@ class PositionFactor:
         return np.asarray(geman_mcclure_loss(squared, self.robust))
 
     def squared(self, pose: Array, covariance: Array) -> float:
-        """The normalised innovation squared: the squared Mahalanobis distance between the measured position and that
-        predicted from ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+        """Return the normalised innovation squared: the squared Mahalanobis distance from the measured position to the
+        position predicted from ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
         residual, (jacobian,) = self.whitened([pose])
         return float(positive.squared(residual[0], np.eye(2) + jacobian[0] @ covariance @ jacobian[0].T))
 
@@ -86,7 +86,7 @@ class PositionFactor:
         return replace(self, robust=width * self.robust)
 
     def _covariances(self, poses: Array) -> Array:
-        """The world-frame covariances (N, 2, 2) of the errors by measurement and ``offset``, at ``poses`` (N, 3)."""
+        """Return the covariances (N, 2, 2) of :meth:`errors` at ``poses`` (N, 3), in the world frame."""
         if self.offset is None:
             return np.broadcast_to(self.covariance, (len(poses), 2, 2))
         x, y = self.arm
