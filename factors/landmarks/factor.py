@@ -36,7 +36,9 @@ from factors.update import CONVERGED, GATE, Correction
 NOTHING = np.zeros(0)  # the values of the sensor constants if the factor estimates no constants
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # placeholders for an offset or covariance that is None
 SMALL_BIAS = 1e-4  # m; step of the numerical derivative by a range bias: residuals are nearly linear
-LEAST_TOLD = 1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
+LEAST_SINGULAR = (
+    1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +47,17 @@ class BearingRangeFactor:
 
     ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their heights above the sensor.
     ``ranges``, ``bearings``: measurements (K,) [m, rad], NaN where a value is missing.
-    ``offset`` (3,): the robot's pose at the measurement's time, in the frame of the pose variable. Odometry measures
-    it. None if both poses are the same.
+    ``offset`` (3,): the robot's pose at the time of the measurement in the frame of the estimated pose, from odometry.
+    None if the two poses are equal.
     ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
     ``point_covariances`` (K, 2, 2): covariances of the landmarks of an inexact map. They are added to the noise.
     ``estimated``: indices in :data:`PARAMETERS` of the P sensor constants that are estimated.
-    ``free``: True if the position of the landmark is a variable. Then K is 1, and the position replaces ``points``.
-    ``biased``: True if a bias of the ranges is a variable.
-    ``twist`` (3,): the robot's body-frame velocity at the measurement's time. The Jacobian by the time offset needs it.
-    ``in_look``: the number of landmarks measured at this time, including those in separate factors. None means K. The landmarks
-    have the error of ``offset`` in common, so its covariance is multiplied by this number and does not average out.
+    ``free``: True if the position of the landmark is estimated. Then K is 1, and the estimate replaces ``points``.
+    ``biased``: True if a bias of the ranges is estimated.
+    ``twist`` (3,): the robot's body-frame velocity at the time of the measurement. Required if the time offset is
+    estimated.
+    ``simultaneous``: the number of all landmarks measured at this time, also by other factors. None means K. The
+    covariance of ``offset`` is multiplied by this number, so that its error, common to all, does not average out.
 
     The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P
     > 0, the range bias (1,) [m] if ``biased``, and the landmark's position (2,) if ``free``.
@@ -71,7 +74,7 @@ class BearingRangeFactor:
     free: bool = False
     biased: bool = False
     twist: Array | None = None
-    in_look: int | None = None
+    simultaneous: int | None = None
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """The whitened residual (2K,) with robust weights, and its Jacobian (2K, d) by each value."""
@@ -88,8 +91,8 @@ class BearingRangeFactor:
 
     @property
     def kind(self) -> Hashable:
-        """A key that is equal for factors that can be linearised together. None if the factor has a free landmark or a
-        bias, since such factors are linearised one by one."""
+        """A key that is equal for factors that can be linearised together. None if the factor must be linearised alone,
+        because it has a free landmark or a bias."""
         return None if self.free or self.biased else (self.estimated, self.model)
 
     def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
@@ -97,8 +100,8 @@ class BearingRangeFactor:
         return BearingRangeStack(factors, numbers, column)
 
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
-        """The number of landmarks whose normalised innovation squared exceeds ``limit``, at the predicted ``pose`` (3,)
-        with body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
+        """Count the landmarks with a normalised innovation squared above ``limit``, at the predicted ``pose`` (3,) with
+        body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
         contiguous = np.ascontiguousarray(covariance)
         return int(kernels.beyond(self.model.packed, pose, self.packed, contiguous, limit))
 
@@ -110,7 +113,7 @@ class BearingRangeFactor:
             *(self.points, self.ranges, self.bearings),
             *(offset is not None, _NOWHERE if offset is None else offset),
             *(drift is not None, _EXACTLY if drift is None else drift),
-            float(len(self.ranges) if self.in_look is None else self.in_look),
+            float(len(self.ranges) if self.simultaneous is None else self.simultaneous),
             *(twist is not None, _NOWHERE if twist is None else twist),
             EXACT if surveys is None else np.ascontiguousarray(surveys),
         )
@@ -140,17 +143,18 @@ class BearingRangeFactor:
         return self if width == 1.0 else replace(self, model=widened(self.model, width))
 
     def with_late(self, late: LateRanges) -> BearingRangeFactor:
-        """The factor with these statistics of ``late`` ranges."""
+        """Return the factor with the statistics ``late`` of ranges that are too long."""
         return self if late == self.model.late else replace(self, model=with_late(self.model, late))
 
     def predicted(self, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """The arguments of :meth:`~factors.landmarks.late.LateShares.after` at a predicted ``pose`` (3,) with
-        body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
+        """Compute the arguments of :meth:`~factors.landmarks.late.LateShares.updated`, three arrays (K,), at a
+        predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
         contiguous = np.ascontiguousarray(covariance)
         return kernels.predicted(self.model.packed, self.packed, pose, contiguous)
 
     def resolved(self, values: Sequence[Array], covariance: Array) -> ResolvedFactor:
-        """The factor for one correction of a Gaussian of all values with mean ``values`` and ``covariance`` (D, D)."""
+        """Replace ranges that may be late by Gaussian measurements, at the predicted ``values`` of the variables with
+        the joint ``covariance`` (D, D). Returns the factor for a Kalman update of this prediction."""
         error, blocks, slopes = self._linearized(values)
         jacobian, changed, weights = np.concatenate(blocks, axis=2), error.copy(), np.ones(len(error))
         columns, contiguous = np.arange(len(covariance)), np.ascontiguousarray(covariance)
@@ -159,11 +163,12 @@ class BearingRangeFactor:
         return ResolvedFactor(self, (changed - error)[:, 0], np.sqrt(weights))
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value, without robust weights."""
+        """Return the whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value.
+        Robust weights are not included."""
         return self._linearized(values)[:2]
 
     def _linearized(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
-        """The results of :meth:`whitened`, and the derivatives (K,) of :func:`~factors.landmarks.losses.slopes`."""
+        """Return the results of :meth:`whitened` and of :func:`~factors.landmarks.losses.slopes`."""
         error, jacobian = self._whitened(values)
         blocks, slopes = self._blocks(jacobian), np.empty(len(error))
         losses.slopes(error, jacobian, self._shortened(values), self.bearings, slopes)
@@ -200,7 +205,7 @@ class BearingRangeFactor:
         return blocks
 
     def fixed(self, parameters: Sequence[Array], point: Array | None, bias: float = 0.0) -> BearingRangeFactor:
-        """A factor on the pose only, with all other values fixed.
+        """Return a factor on the pose only. The remaining variables are fixed.
 
         ``parameters``: a sequence of one array (P,), the corrections of the estimated constants, or an empty sequence.
         ``point`` (2,): the position of a free landmark, otherwise None.
@@ -215,7 +220,9 @@ class BearingRangeFactor:
             offset = delayed(offset, self.twist, changes.get(TIME_OFFSET, 0.0))
         noises, measured = (self.offset_covariance, self.point_covariances), (self.ranges - bias, self.bearings)
         points = self.points if point is None else self._placed(point)
-        return BearingRangeFactor(model, points, *measured, offset, *noises, twist=self.twist, in_look=self.in_look)
+        return BearingRangeFactor(
+            model, points, *measured, offset, *noises, twist=self.twist, simultaneous=self.simultaneous
+        )
 
     def _placed(self, point: Array) -> Array:
         """The landmark's ``point`` (2,) as an array (1, 2), or (1, 3) with its height if ``points`` has heights."""
@@ -245,8 +252,8 @@ class BearingRangeFactor:
 
 @dataclass(frozen=True)
 class ResolvedFactor:
-    """The ``factor`` with possibly late ranges replaced by Gaussian measurements. ``shift`` (K,): is added to the
-    whitened range residuals. ``root`` (K,): the square roots of the weights."""
+    """A landmark ``factor`` with ranges that may be late replaced by Gaussian measurements. ``shift`` (K,): is added to
+    the whitened range residuals. ``root`` (K,): the square roots of the weights of the measurements."""
 
     factor: BearingRangeFactor
     shift: Array
@@ -276,16 +283,16 @@ def landmark_update(
     iterations: int,
     converged: float = CONVERGED,
 ) -> Correction | None:
-    """Correct a Gaussian by landmarks of the map, in compiled code. Equivalent to :func:`~factors.update.update_state`.
+    """Correct a Gaussian by landmarks of the map. A compiled equivalent of :func:`~factors.update.update_state`.
 
-    ``pose`` (3,): the predicted pose. ``covariance`` (S, S): of the error state, whose first three components are the pose.
-    ``constants`` (P,): the estimated sensor constants, which are the components of the error state from index ``first`` on.
-    ``iterations``: maximum number. ``converged``: the step size that ends the iterations. Returns None if the factor has a free
-    landmark or a bias, or if the information form is numerically singular. The caller then uses ``update_state``.
+    ``pose`` (3,): the predicted pose. ``covariance`` (S, S): the covariance of the error state. Its first three
+    components are the pose. ``constants`` (P,): corrections of the estimated sensor constants, which are the components
+    of the error state from index ``first`` on. ``iterations``, ``converged``: as of ``update_state``. Returns None if
+    ``update_state`` must be used: for a free landmark, a bias, or a numerically singular information form.
     """
     if factor.free or factor.biased:
         return None
-    contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order
+    contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for other memory layouts
     known = factor.model.packed, factor.packed, pose, contiguous, constants, factor.places, first
     try:
         return Correction(*kernels.updated(*known, iterations, converged, GATE))
@@ -297,8 +304,8 @@ class BearingRangeStack:
     """Several factors with the same model and the same estimated constants, linearised together. No landmark is free.
 
     ``factors``: L factors.
-    ``pose_of`` (L,): the number of the pose that each factor depends on.
-    ``column``: the index of the first estimated constant among the parameters of the graph.
+    ``pose_of`` (L,): the index of the pose that each factor depends on.
+    ``column``: the index of the first estimated constant in the parameters of the graph.
     """
 
     def __init__(self, factors: Sequence[BearingRangeFactor], pose_of: Sequence[int], column: int) -> None:
@@ -323,12 +330,12 @@ class BearingRangeStack:
 
     @property
     def first(self) -> Integers:
-        """The number (2 K,) of the pose that each residual depends on, for K landmarks in all factors."""
+        """The index (2 K,) of the pose that each residual depends on, for K landmarks in all factors."""
         return np.repeat(np.repeat(self._pose_of, np.diff(self._ends, prepend=0)), 2)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Write the whitened residuals with robust weights into ``residual`` (2 K,), and their Jacobian into
-        ``jacobian`` (2 K, 6 + P). The columns are those of :mod:`factors.chain`."""
+        """Write the whitened residuals with robust weights into ``residual`` (2 K,), and their Jacobian by the pose,
+        the next pose and the P parameters into ``jacobian`` (2 K, 6 + P)."""
         error, by_all, slopes = self._whitened(poses, parameters)
         losses.weigh(self._model, error, by_all, slopes)
         by_all = by_all.reshape(len(residual), WIDTH)
@@ -342,7 +349,8 @@ class BearingRangeStack:
         return float(losses.loss(self._model, error, slopes))
 
     def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array, Array]:
-        """The whitened residuals (K, 2) and their Jacobian (K, 2, WIDTH), without robust weights, and their slopes (K,)."""
+        """Return the whitened residuals (K, 2) without robust weights, their Jacobian (K, 2, WIDTH), and the results
+        (K,) of :func:`~factors.landmarks.losses.slopes`."""
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2
         changes[self._estimated] = parameters[self._column : self._column + len(self._estimated)]
         out = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
@@ -359,10 +367,10 @@ def _places(estimated: tuple[int, ...]) -> Integers:
 
 
 def _raised_inverse(by_point: Array) -> Array:
-    """The inverse of a whitened Jacobian (2, 2) by a landmark's position. Small singular values are raised to a minimum
-    first, because the Jacobian is singular for a landmark at the sensor."""
+    """Invert a whitened Jacobian (2, 2) by a landmark's position. Small singular values are raised first, because the
+    Jacobian of a landmark very close to the sensor is singular."""
     rows, values, columns = np.linalg.svd(by_point)
-    if values[1] > LEAST_TOLD * values[0]:
+    if values[1] > LEAST_SINGULAR * values[0]:
         return np.asarray(np.linalg.inv(by_point))
-    values = np.maximum(values, max(LEAST_TOLD * values[0], LEAST_TOLD))
+    values = np.maximum(values, max(LEAST_SINGULAR * values[0], LEAST_SINGULAR))
     return np.asarray(columns.T / values @ rows.T)

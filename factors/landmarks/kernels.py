@@ -82,7 +82,9 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
                 uu, uv, vv = uu + count * a, uv + count * b, vv + count * d
             _widen(error[k], jacobian[k], uu, uv, vv)
         if displaced:
-            for i in range(2):  # convert the derivative by the pose after the offset to that by the pose variable
+            for i in range(
+                2
+            ):  # convert the derivative by the pose after the offset to the derivative by the estimated pose
                 u, v = jacobian[k, i, 0], jacobian[k, i, 1]
                 jacobian[k, i, 0], jacobian[k, i, 1] = u * c - v * s, u * s + v * c
                 jacobian[k, i, 2] += u * lever_x + v * lever_y
@@ -90,8 +92,9 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
 
 @compiled
 def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
-    """The whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH). Each measurement has
-    its own point (N, 2) or (N, 3) and its own pose (N, 3). ``model``: as of :func:`linearize`."""
+    """Return the whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH).
+    ``poses`` (N, 3), ``points`` (N, 2) or (N, 3), ``ranges`` (N,), ``bearings`` (N,): the pose, the landmark and the
+    values of each measurement. ``model``: as of :func:`linearize`."""
     error, jacobian = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, WIDTH))
     mounted, depth = (model[0], model[1], model[TURN]), model[DEPTH] > 0.0
     noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]
@@ -132,7 +135,7 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
 
 @compiled(error_model="numpy")
 def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
-    """The number of landmarks in the measurement ``packed`` with a normalised innovation squared above ``limit``, at a
+    """Count the landmarks in the measurement ``packed`` with a normalised innovation squared above ``limit``, at a
     ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
     count = len(packed[0])
     error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
@@ -166,12 +169,12 @@ def linearize_all(
     """Linearise L measurements with :func:`linearize`. All their landmarks together are K rows.
 
     ``poses`` (N, 3), ``pose_of`` (L,): poses, and the index of the pose of each measurement.
-    ``ends`` (L,): the index behind the last row of each measurement.
+    ``ends`` (L,): the end row of each measurement (exclusive).
     ``measured``: points, ranges and bearings, with K rows each.
     ``flags`` (L, 4): True where a measurement has an offset, an offset covariance, a velocity, and point covariances.
-    ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): of each measurement, ignored where its flag is
-    False. ``counts`` (L,): the number of landmarks that have the error of an offset in common.
-    ``surveys`` (K, 2, 2): point covariances.
+    ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): the offset, its covariance and the velocity of
+    each measurement, ignored where the flag is False. ``counts`` (L,): the number of landmarks that have the error of
+    an offset in common. ``surveys`` (K, 2, 2): point covariances.
     ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): outputs, which must contain zeros before the call.
     """
     points, ranges, bearings = measured
@@ -205,8 +208,9 @@ def updated(
     ``indices`` (P,): the indices of these constants in :data:`~factors.landmarks.model.PARAMETERS`.
     ``first``: the index of the first of these constants in the error state.
     ``gate``: the noise of a landmark is increased if its normalised innovation squared exceeds this limit.
-    Returns the correction (S,), the covariance (S, S) after it, the whitened residuals (K, 2) of the prediction, their
-    normalised square, and the number of measured values. Raises LinAlgError if rounding makes a covariance singular.
+    Returns the correction (S,), the covariance (S, S) after the correction, the whitened residuals (K, 2) of the
+    prediction, the normalised innovation squared, and the number of measured values. Raises LinAlgError if rounding
+    makes a covariance singular.
     """
     count, size = len(packed[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)
@@ -231,7 +235,7 @@ def updated(
             nis -= pull[i] * posterior[columns[i], columns[j]] * pull[j]
     now, expected = residual.copy(), squared.copy()
     mixed = resolve(model, now, jacobian, columns, covariance, slope, gate, weights, expected)
-    nis += (expected - squared).sum()  # the innovation of a late range does not contradict the prediction
+    nis += (expected - squared).sum()  # a late range does not contradict the prediction
     if widest > 1.0 or mixed:
         delta, posterior, _ = corrected(prior, now, jacobian, columns, weights, previous)
     for _ in range(iterations - 1):
@@ -264,8 +268,8 @@ def weighted(
 
 @compiled(error_model="numpy")
 def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """The whitened errors (K,) of the ranges in ``packed`` at a pose with body-frame ``covariance`` (3, 3), their
-    :func:`slopes` (K,), and the variances (K,) of the predicted ranges in units of the noise."""
+    """Return the whitened errors (K,) of the ranges in ``packed``, their :func:`slopes` (K,), and the variances (K,) of
+    the predicted ranges relative to the noise. ``pose`` (3,), ``covariance`` (3, 3): the prediction."""
     count = len(packed[0])
     error, jacobian, slope, variances = (
         np.zeros((count, 2)),
@@ -285,7 +289,7 @@ def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -
     """Convert whitened residuals to innovations. ``residual`` (K, 2): whitened, predicted minus measured.
 
     ``ranges``, ``bearings`` (K,): measured, NaN if missing. Returns measured minus predicted ranges [m] and bearings
-    [rad], without missing ones.
+    [rad]. Missing values are left out.
     """
     by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
     r = b = 0
@@ -310,8 +314,8 @@ def _linearized(
     jacobian: Array,
     slope: Array,
 ) -> None:
-    """Write the whitened residuals (K, 2), their Jacobian (K, 2, 3 + P) by the pose and the estimated constants, and
-    their :func:`slopes` (K,). The arguments are those of :func:`updated`."""
+    """Write the whitened ``residual`` (K, 2), its ``jacobian`` (K, 2, 3 + P) by the pose and the estimated constants,
+    and ``slope`` (K,) of :func:`slopes`. The remaining arguments are those of :func:`updated`."""
     count = len(residual)
     changes = np.zeros(len(PARAMETERS))
     for j in range(len(values)):

@@ -27,7 +27,7 @@ NOISES = (0.6, 1.0, 1.6)  # factors of the standard deviation of ranges
 SHARES = (0.02, 0.05, 0.12, 0.25, 0.45, 1.0)  # fractions of late ranges; 1 is a bias of all ranges
 MEANS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # m: means of the excess; their prior is proportional to the inverse
 RELATIVE_SIGMAS = (0.2, 0.7)  # standard deviation of the excess divided by its mean
-BIASED = 0.05  # prior probability of a bias, if no range is late
+BIASED = 0.05  # prior probability of a bias of all ranges, for a sensor without late ranges
 OUTLIERS, FAR = 0.02, 10.0  # fraction of gross errors, and their standard deviation divided by that of an innovation
 LARGEST = 1e4  # squares of normalised innovations are limited to this value
 LEAST = 0.002  # a smaller share of late ranges is replaced by 0
@@ -53,7 +53,7 @@ NONE = LateRanges()
 def mixture(
     error: float, slope: float, robust: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
-    """Returns the negative log-likelihood of a range, its derivative by ``error``, and the information about ``error``.
+    """Return the negative log-likelihood of a range, its derivative by ``error``, and the information about ``error``.
 
     ``error``: the predicted minus the measured range in standard deviations.
     ``slope``: the inverse of the standard deviation [1/m].
@@ -82,15 +82,15 @@ def mixture(
 def moments(
     error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
-    """Returns the error and the weight of a Gaussian measurement that has the effect of a range on a prediction, and
-    the normalised innovation squared, averaged over a direct and a late range.
+    """Replace a range that may be late by a Gaussian measurement with the same effect on a prediction.
 
-    The prediction is corrected by a direct and by a late range. The mixture of both results is replaced by a Gaussian
-    with the same mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian
-    inference", 2001, 3.1). The variance is limited to that of the prediction.
+    ``variance``: the variance of the predicted range divided by the variance of the noise. ``gate``: the noise is
+    increased if a normalised innovation squared exceeds this limit. The other arguments are those of :func:`mixture`.
 
-    ``variance``: the variance of the predicted range divided by that of the noise. ``gate``: the noise is increased if
-    a normalised innovation squared exceeds it. The other arguments are those of :func:`mixture`.
+    Returns the error and the weight of the Gaussian measurement, and the expected normalised innovation squared. The
+    prediction corrected by a direct and by a late range is a mixture of two Gaussians. The measurement leads to its
+    mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian inference",
+    2001, 3.1).
     """
     widening = 1.0 + (slope * sigma) ** 2
     beyond = error + slope * mean
@@ -110,7 +110,7 @@ def moments(
 
 
 def _grid() -> tuple[Array, Array, Array]:
-    """The shares, the means and the standard deviations of the hypotheses with an excess, as arrays (H,)."""
+    """Return three arrays (H,): the share of late ranges, and the mean and sigma of their excess, for H hypotheses."""
     shares, means, sigmas = (part.ravel() for part in np.meshgrid(SHARES, MEANS, RELATIVE_SIGMAS, indexing="ij"))
     return shares, means, sigmas * means
 
@@ -156,11 +156,11 @@ class LateShares:
         return LateRanges(_rounded(share), _rounded(mean), _rounded(sigma)) if share >= LEAST else NONE
 
     def updated(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
-        """The posterior after K ranges.
+        """Return the distribution after K ranges.
 
         ``errors`` (K,): the predicted minus the measured ranges in standard deviations. ``slopes`` (K,): the inverse
-        standard deviations [1/m], 0 for measurements that cannot be late. ``variances`` (K,): those of the predicted
-        ranges, in units of the noise.
+        standard deviations [1/m], 0 for measurements that cannot be late. ``variances`` (K,): the variances of the
+        predicted ranges, divided by the variance of the noise.
         """
         if self.probability == 0.0 or not slopes.any():
             return self
@@ -169,7 +169,7 @@ class LateShares:
 
 
 def _rounded(value: float) -> float:
-    """Round to two significant digits. Models then are often equal, and their factors can be linearised together."""
+    """Round to two significant digits, so that models are often equal and can be linearised together."""
     return float(f"{value:.2g}")
 
 
@@ -177,8 +177,8 @@ def _rounded(value: float) -> float:
 def _learnt(
     logs: Array, shares: Array, means: Array, sigmas: Array, errors: Array, slopes: Array, variances: Array
 ) -> Array:
-    """The normalised logarithms of the probabilities of all hypotheses after K ranges. ``logs`` (noises, 1 + H): those
-    before. ``shares``, ``means``, ``sigmas`` (H,): the hypotheses with an excess. The other arguments are those of
+    """Update the log-probabilities ``logs`` (noises, 1 + H) of all hypotheses by K ranges, and return them normalised.
+    ``shares``, ``means``, ``sigmas`` (H,): the hypotheses with late ranges. The other arguments are those of
     :meth:`LateShares.updated`."""
     out, late = logs.copy(), np.empty(_PARTS)
     for k in range(len(errors)):

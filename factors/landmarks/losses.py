@@ -13,8 +13,8 @@ from factors.se2 import Array, Integers
 
 @compiled
 def slopes(error: Array, jacobian: Array, ranges: Array, bearings: Array, out: Array) -> None:
-    """Compute the derivatives ``out`` (K,) of whitened range residuals by the predicted ranges [1/m]. A derivative is 0
-    if a landmark is not measured by its range alone. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the outputs of
+    """Compute the derivatives ``out`` (K,) [1/m] of whitened range residuals by the predicted ranges. The derivative is
+    0 for a landmark without range, or with a bearing. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the outputs of
     :func:`factors.landmarks.kernels.linearize`."""
     for k in range(len(ranges)):
         alone = math.isnan(bearings[k]) and not math.isnan(ranges[k])

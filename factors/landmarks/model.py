@@ -43,7 +43,7 @@ class BearingRangeModel:
     ``hypot(range_sigma, range_sigma_relative * r)``.
     ``bearing_bias``, ``bearing_sigma``: offset and standard deviation of bearings [rad].
     ``robust``: the scale of the Geman-McClure loss in standard deviations.
-    ``late``: the statistics of late ranges (too long by a reflection), among those without a bearing.
+    ``late``: the statistics of ranges that are too long because of reflections. Ranges with a bearing are never late.
     ``packed``: the model as an array (14,) for compiled code.
     """
 
@@ -148,7 +148,7 @@ def widened(model: BearingRangeModel, width: float) -> BearingRangeModel:
 
 @lru_cache(maxsize=64)
 def with_late(model: BearingRangeModel, late: LateRanges) -> BearingRangeModel:
-    """The model with these statistics of ``late`` ranges."""
+    """Return the model with the statistics ``late`` of ranges that are too long."""
     return replace(model, late=late)
 
 
@@ -181,8 +181,8 @@ def whitened_into(
     ``model``: range scale, range sigma, relative range sigma, bearing bias, bearing sigma.
     ``error`` (K, 2): output, the residuals. Must contain zeros before the call.
     ``jacobian`` (K, 2, WIDTH): output, the derivatives by the body-frame perturbation of the pose, by the point, and by
-    :data:`PARAMETERS`. The derivative by the range scale is by its relative change. The derivative by the time offset
-    stays zero, because it needs the robot's velocity. Must contain zeros before the call.
+    :data:`PARAMETERS`. The change of the range scale is relative. The derivative by the time offset stays zero, because
+    it needs the robot's velocity. Must contain zeros before the call.
     """
     range_scale, _, _, _, bearing_sigma = model
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -298,10 +298,9 @@ def _losses(
     """Compute the negative log-likelihoods of K landmarks at N poses.
 
     ``constants`` (N, 5): sensor constants for each pose. ``turn``: heading of the sensor in the robot frame. ``noise``:
-    range sigma, relative range sigma, bearing sigma. ``tails``: scale of the robust loss, and the late ranges.
-    ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
-    ``losses`` (N, K): output. With covariances it includes half the log-determinant of the noise covariance, minus its
-    value without the points' part.
+    range sigma, relative range sigma, bearing sigma. ``tails``: scale of the robust loss, then share, mean and sigma of
+    late ranges. ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
+    ``losses`` (N, K): output, up to a constant for each landmark.
     """
     robust, share, mean, sigma = tails
     range_sigma, range_sigma_relative, bearing_sigma = noise

@@ -171,7 +171,7 @@ def test_landmarks_of_one_look_do_not_average_the_odometry_error_away(split, aro
     information = prior = np.linalg.inv(np.diag((3.0, 3.0, 0.001)) ** 2)
     for i in rows:
         seen = ring[i], ranges[i], bearings[i]
-        factor = BearingRangeFactor(model, *seen, offset, noise, in_look=20 if split else None)
+        factor = BearingRangeFactor(model, *seen, offset, noise, simultaneous=20 if split else None)
         _, (jacobian,) = factor.linearize([np.zeros(3)])
         information = information + jacobian.T @ jacobian
     # by the joint covariance of all forty values: the error of the odometry is one

@@ -101,7 +101,7 @@ def test_by_landmarks(rng, iterations, depth, places):
         bearings[-1] = np.nan
         factor = BearingRangeFactor(model, points, ranges, bearings, estimated=places)
         if count > 1:  # seen after the pose, from a robot that moves, on a map that is not exact
-            moved = {"offset": np.array((0.1, 0.0, 0.1)), "offset_covariance": 1e-4 * np.eye(3), "in_look": 8}
+            moved = {"offset": np.array((0.1, 0.0, 0.1)), "offset_covariance": 1e-4 * np.eye(3), "simultaneous": 8}
             spreads = np.tile(1e-3 * np.eye(2), (count, 1, 1))
             factor = replace(factor, **moved, twist=np.array((0.5, 0.0, 0.2)), point_covariances=spreads)
         start, covariance = (

@@ -184,7 +184,7 @@ def run():
     spreads = np.array([np.diag((0.1, 0.2)) ** 2] * 4)
     offset = {"offset": np.array((0.05, 0.01, 0.03)), "offset_covariance": np.diag((0.05, 0.04, 0.06)) ** 2}
     twist = {"twist": np.array((0.5, 0.0, 0.3))}
-    extras = [{}, twist, offset, {**offset, **twist, "in_look": 7}, {"point_covariances": spreads}]
+    extras = [{}, twist, offset, {**offset, **twist, "simultaneous": 7}, {"point_covariances": spreads}]
     extras.append({**offset, "point_covariances": spreads})
     constants = tuple(range(len(PARAMETERS)))
     factors = [(PriorFactor(np.zeros(3), covariance), (pose_key(0),))]
@@ -233,7 +233,9 @@ def test_one_call_linearises_as_each_factor_does(run):
         for i, point in enumerate(factor.points):
             spread = None if factor.point_covariances is None else factor.point_covariances[i : i + 1]
             seen = {"ranges": factor.ranges[i : i + 1], "bearings": factor.bearings[i : i + 1]}
-            one = replace(factor, **seen, point_covariances=spread, free=True, in_look=factor.in_look or len(POINTS))
+            one = replace(
+                factor, **seen, point_covariances=spread, free=True, simultaneous=factor.simultaneous or len(POINTS)
+            )
             error, (*blocks, _) = one.linearize([*at, point])
             rows = slice(2 * i, 2 * i + 2)
             np.testing.assert_allclose(residual[rows], error, atol=1e-12)

@@ -97,7 +97,7 @@ class KnownLandmarks:
                 None if offset is None else offset.covariance,
                 estimated=self._estimated,
                 twist=twist,
-                in_look=None if offset is None else count,
+                simultaneous=None if offset is None else count,
             )
 
         def of_row(i: int, *, free: bool) -> NamedFactor:
