@@ -33,14 +33,14 @@ from factors.robust import huber_loss
 from factors.se2 import Array, Integers
 
 ANCHORED, SLACK = 4, 2.0  # number of visible points that determine a keyframe's pose; error of such a pose in pixels
-HORIZON, BUNDLE = 60, 8  # number of keyframes whose sightings are kept, and number of keyframes adjusted together
+HORIZON, BUNDLE = 60, 8  # numbers of last keyframes: with stored sightings, and adjusted together
 DISTANCE = 3.0  # m: initial value of the distance of points
 # consecutive keyframes must share a third of the points in view, but at least FEW and at most ENOUGH
 FEW, ENOUGH = 5, 8
 ITERATIONS = 30
-# a sighting fits within FITS standard deviations; at least the fraction MOST of a keyframe's sightings must fit
+# largest residual of a fitting sighting, in standard deviations; least fraction of a keyframe's sightings that must fit
 FITS, MOST = 3.0, 0.5
-SLIPPED = 0.1  # rad: parallax of near points explains smaller differences between turns in the image and of odometry
+SLIPPED = 0.1  # rad: smaller differences between the rotations of odometry and image may be parallax of near points
 
 Waiting = Mapping[Hashable, Sequence[PointSighting]]
 State = tuple[Array, Array, Array]  # poses (N, 3) and tilts (N, 2) of keyframes, and points (P, 3)
@@ -52,11 +52,12 @@ def bundled(
     poses: Sequence[Array],
     waiting: Waiting,
 ) -> list[tuple[Array, Array]] | None:
-    """Adjust the last keyframes and the points that they observe. Returns a pose (3,) and a tilt (2,) for each adjusted keyframe.
+    """Adjust the last keyframes and their points. Returns the pose (3,) and the tilt (2,) of each adjusted keyframe.
 
-    ``keyframes``: consecutive keyframes. The newest are adjusted, as far back as each shares enough points with the one
-    before. ``poses``: their initial poses. The first adjusted pose is fixed. ``waiting``: the sightings of each point.
-    Returns None if there are fewer than :data:`ENOUGH` points, or if most sightings of a keyframe do not fit.
+    ``keyframes``: consecutive keyframes. The longest sequence of newest keyframes is adjusted in which each shares
+    enough points with its predecessor. The first adjusted pose is fixed. ``poses``: the initial poses of the keyframes.
+    ``waiting``: the sightings of each point. Returns None if there are fewer than :data:`ENOUGH` points, or if most
+    sightings of a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)
     shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
@@ -87,7 +88,7 @@ def _adjusted(
 ) -> tuple[Sequence[Array], Array, Truths]:
     """Return adjusted poses (3,) and tilts (N, 2) of N keyframes, and a mask (M,) of the sightings that fit the result.
 
-    ``often``: the M sightings, by point. Poses and tilts keep their initial values if no optimization step can be computed.
+    ``often``: the sightings of each point, M in all. If the adjustment fails, poses and tilts are the initial ones.
     """
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]
@@ -141,7 +142,7 @@ class LocalBundle:
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
         """Return the state after a Levenberg-Marquardt step, and the largest component of the step.
 
-        ``damping``: the factor of the Hessian's diagonal that is added to it. Returns None if the equations are singular.
+        ``damping``: this factor times the Hessian's diagonal is added to the Hessian. Returns None if it is singular.
         """
         poses, tilts, points = state
         residual, jacobian, _ = self.linearize(state)
@@ -185,8 +186,8 @@ class LocalBundle:
 
 
 def _seen_often(first: int, waiting: Waiting) -> list[list[PointSighting]]:
-    """Return for each point its sightings from keyframe number ``first`` on. Points with fewer than :data:`FEWEST` such
-    sightings are left out. ``waiting``: the sightings of each point that is not yet triangulated."""
+    """Return the sightings of each point from the keyframe with number ``first`` and later ones. Points with fewer than
+    :data:`FEWEST` of these are omitted. ``waiting``: all sightings of each point that is not yet triangulated."""
     return [sightings for w in waiting.values() if len(sightings := [s for s in w if s.keyframe >= first]) >= FEWEST]
 
 
@@ -195,8 +196,8 @@ def _turned(
 ) -> list[Array]:
     """Correct the rotations between the ``poses`` (3,) of consecutive keyframes, and return the corrected poses.
 
-    If a rotation differs by more than :data:`SLIPPED` from the median rotation of the common points in the images, the
-    latter replaces it. ``first``: the number of the first keyframe. ``often``: the sightings of each point.
+    The median change of bearing of the common points in both images replaces a rotation that differs by more than
+    :data:`SLIPPED`. ``first``: the number of the first keyframe. ``often``: the sightings of each point.
     """
     sides: list[dict[int, float]] = [{} for _ in poses]
     for i, sightings in enumerate(often):
@@ -233,7 +234,7 @@ class KeyframeCameras:
             self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 
     def anchor(self, keyframe: Keyframe, points: int) -> None:
-        """Store whether the points of the graph determine the pose of a keyframe. ``points``: the number that it observes."""
+        """Store whether points of the graph determine a keyframe's pose. ``points``: how many the keyframe observes."""
         self.anchored[keyframe.index] = points >= ANCHORED
 
     def forget(self, first: int) -> None:
@@ -310,8 +311,8 @@ class KeyframeCameras:
     def _slacks(self, newest: Keyframe, graph: Graph) -> dict[int, float]:
         """Return the errors [px] of the last keyframes relative to the newest keyframe, by number of the keyframe."""
         slacks: dict[int, float] = {}
-        # variance of the odometry's rotation from the newest keyframe back to the last one whose pose is determined by points, and
-        # from an older keyframe to the next one that is determined by points
+        # variances of the odometry's rotation: from the newest keyframe back to the last anchored one; from an older
+        # keyframe to the next anchored one
         to_anchor = since = 0.0
         reached = False
         for index in range(newest.index, max(-1, newest.index - HORIZON), -1):

@@ -28,10 +28,10 @@ from factors.se2 import Array
 
 INTERVAL = 0.9  # s between images that are compared
 SUCCESSIVE, BREAK = 3, 3.0  # number of consecutive images that must agree, and the maximum time [s] between two of them
-MOTION_SIGMAS = np.array((0.1, 0.1, 0.03))  # m, m, rad: errors allowed in the motion between two of these images
+MOTION_SIGMAS = np.array((0.1, 0.1, 0.03))  # m, m, rad: standard deviations of the motion between two such images
 FEWEST = 15  # least number of old points that must match
 LEAST_SHARE = 0.1  # least fraction of the visible old points that must match
-GRID, CELLS = (6, 4), 7  # cells of the image, and how many of them must contain a point
+GRID, CELLS = (6, 4), 7  # cells of the image, and how many of them must contain a matched point
 # standard deviations (m, m, rad) that are added to the covariance of the estimated pose: a constant, and per metre travelled
 DRIFT, DRIFT_PER_METRE = np.array((0.05, 0.05, 0.02)), np.array((0.003, 0.003, 0.0005))
 GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
@@ -43,8 +43,8 @@ FARTHEST = 15.0  # m: largest distance of a point that is searched
 class OldPoints:
     """N points of the graph that were last observed long ago.
 
-    ``points``: their positions, which may be outdated, with the descriptor of one view of each point. ``keys``: their variables in
-    the graph. ``travelled`` (N,): the path length of the robot [m] from the start to the last observation of each point.
+    ``points``: the positions, which may be outdated, with the descriptor of one view of each point. ``keys``: the graph
+    variable of each point. ``travelled`` (N,): the path length of the robot [m] at the last observation of each point.
     """
 
     points: PointMap
@@ -56,8 +56,8 @@ class OldPoints:
 class Image:
     """The image of a new keyframe.
 
-    ``frame``: its features. ``guess``: the predicted pose of ``keyframe`` and its covariance. ``travelled``: the path
-    length of the robot since the start [m].
+    ``frame``: the features of the image. ``keyframe``: the keyframe. ``guess``: the predicted pose of the keyframe with
+    covariance. ``travelled``: the path length of the robot since the start [m].
     """
 
     frame: CameraFrame
@@ -70,8 +70,8 @@ class Image:
 class Revisit:
     """A keyframe whose image shows old points.
 
-    ``pose`` (3,): the pose of ``keyframe`` by these points. ``points`` (M,): indices of the recognized old points.
-    ``features`` (M,): indices of their features in the image.
+    ``pose`` (3,): the keyframe's pose, computed from these points. ``points`` (M,): indices of the recognized old
+    points. ``features`` (M,): indices of the matching features of the image.
     """
 
     keyframe: Keyframe
@@ -81,23 +81,23 @@ class Revisit:
 
 
 class LoopClosure:
-    """Detector of loop closures. It accepts one if several consecutive images show the same old points at poses that agree."""
+    """Detector of loop closures. It requires that several consecutive images show old points, from consistent poses."""
 
     def __init__(self) -> None:
         self._agreeing: list[Revisit] = []  # revisits of the last consecutive images, which agree with each other
         self._last_time = -math.inf  # s; the time of the last image that was compared
 
     def is_due(self, t: float) -> bool:
-        """True if the last comparison is at least :data:`INTERVAL` before ``t`` [s], so that the image at ``t`` is compared."""
+        """True if an image at time ``t`` [s] must be compared: at least :data:`INTERVAL` after the last comparison."""
         return t >= self._last_time + INTERVAL
 
     def compare(
         self, model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]
     ) -> Revisit | None:
-        """Compare an image with the ``old`` points, and return the recognized ones.
+        """Compare an image with the ``old`` points, and return the revisit if a loop is closed, otherwise None.
 
-        ``current``: a function that returns the newest estimate of a variable of the graph, by key.
-        Returns None if no points are recognized, or if fewer than :data:`SUCCESSIVE` consecutive images agree.
+        A loop is closed if the last :data:`SUCCESSIVE` images show old points from consistent poses. ``current``: a
+        function that returns the newest estimate of a variable of the graph, by key.
         """
         self._last_time = image.keyframe.t
         revisit = _revisit(model, image, old, current)
@@ -114,7 +114,7 @@ class LoopClosure:
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """Return the old points that one image shows, or None. The arguments are those of :meth:`LoopClosure.compare`."""
+    """Return the old points that one image shows, None if too few. Arguments: see :meth:`LoopClosure.compare`."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:

@@ -64,7 +64,7 @@ from factors.robust import huber_weight
 from factors.se2 import Array
 
 SETTLED = 1e-3  # m, rad: step of the iterated update below which it has converged
-RECENT = 5.0  # s: a point in the state that was not seen for this time may be hidden
+RECENT = 5.0  # s: a point in the state that was not observed for this time may be occluded
 LOST_AFTER = 5  # consecutive images without a match, after which the filter is lost
 SCALE = "scale_distance"  # the name of the odometry's constant that scales distances
 LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which the pose is unknown
@@ -144,7 +144,7 @@ class Monoslam(Filter):
     """The monoSLAM filter: it localizes a robot with wheels and one camera, and can map points during the run."""
 
     modalities = frozenset({"camera"})
-    estimates_points = True  # points that the map lacks, unless the setting ``landmarks`` is ``known``
+    estimates_points = True
     _state: SlamState
 
     def __init__(self, setup: Setup, settings: MonoslamSettings) -> None:
@@ -158,8 +158,8 @@ class Monoslam(Filter):
         self._mounting = np.zeros((6, 6)) if camera is None else of_mounting(camera)
         self._step: Step | None = None
         self._relocalized = False
-        # without a map the start is unobservable. Its uncertainty is not in the state, where changes of the linearization point
-        # would reduce it (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010)
+        # Without a map the start is unobservable. In the state, changes of the linearization point would reduce its
+        # covariance (Huang, Mourikis, Roumeliotis, International Journal of Robotics Research 29(5), 2010).
         self._origin: Origin | None = None
 
     def initialize(self, prior: PosePrior) -> None:
@@ -189,8 +189,8 @@ class Monoslam(Filter):
         return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
-        """Return the planar poses at the ticks (the times at which a run records the pose). In a known map, later images smooth
-        the poses unless the setting ``smooth`` is off. If points are estimated, the poses are the causal ones."""
+        """Return the planar poses at the times at which a run records the pose. In a known map, the poses are smoothed
+        with later images unless the setting ``smooth`` is off. If points are estimated, the poses are not smoothed."""
         is_known = self._settings.landmarks == "known"
         records = smoothed(self._records) if self._smooth and is_known else self._records
         ticks = np.unique(np.array(self._ticks))
@@ -256,9 +256,9 @@ class Monoslam(Filter):
         return self._matcher.unless_slipped(m, state, eye, *slip)
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Return the state after a Kalman update of ``prior`` by ``match``, iterated with Huber weights in a known map.
+        """Return the state after a Kalman update of ``prior`` with the matched pixels ``match``.
 
-        The noise of a pixel outside the gate is increased.
+        In a known map, the update is iterated with Huber weights. The noise of a pixel outside the gate is increased.
         """
         known = match.mapped, match.points, match.covariances
         zero = np.zeros(len(prior.covariance))
@@ -313,8 +313,8 @@ class Monoslam(Filter):
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
-        """Return the state of a robot with the relocalized ``camera``, with the constants of ``lost_state``. Returns
-        None if this robot would not stand on the floor."""
+        """Return the state of a robot at a relocalized ``camera`` pose, None if this robot is not level on the floor.
+        ``lost_state``: the state before, which supplies the odometry's constants."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
@@ -358,7 +358,7 @@ class Monoslam(Filter):
 
     def _record(self) -> UpdateRecord:
         s = self._state
-        # without a prediction since the last record, this record is a second measurement at the same time
+        # there is no prediction since the last record if both measurements have the same time
         step = self._step or standstill(self._records[-1].robot if self._records else s.robot)
         self._step, relocalized, self._relocalized = None, self._relocalized, False
         return UpdateRecord(self._t, step, s.robot, s.constants, s.covariance[: s.base, : s.base].copy(), relocalized)

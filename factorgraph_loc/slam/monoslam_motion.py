@@ -116,7 +116,7 @@ class Origin:
 
 
 def standstill(robot: RobotState) -> Step:
-    """Return the step of a robot that does not move. A second measurement at the same time needs it."""
+    """Return the step of a robot that does not move, for two measurements at the same time."""
     return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
 
 

@@ -63,17 +63,17 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
     i = np.arange(count)
     distances[i, i], covariances[i, i] = squared(residual, each), each
     inside = distances < GATE
-    # the score of an agreement is low if the point is very uncertain, because such a point agrees with every correction
+    # an agreeing point with a large variance has a low score, because it agrees with any correction
     information = np.log(np.linalg.det(each)[:, None] / np.linalg.det(covariances))
     best = int(np.argmax(np.where(inside, GATE - distances + information, 0.0).sum(axis=0)))
     return _confirmed(residual, total, inside[:, best])
 
 
 def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
-    """Return a mask (K,) of the matches of the mask ``right`` that agree with a prediction from the other matches of ``right``.
+    """Return the mask ``right`` (K,) of inlier matches after removing outliers, one at a time, the worst first.
 
-    The worst match is removed first, until all agree. ``residual`` (K, 2): measured minus predicted pixels. ``total``
-    (2K, 2K): the innovation covariance with noise.
+    An outlier contradicts the pixel predicted from the remaining matches. ``residual`` (K, 2): measured minus predicted
+    pixels. ``total`` (2K, 2K): the innovation covariance with noise.
     """
     rows = np.flatnonzero(right)
     count = len(rows)
@@ -100,10 +100,10 @@ def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
 class Match:
     """The inlier matches of an image: M points of the state and then P points of the map.
 
-    ``pixels`` (M + P, 2): the matched pixels. ``mapped``: indices of the M points of the state.
-    ``points`` (P, 3): positions of the points of the map. ``covariances`` (P, 3, 3): of these positions, None if negligible.
-    ``taken``: rows of the image that are matched. ``expected``: indices of the points of the state that should be matched.
-    ``wanted``: number of map points that should be matched; 0 if they are too few to conclude that the pose is lost.
+    ``pixels`` (M + P, 2): the matched pixels. ``mapped``: indices of the M points of the state. ``points`` (P, 3):
+    positions of the P points of the map. ``covariances`` (P, 3, 3): of these positions, None if negligible. ``taken``:
+    indices of the matched pixels in the image. ``expected``: indices of the points of the state that should be matched.
+    ``wanted``: number of map points that should be matched, 0 if they are too few to decide that the pose is lost.
     ``tempering``: the exponent of the likelihood of map points, at most 1, because their errors are correlated.
     """
 
@@ -148,7 +148,7 @@ class FeatureMatcher:
     def unless_slipped(
         self, m: Pixels, state: SlamState, eye: Eye, added: Array, rarity: float
     ) -> tuple[SlamState, Match]:
-        """Return the state and the result of :meth:`match`. If the pixels show that the wheels slipped, the state is less certain.
+        """Return the state and its matches (:meth:`match`). The state's covariance is increased if the wheels slipped.
 
         ``added`` (3, 3): the covariance of x, y and heading that slip adds. ``rarity``: minus the logarithm of the
         probability of slip. The wheels slipped if the log-likelihood ratio of the pixels exceeds ``rarity``.
@@ -254,7 +254,7 @@ class FeatureMatcher:
     def _agreeing(
         self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Return the inliers among the pairs ``ours`` (row of the image, point of the state). ``pixels``: of all rows."""
+        """Return the inliers among the pairs ``ours`` (index in ``pixels``, point of the state)."""
         if not ours:
             return ours
         sights = eye.mapped(state, [p for _, p in ours])
@@ -264,7 +264,7 @@ class FeatureMatcher:
     def _agreeing_known(
         self, pixels: Array, known: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Return the inliers among the pairs ``known`` (row of the image, point of the map). ``pixels``: of all rows."""
+        """Return the inliers among the pairs ``known`` (index in ``pixels``, point of the map)."""
         if len(known) < FEWEST:
             return known
         points = self._map.positions[[p for _, p in known]]
@@ -316,7 +316,7 @@ def _slip(match: Match, state: SlamState, eye: Eye, added: Array) -> float:
     """
     sights = eye.all(state, match.mapped, match.points, match.covariances)
     covariance = Innovation.of(sights, state.covariance).total(sights.noise)
-    # all points of unknown depth have the same initial depth, so their errors are correlated and resemble a slip
+    # a common error of all depths: points of unknown depth have the same initial depth, so their errors resemble slip
     depths = np.minimum(sights.starts + inverse_depth.SIZE - 1, len(state.covariance) - 1)
     alike = (sights.by_point[:, :, -1] * np.sqrt(state.covariance[depths, depths])[:, None]).ravel()
     by_pose = sights.by_pose[:, :, PLANAR].reshape(-1, 3)

@@ -119,10 +119,10 @@ class SlamState:
 
 
 def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
-    """Return the state ``posterior`` with an updated standard deviation of the robot's tilt.
+    """Return the state ``posterior`` with an updated standard deviation of the robot's tilt (field ``floor``).
 
-    ``prior``, ``posterior``: the states before and after the update by an image at time ``t`` [s]. Only the change of the tilt
-    since the previous image is used, because the tilt at the first observation of a point also displaces the point.
+    ``prior``, ``posterior``: the states before and after the update by an image at time ``t`` [s]. The new value is
+    estimated from the change of the tilt since the previous image.
     """
     if prior.floor is None or prior.image_odometry is None or t <= prior.image_odometry.t:
         return replace(posterior, floor=prior.floor)
@@ -130,7 +130,7 @@ def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
     share = -math.expm1(-2.0 * (t - prior.image_odometry.t) / UNEVEN)  # fraction of the tilt's variance that is new
     was, now = (positive.inverse(s.covariance[:2, :2]) for s in (prior, posterior))
     gained, known = now - was, prior.covariance[:2, :2] - share * sigma**2 * np.eye(2)
-    weight = np.linalg.inv(np.eye(2) + gained @ known)  # the part of the information that is on the change of tilt
+    weight = np.linalg.inv(np.eye(2) + gained @ known)  # fraction of the information that is about the change of tilt
     covariance = positive.inverse(share * weight @ gained + np.eye(2) / sigma**2)
     tilt = math.sqrt(share) * covariance @ weight @ now @ (tilt_of(posterior.robot) - tilt_of(prior.robot))
     return replace(posterior, floor=prior.floor.learnt(tilt, covariance, sigma)[0])
@@ -148,11 +148,11 @@ def of_mounting(camera: CameraSettings) -> Array:
 class Sights:
     """The predicted pixels of K points, with Jacobians.
 
-    ``pixels`` (K, 2) [px]. ``depths`` (K,): in front of the camera if positive; scaled by the inverse depth where the
-    point has one.
-    ``by_pose`` (K, 2, 6): Jacobian with respect to the robot's pose. ``by_point`` (K, 2, 6): with respect to the point's values.
-    ``starts`` (K,): index of the point's first value in the error state. ``sizes`` (K,): number of the point's values; 0 for a
-    point of the map, which is not in the state. ``noise`` (K, 2, 2) [px^2]: covariance of pixel noise and map errors.
+    ``pixels`` (K, 2) [px]. ``depths`` (K,): positive for a point in front of the camera. The depth of a point with
+    inverse depth is multiplied by the inverse depth. ``by_pose``, ``by_point`` (K, 2, 6): Jacobians with respect to the
+    robot's pose and to the point's values. ``starts`` (K,): index of the point's first value in the error state.
+    ``sizes`` (K,): number of the point's values, 0 for a point of the map. ``noise`` (K, 2, 2) [px^2]: covariance of
+    pixel noise and map errors.
     """
 
     pixels: Array

@@ -103,14 +103,14 @@ class NewPoints:
         return len(self.waiting.get(name, ()))
 
     def add(self, name: Hashable, sighting: PointSighting) -> None:
-        """Add a sighting of the point ``name``. If it then has more than :data:`MAX_WAITING` sightings, the oldest is dropped."""
+        """Add a sighting of the point ``name``, and keep only the newest :data:`MAX_WAITING` sightings of this point."""
         waiting = self.waiting.setdefault(name, [])
         waiting.append(sighting)
         del waiting[:-MAX_WAITING]
 
-    def those(self, trusted: Callable[[Hashable], bool]) -> Mapping[Hashable, Sequence[PointSighting]]:
-        """Return the collected sightings of the points for which ``trusted`` returns True."""
-        return {name: sightings for name, sightings in self.waiting.items() if trusted(name)}
+    def select(self, is_wanted: Callable[[Hashable], bool]) -> Mapping[Hashable, Sequence[PointSighting]]:
+        """Return the collected sightings, by name, of the points for which ``is_wanted(name)`` is True."""
+        return {name: sightings for name, sightings in self.waiting.items() if is_wanted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
         """Drop the points ``wrong``, and all points without a sighting in the last :data:`PATIENCE` keyframes before
@@ -164,9 +164,8 @@ def agreed(
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
     """Triangulate a point without outliers. Returns the point and its consistent sightings.
 
-    ``places``: the camera pose of each of the ``sightings``. While the residuals are too large, one more sighting is
-    removed, so that the remaining residuals are smallest. Returns None if the remaining sightings do not determine the
-    point.
+    ``places``: the camera pose of each sighting. While the residuals are too large, the worst sighting is removed.
+    Returns None if the remaining sightings do not determine the point.
     """
     sightings, places = list(sightings), list(places)
     point = triangulate(model, sightings, places)
@@ -195,8 +194,9 @@ def triangulate(
 ) -> TriangulatedPoint | None:
     """Triangulate a point from M ``sightings``, with minimal squared residuals in the images.
 
-    ``places``: the camera pose of each sighting. A residual is infinite if the point is not in front of the camera. Returns None if
-    the rays are nearly parallel, or if the standard deviation exceeds :data:`MAX_SPREAD` times the least depth.
+    ``places``: the camera pose of each sighting. Residuals are infinite in cameras that have the point behind them.
+    Returns None if the rays are nearly parallel, or if the standard deviation exceeds :data:`MAX_SPREAD` times the
+    least depth.
     """
     is_determined, *result = kernels.triangulated(
         reprojection.lens_of(model),

@@ -74,7 +74,7 @@ class PointMapper(UnknownPoints):
 
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:
-    """Return the mapper of a run. It maps nothing without a camera in ``sensors``, or if ``landmarks`` is "known"."""
+    """Return the mapper of a run. It does nothing without a camera, or if ``settings.landmarks`` is "known"."""
     camera = next((sensor for sensor in sensors.values() if isinstance(sensor, CameraSensor)), None)
     if camera is None or settings.landmarks == "known":
         return Mapper()

@@ -34,7 +34,7 @@ class PointView:
 
     ``descriptor`` (D,): the descriptor of the feature. ``seen_from`` (3,): the camera position in the world frame.
     ``travelled`` [m]: the path length of the robot from the start to this view.
-    ``keyframe``: the key of the keyframe's pose. ``guess``: the estimate of this pose at that time, with its covariance.
+    ``keyframe``: the key of the keyframe's pose. ``guess``: this pose with covariance, as estimated when it was viewed.
     """
 
     descriptor: NDArray[Any]

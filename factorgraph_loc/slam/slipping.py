@@ -32,12 +32,12 @@ def unless_slipped(
     slip: Callable[[Increment], tuple[Array, float]],
     observed: tuple[Array, Array, Array, Array],
 ) -> Guess:
-    """Return the predicted pose of a new keyframe. If the image shows that the wheels slipped, its covariance is increased.
+    """Return ``guess``, the predicted pose of a new keyframe, with a larger covariance if the wheels slipped.
 
-    The motion ``keyframe.from_previous`` since the previous keyframe then also gets a larger covariance, in place.
-    ``guess``: the predicted pose and its covariance. ``slip``: a function of a motion. It returns the covariance (3, 3)
-    that slip adds, and minus the logarithm of the probability of slip. ``observed``: the positions (K, 3) of observed
-    points, their pixels (K, 2), and the covariances of positions (K, 3, 3) and pixels (K, 2, 2) [px^2].
+    Slip is detected in the image of the keyframe. If the wheels slipped, the covariance of ``keyframe.from_previous``,
+    the motion since the previous keyframe, is increased in place. ``slip``: a function of a motion. It returns the
+    covariance (3, 3) that slip adds, and minus the logarithm of the probability of slip. ``observed``: the positions
+    (K, 3) of observed points, their pixels (K, 2), and the covariances of both (K, 3, 3) [m^2] and (K, 2, 2) [px^2].
     """
     step = keyframe.from_previous
     if step is None or keyframe.factor is not None or len(observed[0]) < ENOUGH:
@@ -76,7 +76,7 @@ def _evidence(
         return 0.0
     factor = ReprojectionFactor(model, points[agrees], pixels[agrees], point_covariances=of_points[agrees])
     update = image_update(factor, pose, covariances[1], ITERATIONS, SETTLED)
-    # the covariance of the image alone, without the prediction
+    # covariance of the pose from the image alone, without the prediction
     posterior = positive.inverse(update.covariance)
     gained = positive.inverse(positive.nearest(posterior - positive.inverse(covariances[1])))
     off, gained = gained @ posterior @ update.delta, gained + COMMON_COVARIANCE

@@ -39,7 +39,8 @@ from factors.camera.point import PointFactor, PointPrior
 from factors.graph import VectorPriorFactor, point_key, tilt_key
 from factors.se2 import Array
 
-PER_KEYFRAME, MOST_WAITING = 40, 160  # largest numbers per keyframe of points in the graph, and of points not yet added
+# largest numbers of points that are used per keyframe: of the graph, and not yet in the graph
+PER_KEYFRAME, MOST_WAITING = 40, 160
 STRIKES = 2  # consecutive outliers
 LEVEL = np.zeros(2)  # no tilt
 PRIOR_SIGMA = 30.0  # m: weak prior of a point, about the size of a building
@@ -51,8 +52,8 @@ REVISITED = 6  # this many inliers among old points are accepted, even if points
 
 @dataclass
 class _Point:
-    """A point of the graph. ``key``: its variable. ``last`` [s]: the time of its last sighting. ``information`` (3, 3): the inverse
-    covariance of its position from all sightings, if their poses are exact. ``strikes``: the number of consecutive outliers."""
+    """A point of the graph. ``key``: its variable. ``last`` [s]: the time of its last sighting. ``information`` (3, 3):
+    the inverse covariance of its position for exact camera poses. ``strikes``: the number of consecutive outliers."""
 
     key: int
     last: float
@@ -88,7 +89,7 @@ class UnknownPoints(Mapper):
         self._cameras = KeyframeCameras(model, estimated)
         self._loops = LoopClosure()
         self._distance_travelled = 0.0  # m
-        # the name of a point by the feature track that shows it, if this is not the track that the point was added with
+        # the names of points by feature track, for tracks that are not the first track of their point
         self._names_by_track: dict[Hashable, Hashable] = {}
 
     def take_rows(
@@ -101,7 +102,7 @@ class UnknownPoints(Mapper):
         addition: Addition,
         movers: MovingThings,
     ) -> Guess:
-        """Add the ``rows`` of a measurement from a new keyframe to the graph. Returns the pose ``guess``, corrected by points.
+        """Add ``rows`` of the image ``m`` of a new keyframe to the graph. Returns the pose ``guess``, corrected by points.
 
         The covariance of the pose is not reduced, because the points are as uncertain as the poses that observed them.
         ``addition``: receives the new factors and variables. ``movers``: the tracks on moving objects.
@@ -136,11 +137,8 @@ class UnknownPoints(Mapper):
     def _observe_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
-        """Add the observations of points of the graph among the sightings ``chosen``. Returns the pose ``guess``,
-        corrected by these points, and their number.
-
-        ``certain``: the rows whose points were recognized by a loop closure.
-        """
+        """Add the sightings ``chosen`` of points that the graph contains. Returns the pose ``guess``, corrected by these
+        points, and their number. ``certain``: the rows of points that a loop closure recognized."""
         m, keyframe = image.m, image.keyframe
         old = [i for i, name in enumerate(chosen.names) if name in self._points]
         old = [old[i] for i in spread_out(chosen.pixels[old], PER_KEYFRAME).tolist()]
@@ -159,9 +157,10 @@ class UnknownPoints(Mapper):
     def _add_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, most: int, movers: MovingThings
     ) -> Array:
-        """Collect the sightings of points that are not in the graph. Add at most ``most`` of these points, if
-        triangulated, to it. ``movers``: the tracks on moving objects. Returns the pose (3,) of the keyframe, which is
-        adjusted if the points of the graph do not determine it.
+        """Collect sightings of points not in the graph, and add up to ``most`` triangulated points to the graph.
+
+        Returns the pose (3,) of the keyframe. It is adjusted together with the new points if the points of the graph do
+        not determine it. ``movers``: the tracks on moving objects.
         """
         m, keyframe, graph, addition = image.m, image.keyframe, image.graph, image.addition
         fresh = [i for i, name in enumerate(chosen.names) if name not in self._points]
@@ -171,7 +170,7 @@ class UnknownPoints(Mapper):
         waiting = [
             n for i in fresh if self._new.count(n := chosen.names[i]) >= FEWEST_SIGHTINGS and movers.is_static(n)
         ]
-        bundle = self._cameras.bundled(keyframe, guess[0], self._new.those(movers.is_static), self._floor.sigma, graph)
+        bundle = self._cameras.bundled(keyframe, guess[0], self._new.select(movers.is_static), self._floor.sigma, graph)
         cameras, pose = bundle or (
             self._cameras.cameras(keyframe, guess[0], waiting, self._new.waiting, graph),
             guess[0],
@@ -322,9 +321,8 @@ class UnknownPoints(Mapper):
         """Correct the pose ``guess`` by ``points`` of the graph that are observed at ``pixels``. Returns pose, tilt
         (2,) of the robot, prior standard deviation of the tilt, and a mask of the inliers.
 
-        Recent points and old points are tested separately, because the track has drifted since the old ones. A few
-        points cannot confirm each other. They are used only if they have names, because a wrong feature may agree with
-        an uncertain pose. ``known``: mask of the points recognized by a loop closure.
+        Recent points and old points are tested separately, because the pose has drifted since the old ones. If too few
+        points agree, only recent ones with names are used. ``known``: mask of points recognized by a loop closure.
         """
         model, keyframe, graph, named = image.model, image.keyframe, image.graph, image.m.names is not None
         sigma = self._floor.sigma
@@ -339,7 +337,7 @@ class UnknownPoints(Mapper):
         observed = positions[recent], pixels[recent], covariances[recent], noise[recent]
         guess = unless_slipped(replace(model, tilt=sigma), keyframe, guess, graph.motion.slip, observed)
         since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
-        near = guess if since is None else (guess[0], since)  # odometry since these points were observed
+        near = guess if since is None else (guess[0], since)  # with the covariance of the odometry since RECENT
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
         # a named point needs one other point that confirms it
         revisited = max(2 if named else REVISITED, math.ceil(LEAST_INLIERS * np.count_nonzero(~recent & ~known)))
