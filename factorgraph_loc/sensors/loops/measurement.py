@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 class LoopSettings(SensorSettings):
     """Noise of loop closures that another program found. A rig without this section has the defaults.
 
-    The settings apply to a loop of score 1. A loop of score s has standard deviations that are 1/s times as large. The robust loss
-    rejects it already at a residual [m, rad] that is sqrt(s) times the residual at which it rejects a loop of score 1.
+    The standard deviations and the scale ``robust`` are those of a loop of score 1. For a loop of score s, the standard
+    deviations are divided by s. The residual [m, rad] above which the loop is rejected is multiplied by sqrt(s).
     """
 
     sigma_position: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")] = 0.1
@@ -85,10 +85,10 @@ LOOPS_BY_STAMP = Table(
 
 @dataclass(frozen=True, slots=True)
 class Loops:
-    """K loop closures at the time ``t`` [s]: the robot is at places that it has visited before.
+    """K loop closures at the time ``t`` [s]. Each states that the robot is near an earlier pose.
 
-    ``age`` (K,): time [s] since the earlier visit. ``x``, ``y`` (K,) [m] and ``heading`` (K,) [rad]: the current pose in the
-    frame of the earlier pose, NaN if the loop has no relative pose. ``score`` (K,): confidence from 0 to 1, NaN if unknown.
+    ``age`` (K,): the time [s] since the earlier pose. ``x``, ``y`` (K,) [m], ``heading`` (K,) [rad]: the pose at ``t``
+    in the frame of the earlier pose, NaN if unknown. ``score`` (K,): confidence from 0 to 1, NaN if unknown.
     """
 
     sensor: ClassVar[str] = "loops"
@@ -104,14 +104,14 @@ class Loops:
 
     @property
     def count(self) -> int:
-        """The number of loops."""
+        """The number K of loop closures."""
         return len(self.age)
 
 
 @dataclass(frozen=True)
 class LoopStream(ScanStream):
-    """All loop closures of a log, one per row. Rows of one timestamp form one measurement. For the fields see
-    :class:`Loops`."""
+    """All loop closures of a log, one per row. The fields are those of :class:`Loops`. Rows with the same timestamp
+    form one measurement."""
 
     kind: ClassVar[type[Any]] = Loops
     age: Array
@@ -125,8 +125,8 @@ POSE = ("x", "y", "heading")
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of loops of a log. Raises InputError if the time of an earlier pose is not before the timestamp
-    of its row, or if a relative pose is incomplete."""
+    """Return the loop closures of a log as a stream. ``rows``: the rows by table name. Raises InputError if a relative
+    pose is incomplete, or if the earlier pose of a loop is not earlier than the loop."""
     (table,) = rows.values()
     columns = dict(table.numbers)
     if "before_ns" in columns:
@@ -148,8 +148,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
 
 
 def check(m: Loops, where: str) -> dict[str, Any]:
-    """Return copies of the validated fields of a pushed measurement. Raises InputError with the first invalid field.
-    ``where``: the measurement's name in messages."""
+    """Return the validated fields of ``m`` by name. Raises InputError for the first invalid field. ``where``: the name
+    of the measurement in error messages."""
     count = numbers(where, "age", m.age).size
     values = {name: within(where, LOOPS[name], getattr(m, name), (count,)) for name in ("age", *POSE, "score")}
     known = np.isfinite([values[name] for name in POSE])

@@ -14,12 +14,12 @@ from factors.loops.factor import LoopFactor
 from factors.se2 import Array
 
 UNKNOWN = "the earlier pose is not kept"
-LEAST_SCORE = 0.01  # smaller scores are replaced by this
+LEAST_SCORE = 0.01  # smaller scores are raised to this
 
 
 class LoopSensor(Sensor):
-    """Turns each loop closure into a robust factor on two poses. A loop is counted as ignored if the estimator does not
-    keep its earlier pose. Filters keep no earlier poses."""
+    """The loop closures of another program in a run. Each becomes a robust factor on two poses. A loop is ignored if
+    the estimator does not keep the earlier pose. Filters keep no earlier poses."""
 
     modality = "loops"
     links = True
@@ -29,7 +29,7 @@ class LoopSensor(Sensor):
         self._settings, self._diagnostics = settings, binding.diagnostics
 
     def observe(self, m: Loops, view: View) -> Iterator[Link]:
-        """Yield a factor on two poses for each loop."""
+        """Yield a factor on two poses for each loop closure in ``m`` that is not ignored."""
         settings = self._settings
         scores = np.where(np.isnan(m.score), 1.0, m.score)
         for age, x, y, heading, score in zip(m.age, m.x, m.y, m.heading, scores.tolist(), strict=True):
@@ -45,13 +45,13 @@ class LoopSensor(Sensor):
             if np.isfinite(x):
                 measured = np.array((x, y, heading))
                 sigmas = np.array((settings.sigma_position, settings.sigma_position, settings.sigma_heading))
-            # the limit of the residual [m] is proportional to sqrt(score), and sigma to 1/score: their ratio to score^1.5
+            # the rejected residual is proportional to sqrt(score), sigma to 1/score: their ratio to score^1.5
             scale = settings.robust * wider**-1.5
             factor = LoopFactor(measured, wider * sigmas, view.offset, earlier.offset, scale)
             yield Link(m.t, earlier.t, factor, factor.rows)
 
     def at_end(self, factor: Factor, width: float) -> Factor:
-        """Return the loop's factor with a robust loss that is ``width`` times as wide."""
+        """Return a copy of ``factor`` with the scale of the robust loss multiplied by ``width``."""
         return cast(LoopFactor, factor).widened(width)
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
@@ -65,12 +65,13 @@ def bind(binding: Binding) -> LoopSensor | None:
     return LoopSensor(binding, binding.setup.rig.find(LoopSettings) or LoopSettings())
 
 
-NEAR = 1.0  # m; a loop is correct if its distance differs from that in the reference by less than this
+NEAR = 1.0  # m; a loop is correct if the distance of its two poses differs from the reference by less than this
 GAP = 5.0  # s; longest interpolated gap between poses of the reference
 
 
 def summarize(log: Log) -> Summary:
-    """Return a summary: the number of loops, of loops with a relative pose, and of loops that agree with the reference."""
+    """Return the summary of the loop closures in a log: the numbers of all loops, of loops with a relative pose, and of
+    loops that agree with the reference."""
     stream = log.streams.get("loops")
     if not isinstance(stream, LoopStream) or not len(stream.t):
         return Summary()

@@ -1,4 +1,4 @@
-"""Calibration of wheel odometry: its constants and its noise are estimated from the motion of a reference over windows of time.
+"""Calibration of wheel odometry: constants and noise are estimated from the motion of a reference in time windows.
 
 The noise grows with distance, rotation and time (:class:`factors.odometry.model.Growth`). The covariance of a relative
 motion is linear in the variances per unit of distance, rotation and time. They are estimated as non-negative variance
@@ -40,27 +40,28 @@ from factors.se2 import Array
 
 LEAD = 1.0  # s; odometry must be complete for this time before a window, because the wheels respond with a lag
 WINDOW = 2.0  # s; length of the windows for the estimation of constants
-# m, m, rad; error of the reference over a window: lower bound of the residuals' standard deviations
+# m, m, rad; assumed errors of the reference over a window, the minimum of ``Windows.sigmas``
 REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
 MOVING = np.array((0.05, 0.1))  # m/s, rad/s; the robot moves in a window if it is faster than one of these
 MIN_WINDOWS = 15
 LENGTHS = (1.0, 3.0, 10.0)  # s; lengths of the windows for the estimation of noise
-BLACKOUT = 30.0  # s; length of the windows over which the noise is finally checked
+BLACKOUT = 30.0  # s; length of the windows to which the size of the noise is adapted
 MIN_BLACKOUTS = 10
 MOST_OUTLIERS = 0.05  # fraction of the windows; more outliers cause a warning
 ERRORS = {"along": "m", "lateral": "m", "heading": "rad"}
-FITS = 3  # number of fits of the noise; each one omits the outliers of the fit before
+FITS = 3  # number of fits of the noise; each fit omits the outliers of the previous fit
 GATE = chi_squared.quantile(0.9999, 3)  # a window with a larger squared Mahalanobis distance is an outlier
-_SMALLEST = 1e-8  # smaller variances per unit are set to zero
-# minimum standard deviations of wheels; rows: along, lateral, heading; columns: per distance, rotation, time.
-# A reference that depends on the odometry would give lower values.
+_SMALLEST = 1e-8  # smaller variances per metre, radian or second are set to zero
+# minimum noise of wheels; rows: along, lateral, heading; columns: per root of distance, rotation, time.
+# Fits are lower if the reference was computed with the odometry.
 FLOOR = np.array(((0.01, 0.0, 0.0), (0.005, 0.0, 0.0), (0.003, 0.005, 0.0)))
 
 
 @dataclass(frozen=True)
 class Windows:
-    """M windows of time in a log. ``begin`` and ``end`` (M,): their times [s]. ``motion`` (M, 3): the motion of the reference
-    from begin to end, in the robot frame at the begin. ``sigmas`` (M, 3): standard deviations of the residuals [m, m, rad]."""
+    """M time windows of a log. ``begin``, ``end`` (M,): their first and last time [s]. ``motion`` (M, 3): the motion of
+    the reference in each window, in the robot frame at its first time. ``sigmas`` (M, 3): standard deviations of the
+    errors of the odometry [m, m, rad]."""
 
     log: Log
     begin: Array
@@ -73,19 +74,19 @@ class Windows:
         return self.begin
 
     def states(self, model: OdometryModel) -> tuple[Array, Array]:
-        """Return the odometry states (M, 8) at the begin and at the end of each window."""
+        """Return the odometry states at the first time (M, 8) and at the last time (M, 8) of each window."""
         chain = integrated(self.log, model)
         return chain.states(self.begin), chain.states(self.end)
 
     def errors(self, model: OdometryModel) -> Array:
-        """Return the errors (M, 3) of the odometry over each window, as body-frame perturbations at its end [m, m,
-        rad]. The motion of the odometry, composed with the perturbation, equals the motion of the reference."""
+        """Return the errors (M, 3) of the odometry in each window [m, m, rad]. The error is the body-frame perturbation
+        of the final pose by odometry that gives the final pose of the reference."""
         start, end = self.states(model)
         odometry = se2.between(start[:, 1:4], end[:, 1:4])
         return se2.log(se2.between(odometry, self.motion))
 
     def residuals(self, settings: OdometrySettings) -> Array:
-        """Return :meth:`errors` (M, 3) in standard deviations."""
+        """Return :meth:`errors` (M, 3), divided by ``sigmas``. ``settings``: the settings of the odometry."""
         return self.errors(self.model(settings)) / self.sigmas
 
     def model(self, settings: OdometrySettings) -> OdometryModel:
@@ -93,14 +94,14 @@ class Windows:
         return odometry_model(self.log.rig.model_copy(update={"odometry": settings}))
 
     def covariances(self, model: OdometryModel) -> Array:
-        """Return the covariances (M, 3, 3) of :meth:`errors` according to the model."""
+        """Return the covariances (M, 3, 3) that ``model`` predicts for :meth:`errors`."""
         chain, no_constants = integrated(self.log, model), np.zeros(0)
         return chain.relatives(chain.states(self.begin), chain.states(self.end), no_constants)[1]
 
 
 def cut(log: Log, length: float) -> Windows:
-    """Cut a log into consecutive windows of ``length`` seconds. Windows without reference poses at both ends, or with
-    gaps in the odometry, are omitted."""
+    """Return the consecutive windows of ``length`` [s] of a log. Windows are omitted if the odometry has a gap or if
+    the reference has no pose at the first or last time."""
     assert log.reference is not None
     first, last = overlap(log)
     edges = np.arange(first + LEAD, last, length)
@@ -115,11 +116,11 @@ def cut(log: Log, length: float) -> Windows:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """The estimated noise of an odometry.
+    """The estimated noise of the odometry.
 
-    ``growth``: the noise by the name of the error (along, lateral, heading). ``outliers``: fraction of windows that are
-    outliers. ``widened``: a factor that is already included in ``growth``. It accounts for correlated errors of wheels,
-    which grow faster than a random walk. ``floored``: names of the errors whose noise was raised to its lower bound.
+    ``growth``: the noise of each error, by name ("along", "lateral", "heading"). ``outliers``: the fraction of windows
+    that are outliers. ``widened``: the factor by which ``growth`` was enlarged to explain the errors in long windows.
+    ``floored``: names of the errors for which the noise was raised to its lower bound.
     """
 
     growth: Mapping[str, Growth]
@@ -129,16 +130,16 @@ class NoiseFit:
 
 
 def with_noise(model: OdometryModel, sigmas: Array) -> OdometryModel:
-    """Return the model with the noise ``sigmas`` (3, 3): rows are longitudinal, lateral and heading errors, columns are
-    per root of distance, rotation and time."""
+    """Return a copy of ``model`` with other noise. ``sigmas`` (3, 3): standard deviations of the longitudinal, lateral
+    and heading errors (rows) per square root of distance, rotation and time (columns)."""
     along, lateral, heading = (Growth(*row) for row in sigmas.tolist())
     return replace(model, along=along, lateral=lateral, heading=heading)
 
 
 def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
-    """Fit the noise of the odometry ``model`` to the residuals of windows of several lengths, without outliers.
+    """Fit the noise of the odometry to its errors in windows of several lengths, without outliers.
 
-    The noise is then multiplied by a factor so that it explains the median error over windows of :data:`BLACKOUT` seconds.
+    The fitted noise is enlarged if errors in windows of :data:`BLACKOUT` seconds are larger than it predicts.
     """
     windows = [cut(log, length) for log in logs for length in LENGTHS]
     bases = np.concatenate([_bases(part, model) for part in windows])
@@ -160,8 +161,8 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
 
 
 def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
-    """Return the ratio of observed to modelled errors over windows of :data:`BLACKOUT` seconds. It is at least 1, and 1
-    if there are too few windows."""
+    """Return the ratio of observed to predicted errors in windows of :data:`BLACKOUT` seconds. A ratio below 1 is
+    replaced by 1, and so is the ratio of too few windows."""
     windows = [cut(log, BLACKOUT) for log in logs]
     residuals = np.concatenate([part.errors(model) for part in windows])
     if len(residuals) < MIN_BLACKOUTS:
@@ -172,9 +173,9 @@ def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
 
 
 def _bases(windows: Windows, model: OdometryModel) -> Array:
-    """Return covariances (M, 11, 3, 3) of the windows' errors for unit values of 11 variances. These are the variances
-    of longitudinal, lateral and heading errors per distance, rotation and time, then those of position and heading of
-    the reference."""
+    """Return the covariances (M, 11, 3, 3) of the errors in each window if one of 11 variances is 1 and all others 0.
+    The variances are those of longitudinal, lateral and heading errors, each per distance, rotation and time, then
+    those of position and heading of the reference."""
     start, end = windows.states(model)
     drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion
     drivers[:, 2] -= end[:, 7] - start[:, 7]
@@ -196,7 +197,7 @@ def _bases(windows: Windows, model: OdometryModel) -> Array:
 
 def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, Array]:
     """Return squared Mahalanobis distances (M,) of ``residuals`` (M, 3), and log-determinants (M,) of their
-    covariances. ``bases`` (M, 11, 3, 3): covariances for unit values of the ``variances`` (11,)."""
+    covariances. A covariance is the sum of ``variances`` (11,) times ``bases`` (M, 11, 3, 3), see :func:`_bases`."""
     floor = np.diag((MINIMUM_POSITION_VARIANCE, MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE))
     covariance = np.tensordot(bases, variances, (1, 0)) + floor
     solved = np.linalg.solve(covariance, residuals[..., None])[..., 0]
@@ -204,8 +205,8 @@ def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, A
 
 
 def _maximise(bases: Array, residuals: Array, weights: Array, start: Array) -> Array:
-    """Return the variances (11,) that maximise the Gaussian likelihood of ``residuals`` (M, 3) with ``weights`` (M,),
-    starting from ``start`` (11,). The optimisation is in the logarithms of the variances."""
+    """Return the variances (11,) that maximise the Gaussian likelihood of ``residuals`` (M, 3) with ``weights`` (M,).
+    ``start`` (11,): initial values. ``bases``: the result of :func:`_bases`."""
 
     def cost(logarithms: Array) -> float:
         squared, log_determinant = _squared(bases, residuals, np.exp(logarithms))
@@ -230,7 +231,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()
 
     def part(self, log: Log) -> Windows:
-        """Return windows of a log. Raises InputError if there are too few."""
+        """Return the windows of a log. Raises InputError if the log has fewer than :data:`MIN_WINDOWS`."""
         windows = cut(log, WINDOW)
         if len(windows.begin) < MIN_WINDOWS:
             raise InputError(
@@ -240,8 +241,8 @@ class OdometryCalibrator(ConstantsCalibrator):
         return windows
 
     def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
-        """Return the constants to estimate, with priors. Delay, lag and slowdown only exist for commanded velocities.
-        The priors of biases per time are narrower for wheels with encoders, which have hardly any such bias."""
+        """Return the constants to estimate, with priors. They depend on the data: commanded velocities also have delay,
+        lag and slowdown, and larger biases than wheel encoders."""
         commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
         by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s; prior sigmas
         priors = {
@@ -259,10 +260,10 @@ class OdometryCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Windows], settings: OdometrySettings
     ) -> tuple[Sequence[Windows], OdometrySettings]:
-        """Return the windows with robust standard deviations of their errors, separately for windows in motion and at rest.
+        """Return the windows with new ``sigmas``, and the unchanged ``settings``.
 
-        All windows in motion have equal standard deviations. The standard deviations of the noise model are not used,
-        because they would give windows with little motion too much weight.
+        The standard deviations are robust estimates from the errors, one for all windows in motion and one for all
+        windows at rest.
         """
         errors, moves = [], []
         for part in parts:
@@ -276,7 +277,7 @@ class OdometryCalibrator(ConstantsCalibrator):
         return weighted, settings
 
     def finished(self, parts: Sequence[Windows], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the result with the noise that remains after the calibration of the constants."""
+        """Return the result ``knowledge`` with the noise of the calibrated odometry, warnings and residuals."""
         noise = fit_noise([part.log for part in parts], odometry_model(rig))
         growth = {error: GrowthSettings.bounded(**asdict(g)) for error, g in noise.growth.items()}
         settings = rig.odometry.model_copy(update={"noise": OdometryNoise(**growth)})
@@ -296,7 +297,7 @@ class OdometryCalibrator(ConstantsCalibrator):
 
 
 def _residuals(windows: Windows, model: OdometryModel) -> Residuals:
-    """Return the errors of the odometry over the windows."""
+    """Return the errors of the odometry in each window, for plots."""
     start, end = windows.states(model)
     sigmas = np.sqrt(np.diagonal(windows.covariances(model), axis1=1, axis2=2))
     return Residuals(windows.log.name, ERRORS, windows.t, end[:, 4] - start[:, 4], windows.errors(model), sigmas)

@@ -15,11 +15,11 @@ from factorgraph_loc.sensors.odometry.measurement import IncrementStream, Veloci
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
-# a jump differs from the median of the rows before by LEAST_TURN [rad/s] or LEAST_SPEED [m/s], and is FACTOR times as large
+# a jump differs from the median of the previous rows by more than this [rad/s, m/s] and is FACTOR times as large
 LEAST_TURN, LEAST_SPEED = 6.0, 5.0
 FACTOR = 5.0
 HELD = 0.1  # s; assumed duration of the first increment, which is usually zero
-PREVIOUS = 3  # number of rows before a row that it is compared with
+PREVIOUS = 3  # a row is compared with this many previous rows
 
 
 Motion = VelocityStream | IncrementStream | YawRateStream
@@ -42,8 +42,8 @@ class Jump(NamedTuple):
 
 
 def jumps(stream: Motion) -> list[Jump]:
-    """Return the jumps of a stream of odometry or of a gyro in order of its rows. In a jump the speed or turn rate
-    differs from that of the rows before by more than a robot can accelerate."""
+    """Return the jumps in odometry or in the turn rates of a gyro, in the order of rows. A jump is a change of the
+    speed or turn rate between rows that is larger than a robot can accelerate."""
     if not len(stream.t):
         return []
     if isinstance(stream, YawRateStream):
@@ -52,7 +52,7 @@ def jumps(stream: Motion) -> list[Jump]:
         speeds, turns = stream.v, stream.w
     else:
         steps = np.diff(stream.t, prepend=stream.t[0] - HELD)
-        steps = np.maximum(steps, _usual(steps, HELD))  # two timestamps may be close by chance, which is no high speed
+        steps = np.maximum(steps, _usual(steps, HELD))  # timestamps that are too close must not look like high speed
         speeds, turns = np.hypot(stream.dx, stream.dy) / steps, stream.dtheta / steps
     kinds = (("turn rate", "rad/s", turns, LEAST_TURN), ("speed", "m/s", speeds, LEAST_SPEED))
     out = [
@@ -64,15 +64,15 @@ def jumps(stream: Motion) -> list[Jump]:
 
 
 def _outliers(rates: Array, least: float) -> Integers:
-    """Return the indices of ``rates`` (N,) that differ from the median of the rates before by more than ``least``, and
-    that are more than FACTOR times as large as this median."""
+    """Return the indices of those ``rates`` (N,) that exceed the median of the previous rates FACTOR times, and differ
+    from it by more than ``least``."""
     usual = _usual(rates, 0.0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 
 
 def _usual(values: Array, first: float) -> Array:
     """Return the median (N,) of the :data:`PREVIOUS` values before each of ``values`` (N,). ``first``: the value that
-    stands before all others."""
+    is assumed before the first one."""
     padded = np.concatenate((np.full(PREVIOUS, np.nan), values[:-1]))
     padded[PREVIOUS - 1] = first
     windows = np.lib.stride_tricks.sliding_window_view(padded, PREVIOUS)
@@ -80,8 +80,8 @@ def _usual(values: Array, first: float) -> Array:
 
 
 def jump_warning(kind: str, events: list[Jump], stream: Motion, end: str) -> Notice:
-    """Return a warning about the jumps ``events`` in a stream. ``kind``: the kind of the warning. ``end``: text that is
-    appended to it."""
+    """Return a warning about the jumps ``events`` in a stream. ``kind``: the identifier of the warning. ``end``: a text
+    that is appended to the warning."""
     first = events[0]
     sentence = (
         "the {what} of the {source} jumps to {rate:.1f} {unit} at t = {t:.3f} s, between rows with {previous:.2f} and "
@@ -94,10 +94,10 @@ def jump_warning(kind: str, events: list[Jump], stream: Motion, end: str) -> Not
 
 
 def without_jumps(stream: M, rules: RowRules, warnings: list[Notice]) -> M:
-    """Return the odometry, or the turn rates of a gyro, without jumps, and append a warning about them to ``warnings``.
-    If ``rules``, the rules for bad rows of the log, do not skip bad rows, the stream is returned unchanged.
+    """Remove the rows with jumps from odometry or from the turn rates of a gyro.
 
-    The velocity before a removed row is valid until the next row. The motion of a removed increment is marked as unknown.
+    Returns the remaining rows, and appends a warning to ``warnings``. If the log's rules for bad rows, ``rules``, are
+    to refuse them, the stream is returned unchanged. The motion of a removed increment is marked as unknown.
     """
     if rules.bad_rows == "refuse" or not (events := jumps(stream)):
         return stream

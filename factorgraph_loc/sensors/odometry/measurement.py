@@ -1,4 +1,4 @@
-"""Measurements of wheel odometry and gyro: their types, the columns of their files, and checks of pushed measurements."""
+"""Measurements of wheel odometry and gyro: their types, the columns of their files, and checks of live measurements."""
 
 from __future__ import annotations
 
@@ -54,9 +54,10 @@ class VelocityOdometry:
 
 @dataclass(frozen=True, slots=True)
 class IncrementOdometry:
-    """Motion since the previous measurement: ``dx``, ``dy`` [m] and ``dtheta`` [rad] in the robot frame at that measurement.
+    """Motion of the robot since the previous measurement.
 
-    ``unknown`` [s]: the time of unknown motion since the previous measurement.
+    ``dx``, ``dy`` [m], ``dtheta`` [rad]: the motion in the robot frame of the previous measurement. ``unknown`` [s]:
+    for how much of the time since then the motion was not measured.
     """
 
     sensor: ClassVar[str] = "odometry"
@@ -97,11 +98,7 @@ class VelocityStream(Stream):
 
 @dataclass(frozen=True)
 class IncrementStream(Stream):
-    """All increments of a log: ``dx``, ``dy`` [m] and ``dtheta`` [rad], each (N,): motion since the previous row, in
-    the robot frame at the previous row.
-
-    ``unknown`` (N,) [s]: the time of unknown motion since the previous row, by default 0.
-    """
+    """All odometry increments of a log. For the fields, each (N,), see :class:`IncrementOdometry`."""
 
     rank: ClassVar[int] = FLOOR
     kind: ClassVar[type[Any]] = IncrementOdometry
@@ -115,7 +112,7 @@ class IncrementStream(Stream):
             object.__setattr__(self, "unknown", np.zeros(len(self.t)))
 
     def begun_anew(self) -> IncrementStream:
-        """Return the stream with a first increment of zero. Use this for a log that begins after the robot was carried."""
+        """Return a copy with a first increment of zero. Use this if the robot was carried before the first row."""
         moves = np.arange(len(self.t)) > 0
         return replace(
             self, dx=self.dx * moves, dy=self.dy * moves, dtheta=self.dtheta * moves, unknown=self.unknown * moves
@@ -124,7 +121,7 @@ class IncrementStream(Stream):
 
 @dataclass(frozen=True)
 class YawRateStream(Stream):
-    """All turn rates ``w`` (N,) [rad/s] of a gyro in a log."""
+    """All turn rates ``w`` (N,) [rad/s] of a gyro in a log. Each row is valid until the next row."""
 
     rank: ClassVar[int] = TURN
     kind: ClassVar[type[Any]] = YawRate
@@ -132,7 +129,7 @@ class YawRateStream(Stream):
 
 
 class Increments(Intake):
-    """Checks that pushed increments are in order of time."""
+    """Checks that the increments that a program passes to the live localizer are in order of time."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         self._newest = -math.inf
@@ -173,7 +170,7 @@ IMU = Table(
     (STAMP, within("w", RATE, FASTEST_TURN, "turn rate of a gyro")),
     stream="factorgraph_loc.sensors.odometry.measurement:YawRateStream",
 )
-# distances by wheel counters, which are converted to increments
+# columns of foreign files with wheel distances; a reader converts them to increments
 WAYS = Table(
     "odometry",
     (
@@ -181,7 +178,7 @@ WAYS = Table(
         *(within(side, LENGTH, 1e9, "distance that the wheel has travelled so far") for side in ("left", "right")),
     ),
 )
-# measured speeds or turns of wheels, which are converted to velocities or increments
+# columns of foreign files with wheel speeds or rotations; a reader converts them to velocities or increments
 WHEELS = Table(
     "odometry",
     (
@@ -194,16 +191,16 @@ WHEELS = Table(
 
 
 def since_skipped(t_ns: Integers, resumed: NDArray[np.bool_]) -> Array:
-    """Return the times (N,) [s] of unknown motion in increments at N timestamps [ns] after skipped rows.
+    """Return the durations (N,) [s] of unknown motion before each of N rows of odometry.
 
-    ``resumed`` (N,): True for each row that follows a skipped row. Its time is that since the row before; the time of
-    other rows is 0.
+    ``t_ns`` (N,): the timestamps of the rows [ns]. ``resumed`` (N,): True for rows that follow a skipped row. The
+    motion before these rows is unknown since the previous timestamp. All other durations are 0.
     """
     return np.asarray(resumed * np.maximum(np.diff(t_ns, prepend=t_ns[:1]), 0) / 1e9)
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of the table of odometry. The column ``unknown`` is left out if it is 0 throughout."""
+    """Return the columns of the table "odometry" by name. The column ``unknown`` is omitted if all its values are 0."""
     fields = {name: values for name, values in columns_of(stream).items() if name not in ("t", "unknown")}
     if isinstance(stream, IncrementStream) and stream.unknown.any():
         fields["unknown"] = stream.unknown
@@ -211,8 +208,8 @@ def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of velocities or increments of a log. Increments with equal timestamps are composed. Of
-    velocities with equal timestamps the last is kept."""
+    """Return the rows of the table "odometry" as a stream of velocities or increments. If timestamps are equal,
+    increments are composed, and the last velocity is kept. ``rows``: the rows by table name."""
     table = rows["odometry"]
     if "dx" not in table.numbers:
         return stream_of(VELOCITIES, table, reading.t0_ns, reading.warnings)

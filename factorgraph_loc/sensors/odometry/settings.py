@@ -10,7 +10,7 @@ from factors.odometry.model import PARAMETERS, Growth
 
 
 class GrowthSettings(FileModel):
-    """Standard deviation of an error that grows with the square root of distance, rotation and time."""
+    """Standard deviation of an error of odometry. Its square grows with distance, rotation and time."""
 
     per_distance: Noise = 0.0
     """standard deviation per sqrt(m) travelled"""
@@ -35,7 +35,7 @@ class OdometryNoise(FileModel):
 
 
 class OdometryUncertainty(FileModel):
-    """Standard deviations of the odometry's constants before a run. A constant is estimated if its value is above 0."""
+    """Standard deviations of the odometry's calibration constants before a run. Constants above 0 are estimated."""
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """relative standard deviation of the scale of distances"""
@@ -48,8 +48,8 @@ class OdometryUncertainty(FileModel):
 
 
 class DifferentialDrive(FileModel):
-    """Geometry of two driven wheels, for logs that contain rotations or distances of the wheels. It converts them to
-    odometry, which ``scale_distance`` and ``scale_rotation`` then correct."""
+    """Geometry of two driven wheels. Required if the log contains rotations or distances of the wheels instead of the
+    motion of the robot."""
 
     radius: Annotated[float, Field(gt=0.0, le=5.0), InUnit("m")] | None = None
     """radius of the wheels; not needed if the log contains distances of the wheels"""
@@ -57,8 +57,8 @@ class DifferentialDrive(FileModel):
     """distance between the wheels"""
 
     def corrected(self, scale_distance: float, scale_rotation: float) -> tuple[float | None, float]:
-        """Return radius (or None) and track width [m] after correction. ``scale_distance``, ``scale_rotation``: the
-        scales of the odometry, as in :class:`OdometrySettings`."""
+        """Return the radius (or None) and the track width [m] with which the odometry needs no scales.
+        ``scale_distance``, ``scale_rotation``: the present scales, as in :class:`OdometrySettings`."""
         radius = None if self.radius is None else self.radius * scale_distance
         return radius, self.track * scale_distance / scale_rotation
 
@@ -100,8 +100,8 @@ class OdometrySettings(SensorSettings):
 
 
 class ImuSettings(SensorSettings):
-    """Settings of a gyro. Its turn rate replaces the rotation of the wheels if an estimator uses the sensor ``imu``. A
-    rig without this section has the defaults."""
+    """Settings of a gyro. If a run uses the sensor "imu", the turn rate of the gyro replaces the rotation of the
+    wheels. A rig without this section has the defaults."""
 
     bias: Rate = 0.0
     """turn rate reported at rest"""

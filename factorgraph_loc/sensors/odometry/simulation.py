@@ -27,22 +27,22 @@ DESCRIPTION = (
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the wheel odometry of a simulated drive."""
+    """Return the simulated wheel odometry of a drive."""
     return Simulated({"odometry": wheel_odometry(ride.truth, int(ride.rng("odometry").integers(2**32)))})
 
 
 def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
-    """Simulate odometry along ``reference``. The first row has no motion, at the time of the first pose.
+    """Return simulated odometry along ``reference`` at 10 Hz. The first row has no motion.
 
-    With increments (dx, dy, dyaw) of the reference over 0.1 s, in the body frame, and ds = length of (dx, dy):
+    (dx, dy, dyaw) are the increments of the reference in the body frame, ds is the length of (dx, dy):
 
     - dx' = (1 + s) dx + 0.01 sqrt(ds) n1
     - dy' = (1 + s) dy + 0.005 sqrt(ds) n2
     - dyaw' = (1 + g) dyaw + b ds + radians(1.5) sqrt(ds) n3
 
-    The scales s, g ~ N(0, 0.02) and the drift b ~ N(0, radians(1) per m) are constant; n1, n2, n3 ~ N(0, 1) differ in each row.
-    They are drawn from ``default_rng(seed)`` in the order s, b, g, then n1 and n2 of each row, then n3 of each row. Gaps of the
-    reference above 60 s have no rows. The row after such a gap contains the whole motion during the gap.
+    The scales s, g ~ N(0, 0.02) and the drift b ~ N(0, radians(1) per m) are constant. n1, n2, n3 ~ N(0, 1) differ
+    between rows. ``default_rng(seed)`` draws s, b, g, then n1 and n2 of each row, then n3 of each row. Gaps above 60 s
+    in the reference have no rows. The row after such a gap contains the whole motion during the gap.
     """
     t = _grid(reference.t)
     count = len(t) - 1
@@ -62,8 +62,7 @@ def wheel_odometry(reference: Trajectory, seed: int) -> IncrementStream:
 
 
 def _grid(stamps: Array) -> Array:
-    """Return times (N,) at 10 Hz from the first to the last of ``stamps``. Long gaps are omitted, because a clock may
-    jump by days."""
+    """Return times (N,) at 10 Hz from the first to the last of ``stamps``, without times in long gaps."""
     long = np.flatnonzero(np.diff(stamps) > TICK_GAP)
     begins, ends = stamps[np.append(0, long + 1)], stamps[np.append(long, -1)]
     first = np.ceil((begins - stamps[0]) * RATE - 1e-6).astype(int)

@@ -20,11 +20,11 @@ from factors import se2
 from factors.se2 import Array
 
 WINDOW = 0.2  # s; minimum time over which a rate is averaged
-MOVES = 0.03  # rad/s, m/s; a signal moves if the root mean square of its rate is at least this
-ALIKE = 0.6  # two signals of the same motion have at least this correlation
-DEGREES = (20.0, 150.0)  # bounds of the ratio of two rates if one of them is in degrees
+MOVES = 0.03  # rad/s, m/s; minimum root mean square of the rates for a comparison
+ALIKE = 0.6  # minimum correlation of two signals that measure the same motion
+DEGREES = (20.0, 150.0)  # ratios of turn rates between these bounds mean that one rate is in degrees
 CHORD = 2.0  # s; distances and rotations are compared over time intervals of this length
-SCALED = 0.1  # a larger relative difference of two scales causes a warning
+SCALED = 0.1  # a ratio of reference to odometry that differs from 1 by more than this causes a warning
 # a reference stands still if it moves less than STANDS [m] while the odometry drives more than DRIVES [m] in STILL [s]
 STANDS, DRIVES = 0.02, 0.5
 STILL = 5.0
@@ -34,15 +34,15 @@ COVERED = 0.9  # a reference should cover at least this fraction of a log's time
 
 @dataclass(frozen=True)
 class RateMatch:
-    """The comparison of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``:
-    values of the second signal divided by values of the first signal."""
+    """The relation of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``: the
+    factor by which the second signal is larger than the first, negative if the signs differ."""
 
     shift: float
     slope: float
 
 
 def summarize(log: Log) -> Summary:
-    """Return warnings about the odometry of a log, and the ratios of distance and rotation of the reference to the odometry."""
+    """Return the summary of the odometry in a log: warnings, and ratios of the reference's motion to the odometry."""
     ratios, still = against_reference(log)
     covered = _coverage(log)
     problems = [*motion_problems(log), *still]
@@ -63,11 +63,11 @@ def _jumps(log: Log) -> list[Notice]:
 
 
 def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
-    """Compare reference and odometry. Returns ratios and warnings.
+    """Compare the reference with the odometry. Returns a dict of ratios and a list of warnings.
 
-    The ratios ``travels`` and ``turns`` are distance and rotation of the reference divided by those of the odometry, as
-    corrected by the rig. They are least-squares estimates over time intervals of :data:`CHORD` seconds. A ratio is
-    missing without motion. A warning states that the reference stands still while the odometry drives.
+    ``travels``, ``turns``: the distance and the rotation of the reference, divided by those of the odometry. The dict
+    lacks ratios for which the robot moves too little. The only warning is that the reference stands still while the
+    odometry drives.
     """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
@@ -86,15 +86,15 @@ def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
 
 
 def _ratio(theirs: Array, ours: Array) -> float | None:
-    """Return the least-squares ratio of ``theirs`` (N,), NaN if unknown, to ``ours`` (N,). Returns None without motion."""
+    """Return the least-squares ratio of ``theirs`` (N,) to ``ours`` (N,), or None if ``ours`` are too small."""
     known = np.isfinite(theirs)
     moved = float(ours[known] @ ours[known])
     return float(ours[known] @ theirs[known]) / moved if moved > 1.0 else None
 
 
 def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
-    """Return warnings about ratios that differ from 1. Rotations of another sign or unit are left to
-    :func:`motion_problems`."""
+    """Return warnings about ratios that are not near 1. Ratios of ``turns`` that suggest another sign or unit are
+    skipped, because :func:`motion_problems` warns about them."""
     keys = {"travels": "scale_distance", "turns": "scale_rotation"}
     sentence = "the reference {moves} {ratio:.2f} times as much as the odometry: set odometry.{setting}, or run fgloc calibrate"
     return [
@@ -105,8 +105,8 @@ def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
 
 
 def _standstill(t: Array, ours: Array, theirs: Array) -> list[Notice]:
-    """Return a warning if the reference stands still while the odometry drives. ``ours``, ``theirs`` (N, 2): positions
-    [m] by odometry and reference at times ``t`` (N,) [s]."""
+    """Return a list with a warning if the reference stands still while the odometry drives. ``ours``, ``theirs``
+    (N, 2): positions [m] by odometry and by reference at the times ``t`` (N,) [s]."""
     steps = round(STILL / (CHORD / 4.0))
     stuck = np.flatnonzero((_chords(theirs, steps) < STANDS) & (_chords(ours, steps) > DRIVES))
     if not len(stuck):
@@ -117,13 +117,13 @@ def _standstill(t: Array, ours: Array, theirs: Array) -> list[Notice]:
 
 
 def _chords(places: Array, steps: int) -> Array:
-    """Return the distances (N - steps,) between each of the positions (N, 2) and the position ``steps`` rows later."""
+    """Return the distances (N - steps,) between positions ``steps`` rows apart. ``places`` (N, 2): the positions."""
     return np.asarray(np.hypot(*(places[steps:] - places[:-steps]).T))
 
 
 def motion_problems(log: Log) -> list[Notice]:
-    """Return warnings if the gyro or the reference contradicts the odometry in time, sign or unit. Only the longest
-    part of the log without a long gap is compared."""
+    """Return warnings if the gyro or the reference seems to have another clock, sign or unit than the odometry. Only
+    the longest part of the log without a long gap is compared."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return []
@@ -154,7 +154,7 @@ def motion_problems(log: Log) -> list[Notice]:
 
 
 def _longest(t: Array) -> tuple[float, float]:
-    """Return start and end [s] of the longest part of timestamps ``t`` (N,) without a gap above
+    """Return the first and the last time [s] of the longest part of ``t`` (N,) without a gap above
     :data:`~factorgraph_loc.model.scoring.TICK_GAP`."""
     parts = np.split(t, np.flatnonzero(np.diff(t) > TICK_GAP) + 1)
     longest = max(parts, key=lambda part: float(part[-1] - part[0]))
@@ -162,10 +162,10 @@ def _longest(t: Array) -> tuple[float, float]:
 
 
 def match(rates: Array, delayed: Array) -> RateMatch | None:
-    """Estimate delay and slope of ``delayed`` (N,) relative to ``rates`` (N,), both sampled every ``STEP`` seconds.
+    """Estimate the delay of ``delayed`` (N,) relative to ``rates`` (N,), and the ratio of the two signals.
 
-    Returns None if the signals are uncorrelated. The slope is negative if the signs differ. The shift is zero if it
-    hardly improves the correlation, or if it is not observable because the rates are constant.
+    Both are sampled every ``STEP`` seconds. Returns None if they are uncorrelated. The delay is 0 if it hardly improves
+    the correlation, or if the rates are nearly constant.
     """
     if np.count_nonzero(np.isfinite(rates) & np.isfinite(delayed)) < FEWEST:
         return None
@@ -181,7 +181,8 @@ def match(rates: Array, delayed: Array) -> RateMatch | None:
 
 
 def _correlation(rates: Array, signal: Array, shift: int) -> tuple[float, float]:
-    """Return correlation and slope between ``rates`` and ``signal``, ``shift`` steps later. Zeros without motion."""
+    """Return the correlation and the slope between ``rates`` and the values of ``signal`` that are ``shift`` rows
+    later. Both are 0 if the robot hardly moves."""
     a = rates[max(0, -shift) : len(rates) - max(0, shift)]
     b = signal[max(0, shift) : len(signal) - max(0, -shift)]
     both = np.isfinite(a) & np.isfinite(b)
@@ -193,8 +194,8 @@ def _correlation(rates: Array, signal: Array, shift: int) -> tuple[float, float]
 
 
 def _compared(sensor: str, name: str, compared: RateMatch | None) -> list[Notice]:
-    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``compared``: its comparison with the
-    odometry. ``sensor``: the section of the rig whose time_offset corrects the clock."""
+    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``compared``: the relation between
+    odometry and signal. ``sensor``: the section of the rig with the ``time_offset`` to set."""
     if compared is None:
         return []
     lines = []
@@ -207,15 +208,15 @@ def _compared(sensor: str, name: str, compared: RateMatch | None) -> list[Notice
     elif DEGREES[0] < 1.0 / size < DEGREES[1]:
         lines.append(notice("degrees", IN_DEGREES, "the odometry", 1.0 / size, name))
     if compared.shift:
-        # a late clock needs a negative offset; if the reference is late, the odometry is early and needs a positive offset
+        # time_offset is added to timestamps: it is negative for a late gyro, positive for odometry before the reference
         offset = -compared.shift if sensor == "imu" else compared.shift
         lines.append(interfaces.line(name, compared.shift, "the odometry", sensor, offset))
     return lines
 
 
 def _rates(values: Array, window: float) -> Array:
-    """Return the rates of change (N,) of values (N,), averaged over a ``window`` [s] around each time. They are NaN at
-    the ends."""
+    """Return the rates of change (N,) of ``values`` (N,), averaged over a ``window`` [s] around each time. The first
+    and last rates are NaN."""
     half = max(1, round(window / STEP / 2.0))
     out = np.full(len(values), np.nan)
     if len(values) > 2 * half:
@@ -237,6 +238,6 @@ def _coverage(log: Log) -> list[Notice]:
     if end - begin >= COVERED * (last - first):
         return []
     if end <= begin:
-        return [notice("no_overlap", "the reference has no pose while there is odometry")]
+        return [notice("no_overlap", "the reference trajectory and the odometry do not overlap in time")]
     sentence = "the reference covers {begin:.1f} to {end:.1f} s of the odometry's {first:.1f} to {last:.1f} s"
     return [notice("short_reference", sentence, begin, end, first, last)]

@@ -1,7 +1,7 @@
-"""Localization from measured positions alone, at an unknown start or after a kidnapping.
+"""Global localization from measured positions alone, at an unknown start or after the robot was carried.
 
 The positions of the last minute are aligned with the path of the odometry. The heading becomes known when the robot has
-travelled far enough. A track is rejected if all positions of the last ten seconds contradict it and agree on another pose.
+travelled far enough. An estimated pose is rejected if the positions of the last ten seconds agree on another pose.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from factors.robust import geman_mcclure_weight
 from factors.se2 import Array
 from factors.update import GATE
 
-DURATION, INTERVAL = 60.0, 0.5  # s; time span of the positions that are aligned, and minimum time between them
-FEWEST, SHARE = 5, 0.8  # a pose needs at least FEWEST positions, and the fraction SHARE of them within the gate
+DURATION, INTERVAL = 60.0, 0.5  # s; age of the oldest position that is used, and minimum time between positions
+FEWEST, SHARE = 5, 0.8  # a pose needs at least FEWEST positions, of which the fraction SHARE are inliers
 HEADING = 0.15  # rad; largest standard deviation of a known heading
-WIDENINGS = (64.0, 16.0, 4.0, 1.0, 1.0, 1.0)  # factor of the loss's scale in each iteration
-BEYOND = 2.0  # a position contradicts the track if its squared innovation exceeds this multiple of the gate
-CONTRADICTED = 10.0  # s; the track is suspicious if positions contradict it for so long; wrong fixes last less
-SEARCH_INTERVAL = 1.0  # s between alignments while the track is suspicious
+WIDENINGS = (64.0, 16.0, 4.0, 1.0, 1.0, 1.0)  # multiplies the scale of the robust loss in each iteration
+BEYOND = 2.0  # a position contradicts the estimated pose if its squared innovation exceeds BEYOND * GATE
+CONTRADICTED = 10.0  # s; positions that contradict the pose for this time mean a wrong pose and not wrong positions
+SEARCH_INTERVAL = 1.0  # s between searches while positions contradict the pose
 
 
 class Row(NamedTuple):
-    """A measured position: its ``factor`` on the pose at its time, and the ``odometry`` state at its time."""
+    """A measured position: the ``odometry`` state at its time, and its ``factor`` on the pose at its time."""
 
     odometry: ChainState
     factor: PositionFactor
 
 
 class PositionFinder:
-    """Finds the pose by measured positions, without a prediction. It implements :class:`~factorgraph_loc.sensors.base.Finder`.
+    """Global localization by measured positions. It implements :class:`~factorgraph_loc.sensors.base.Finder`.
 
-    ``observation``: a function that returns the observation of a measurement, on the pose at its time.
+    ``observation``: a function from a measurement to its observation, which depends on the pose at the same time.
     """
 
     at_once = False
@@ -61,7 +61,7 @@ class PositionFinder:
 
     @property
     def suspicious_since(self) -> float | None:
-        """The time [s] since which all positions contradict the track, or None."""
+        """The time [s] since which all positions contradict the estimated pose, or None if this time is too short."""
         if not self._beyond or not all(beyond for _, beyond in self._beyond):
             return None
         first, last = self._beyond[0][0], self._beyond[-1][0]
@@ -97,7 +97,7 @@ class PositionFinder:
         return since if positive.squared(error, world) > BEYOND * GATE else None
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return samples (N, 3) of the pose at the last position. Headings are uniform until the heading is known."""
+        """Return ``count`` random poses (N, 3) at the time of the last position. An unknown heading is uniform."""
         if not self.hypotheses:
             return np.empty((0, 3))
         (mode,) = self.hypotheses
@@ -110,8 +110,8 @@ class PositionFinder:
         self._beyond.clear()
 
     def _add(self, odometry: ChainState, factor: PositionFactor) -> None:
-        """Store a position: its ``factor``, and the ``odometry`` state at its time. A late position is skipped. Of
-        positions that are closer in time than INTERVAL, only the last is kept."""
+        """Store a position, see :class:`Row`. Late positions are skipped. A position replaces the previous one if less
+        than INTERVAL has passed."""
         self._robust = factor.robust
         if self._rows and odometry.t <= self._rows[-1].odometry.t:
             return
@@ -122,8 +122,8 @@ class PositionFinder:
             self._rows.popleft()
 
     def _align(self, now: ChainState) -> None:
-        """Estimate the pose at the odometry state ``now``: align the path of the odometry with the positions, by least
-        squares with a robust loss that narrows from iteration to iteration."""
+        """Align the path of the odometry with the positions by robust least squares. Store the pose at the odometry
+        state ``now`` in ``hypotheses``, and in ``best`` if it is unambiguous."""
         rows = list(self._rows)
         if self.start is not None:
             known = self.start.prior
@@ -150,8 +150,7 @@ class PositionFinder:
         self.best = PosePrior(now.t, pose, covariance) if agree and covariance[2, 2] < HEADING**2 else None
 
     def _on(self, now: ChainState, row: Row) -> PositionFactor:
-        """Return the factor of the earlier position ``row``, changed to depend on the pose at ``now``. The factor's offset is the
-        inverse of the motion since the position, with the covariance in the body frame of the earlier pose."""
+        """Return the factor of the position ``row`` as a function of the pose at the odometry state ``now``."""
         step = self._motion.relative(row.odometry, now)
         carried = se2.adjoint(step.delta)
         back = Increment(se2.inverse(step.delta), carried @ step.covariance @ carried.T, step.duration, step.still)

@@ -69,14 +69,14 @@ POSITIONS_ON_EARTH = Table(
 )
 # the ellipsoid of WGS 84: its semi-major axis [m], and the square of its eccentricity
 MAJOR, ECCENTRICITY = 6378137.0, 6.69437999014e-3
-# m^2; variances outside of these bounds are placeholders, such as 0, 9999 and 1e308
+# m^2; receivers report variances outside of these bounds, such as 0 or 9999, if the variance is unknown
 PLAUSIBLE = (1e-6, 2500.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A measured position at the time ``t`` [s]: ``x``, ``y`` [m] in the world. ``var_x``, ``cov_xy``, ``var_y`` [m^2]:
-    the elements of its covariance, NaN if unknown."""
+    """A measured position ``x``, ``y`` [m] in the world frame at the time ``t`` [s]. ``var_x``, ``cov_xy``, ``var_y``
+    [m^2]: the elements of its covariance, NaN if unknown."""
 
     sensor: ClassVar[str] = "position"
     modality: ClassVar[str] = "position"
@@ -104,8 +104,8 @@ class PositionStream(Stream):
 
 
 def are_plausible(var_x: Any, cov_xy: Any, var_y: Any) -> Any:
-    """True for covariances that are possible, and False for placeholders and NaN. The elements [m^2] are numbers or
-    arrays (N,)."""
+    """Return True for plausible covariances, False for placeholders and NaN. The arguments are the elements [m^2] of
+    one covariance, or arrays (N,) of the elements of N covariances."""
     low, high = PLAUSIBLE
     ranges = (low <= var_x) & (var_x <= high) & (low <= var_y) & (var_y <= high)
     return ranges & (np.abs(cov_xy) < np.sqrt(np.abs(var_x)) * np.sqrt(np.abs(var_y)))
@@ -124,17 +124,18 @@ class PositionSettings(SensorSettings):
     """scale of the Geman-McClure loss, in standard deviations"""
 
     def covariance(self, m: Position) -> Array:
-        """Return the covariance (2, 2) [m^2] of a measured position: the covariance in the measurement if it is
-        plausible, otherwise the square of the setting ``sigma`` for x and y."""
+        """Return the covariance (2, 2) [m^2] of a measured position. If the covariance in the measurement is
+        implausible, the variances of x and y are ``sigma`` squared."""
         if are_plausible(m.var_x, m.cov_xy, m.var_y):
             return np.array(((m.var_x, m.cov_xy), (m.cov_xy, m.var_y)))
         return self.sigma**2 * np.eye(2)
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the stream of positions of a log. Missing covariances become NaN.
+    """Return the positions of a log as a stream. ``rows``: the rows by table name. Missing covariances are NaN.
 
-    Latitudes and longitudes become metres to the east and north of the first position. All sensors of a log share this origin.
+    Latitudes and longitudes become metres to the east and north of the first position. This origin is the same for all
+    sensors of a log.
     """
     (table,) = rows.values()
     if "latitude" in table.numbers:
@@ -158,8 +159,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
 
 
 def _with_fix(table: TableRows, warnings: list[Notice]) -> TableRows:
-    """Return the rows of a table without those at latitude 0 and longitude 0, which receivers report while they have no
-    fix. Appends a warning about these rows to ``warnings``."""
+    """Return the rows with a GNSS fix. Without a fix, receivers report latitude 0 and longitude 0. A warning about such
+    rows is appended to ``warnings``."""
     none = (table.numbers["latitude"] == 0.0) & (table.numbers["longitude"] == 0.0)
     if not none.any() or none.all():
         return table

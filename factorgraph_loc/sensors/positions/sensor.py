@@ -20,11 +20,11 @@ from factors.update import Correction
 
 @dataclass(frozen=True)
 class PositionObservation(ResidualObservation):
-    """The observation of one measured position. Its log-likelihood is vectorised over all particles."""
+    """The observation of one measured position. The method ``log_likelihood`` is vectorised over all poses."""
 
     @property
     def factor(self) -> PositionFactor:
-        """The factor of the position on the pose."""
+        """The only factor of the observation."""
         return cast(PositionFactor, self.terms[0].factor)
 
     def log_likelihood(self, poses: Array, values: Mapping[str, Array]) -> Array:
@@ -32,8 +32,8 @@ class PositionObservation(ResidualObservation):
 
 
 class PositionSensor(Sensor):
-    """The position sensor of a run. A position that equals the previous one in all digits is counted as ignored,
-    because it has no new information: the system repeats its last result."""
+    """A position sensor in a run. A position that equals the previous one in all digits is ignored, because the system
+    only repeats its last result."""
 
     modality = "position"
 
@@ -45,8 +45,8 @@ class PositionSensor(Sensor):
         self.finder = self._finder = PositionFinder(self.observation, binding.motion)
 
     def observation(self, m: Position, offset: Increment | None = None) -> PositionObservation:
-        """Return the observation of a measurement. ``offset``: the motion from the pose that the observation depends on
-        to the measurement, None if the times are equal."""
+        """Return the observation of the measurement ``m``. ``offset``: the motion from the pose that the observation
+        must depend on to the time of ``m``, or None if the times are equal."""
         position, covariance = np.array((m.x, m.y)), self._settings.covariance(m)
         factor = PositionFactor(position, covariance, self._arm, self._settings.robust, offset)
         return PositionObservation(m.t, (Term(factor, (), 2),))
@@ -60,7 +60,7 @@ class PositionSensor(Sensor):
         yield self.observation(m, view.offset)
 
     def judge(self, observation: PositionObservation, correction: Correction, view: View) -> bool:
-        """Return True: no position is rejected. Record its innovation and its residuals [m] in the diagnostics."""
+        """Return True, because no position is rejected. Record innovation and residuals [m] in the diagnostics."""
         self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
         (error,) = -observation.factor.errors(view.pose[None])
         self._diagnostics.add_residuals(f"{self.name}.x", [float(error[0])])

@@ -13,13 +13,13 @@ from factors.se2 import Array
 
 MAX_GAP = 1.0  # s; longest interpolated gap between poses of the reference
 SPAN = 10.0  # s; positions and odometry are compared over time spans of this length
-SMALL = 0.1  # a smaller ratio of travelled distances, positions to odometry, causes a warning
-DRIVEN = 1.0  # m; time spans with less motion by odometry are not compared
+SMALL = 0.1  # a smaller ratio of the distance by positions to the distance by odometry causes a warning
+DRIVEN = 1.0  # m; time spans in which the robot drives less are not compared
 
 
 def summarize(log: Log) -> Summary:
-    """Return the number of positions and their median error against the reference, with warnings about their unit,
-    their covariances and repeated positions."""
+    """Return the summary of the positions in a log: their number, their median error against the reference, and
+    warnings about implausible covariances, repeated positions and a wrong unit."""
     stream, settings = log.streams.get("position"), log.rig.find(PositionSettings)
     if not isinstance(stream, PositionStream) or not len(stream.t):
         return Summary()
@@ -51,9 +51,9 @@ def summarize(log: Log) -> Summary:
 
 
 def _ratio(log: Log, t: Array, places: Array) -> float | None:
-    """Return the median, over spans of time, of the distance by positions divided by the distance by odometry.
+    """Return the median ratio, over time spans, of the distance by positions to the distance by odometry.
 
-    ``places`` (N, 2): the positions at the times ``t`` (N,). Returns None if the robot hardly moves.
+    ``places`` (N, 2): the measured positions [m] at the times ``t`` (N,) [s]. Returns None if the robot hardly moves.
     """
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
