@@ -43,12 +43,12 @@ class Estimator(Protocol):
         """Process one measurement. A measurement that is late by more than the setting ``max_delay`` is counted and ignored."""
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the time of the newest measurement, from all measurements so far. If ``t`` [s] is later, the pose
-        is predicted to ``t`` by odometry."""
+        """Return the pose at the time of the newest measurement, from all measurements so far. If ``t`` [s] is later,
+        the pose is predicted to ``t`` by odometry."""
 
     def belief(self, t: float | None = None) -> Belief:
-        """The whole probability distribution of the pose, at the time of :meth:`estimate`. It has Gaussian modes, and
-        particles if the estimator uses them."""
+        """Return the whole probability distribution of the pose, at the time of :meth:`estimate`. It has Gaussian
+        modes, and particles if the estimator uses them."""
 
     def learnt(self) -> Learnt:
         """The estimates of sensor constants and landmarks from all measurements, consistent with :meth:`trajectory`."""
@@ -62,7 +62,7 @@ class ConcludingEstimator(Protocol):
     """An estimator that computes its final trajectory separately, after the last measurement. This may add diagnostics."""
 
     def final_diagnostics(self) -> Diagnostics:
-        """The diagnostics of the run and of the final solution."""
+        """Return the diagnostics of the run and of the final solution."""
 
 
 @runtime_checkable

@@ -85,13 +85,13 @@ class Cloud:
         return replace(self, log_weights=log_weights), float(weighed[heaviest] - log_weights[heaviest])
 
     def thinned(self, count: int) -> Cloud:
-        """The cloud with only every k-th particle, so that about ``count`` particles remain."""
+        """Return the cloud with only every k-th particle, so that about ``count`` particles remain."""
         some = slice(None, None, max(1, len(self.poses) // count))
         weights = normalised(self.log_weights[some])
         return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
 
     def density(self) -> tuple[Cloud, Array]:
-        """A kernel density with the same moments as the particles.
+        """Return a kernel density with the same moments as the particles.
 
         The poses are shrunk towards their mean, and each gets a Gaussian kernel (Liu, West, in "Sequential Monte Carlo Methods in
         Practice", 2001, eq. 10.3.8), whose width depends on the number of particles (:func:`silverman`). The sensor constants are
@@ -137,7 +137,7 @@ class Cloud:
         )
 
     def modes(self) -> tuple[Mode, ...]:
-        """The modes, in order of decreasing weight, each with the moments of the particles around its centre."""
+        """Return the modes, in order of decreasing weight, each with the moments of the particles around its centre."""
         weights = self.weights
         modes: list[Mode] = []
         _, which = np.unique(cell_numbers(self.poses, CELL), return_inverse=True)
@@ -229,7 +229,7 @@ def systematic(weights: Array, rng: np.random.Generator, count: int | None = Non
 
 
 def around(poses: Array, middle: Array) -> NDArray[np.bool_]:
-    """A mask (N,) of the poses (N, 3) that belong to a mode with the centre ``middle`` (3,)."""
+    """Return a mask (N,) of the poses (N, 3) that belong to a mode with the centre ``middle`` (3,)."""
     difference = np.abs(poses - middle)
     difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
     return np.asarray(np.all(difference < REACH, axis=1))
@@ -244,7 +244,8 @@ def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
 
 
 def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
-    """The largest exponent of a likelihood, at most ``left``, after which the effective number of particles is still ``enough``.
+    """Return the largest exponent of a likelihood, at most ``left``, after which the effective number of particles is
+    still ``enough``.
 
     ``log_weights`` (N,): the particles' log-weights. ``likelihood`` (N,): their log-likelihoods. The result is at least
     :data:`LEAST`, so that a correction has at most a few hundred steps.
@@ -279,7 +280,7 @@ def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
 
 
 def effective_size(log_weights: Array) -> float:
-    """The effective number of particles with normalised log-weights (N,) (Kong, Liu, Wong, 1994)."""
+    """Return the effective number of particles with normalised log-weights (N,) (Kong, Liu, Wong, 1994)."""
     return float(1.0 / np.sum(np.exp(2.0 * log_weights)))
 
 
@@ -290,20 +291,20 @@ def normalised(log_weights: Array) -> Array:
 
 
 def silverman(count: int, size: int) -> float:
-    """The bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions, as a fraction of the points'
-    standard deviation (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
+    """Return the bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions, as a fraction of the
+    points' standard deviation (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
     return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
 
 
 def pose_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """The weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3) in the
-    world frame. ``weights`` (N,): must have the sum 1."""
+    """Return the weighted mean (3,) of poses (N, 3), with a circular mean of the headings, and their covariance (3, 3)
+    in the world frame. ``weights`` (N,): must have the sum 1."""
     mean, covariance = se2.moments(poses, weights)
     return mean, covariance + np.diag(np.full(3, MINIMUM_VARIANCE))
 
 
 def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
-    """The weighted mean (P,) and covariance (P, P) of vectors (N, P). ``weights`` (N,): must have the sum 1."""
+    """Return the weighted mean (P,) and covariance (P, P) of vectors (N, P). ``weights`` (N,): must have the sum 1."""
     mean = weights @ values
     error = values - mean
     return mean, (weights[:, None] * error).T @ error

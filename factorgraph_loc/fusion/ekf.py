@@ -73,8 +73,8 @@ class _State(NamedTuple):
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def on_pose(self, observation: Observation) -> Observation:
-        """The observation as a function of the pose only. Constants and landmarks are fixed at this state, and their
-        covariances are added to the noise."""
+        """Return the observation as a function of the pose only. Constants and landmarks are fixed at this state, and
+        their covariances are added to the noise."""
         values, columns = self.layout.values(self.rest), self.layout.columns
         spreads = {name: self.covariance[columns[name], columns[name]] for name in observation.blocks}
         return observation.on_pose({name: values[name] for name in spreads}, spreads)
@@ -176,7 +176,7 @@ class Ekf(Filter):
         return PosePrior(t, pose, covariance)
 
     def learnt(self) -> Learnt:
-        """The estimated constants and landmarks."""
+        """Return the estimated constants and landmarks."""
         if self._state is None:
             return Learnt()
         values, view = self._state.layout.values(self._state.rest), _View(self)
@@ -299,7 +299,7 @@ class Ekf(Filter):
         return _Record(self._t, step, self._state)
 
     def _standstill(self) -> _Step:
-        """The prediction step between two measurements of equal time. It has no motion and no noise."""
+        """Return the prediction step between two measurements of equal time. It has no motion and no noise."""
         return _Step(self._state.pose, np.eye(3, len(self._state.covariance)), np.zeros((3, 3)))
 
 

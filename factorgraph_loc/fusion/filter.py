@@ -70,7 +70,7 @@ class FilterView:
     def value(self, name: str) -> Array | None: ...
 
     def poses_at(self, times: Array) -> Array:
-        """The robot's poses (N, 3) at ``times`` (N,) [s] in the frame of the filter's present pose."""
+        """Return the robot's poses (N, 3) at ``times`` (N,) [s] in the frame of the filter's present pose."""
         constants = self.value(MOTION)
         values = np.zeros(0) if constants is None else constants
         return np.asarray(self._filter._motion.poses_at(self._filter._odometry, times, values))
@@ -80,11 +80,11 @@ class FilterView:
         return None
 
     def track(self) -> Tracked:
-        """The present estimate of the pose, with the odometry at that time."""
+        """Return the present estimate of the pose, with the odometry at that time."""
         return Tracked(self._filter._odometry, self.pose, self.covariance)
 
     def pose_back(self, t: float, pose: Array) -> Array:
-        """The robot's pose (3,) at an earlier time ``t`` [s], if the robot is at ``pose`` (3,) now."""
+        """Return the robot's pose (3,) at an earlier time ``t`` [s], if the robot is at ``pose`` (3,) now."""
         return se2.compose(pose, self.poses_at(np.array([t]))[0])
 
 
@@ -128,7 +128,7 @@ class Filter(Timeline):
             self._ahead = None
 
     def learnt(self) -> Learnt:
-        """An empty result. Filters that estimate constants or landmarks override this."""
+        """Return an empty result. Filters that estimate constants or landmarks override this."""
         return Learnt()
 
     def forget(self, until: float) -> None:
@@ -146,11 +146,11 @@ class Filter(Timeline):
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
-        """The best estimate of all past poses, at the ticks, the times at which a run records the pose."""
+        """Return the best estimate of all past poses, at the ticks, the times at which a run records the pose."""
 
     @abstractmethod
     def _start(self, prior: PosePrior) -> Any:
-        """The filter's state for a Gaussian prior of the pose."""
+        """Return the filter's state for a Gaussian prior of the pose."""
 
     @abstractmethod
     def _predict(self, t: float) -> None:
@@ -166,7 +166,7 @@ class Filter(Timeline):
 
     @abstractmethod
     def _estimate(self) -> PoseEstimate:
-        """The pose, covariance and status of the present state."""
+        """Return the pose, covariance and status of the present state."""
 
     @abstractmethod
     def _record(self) -> Any:
@@ -262,7 +262,7 @@ def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: A
 
 
 def twin(rng: np.random.Generator) -> np.random.Generator:
-    """A copy of a random generator, which will draw the same numbers. A deep copy takes four times as long."""
+    """Return a copy of a random generator, which will draw the same numbers. A deep copy takes four times as long."""
     bits = type(rng.bit_generator)(0)
     bits.state = rng.bit_generator.state
     return np.random.Generator(bits)

@@ -48,8 +48,8 @@ class Guard:
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """A context that silences NumPy's warnings for a whole run. To silence them separately for each measurement
-        takes as long as processing one measurement of odometry."""
+        """Return a context that silences NumPy's warnings for a whole run. To silence them separately for each
+        measurement takes as long as processing one measurement of odometry."""
         with np.errstate(all="ignore"):
             self._is_quiet = True
             try:
@@ -64,7 +64,7 @@ class Guard:
             estimator.process(measurement)
 
     def computing(self, what: str, t: float | None = None) -> Self:
-        """A context for a request to the estimator. ``what``: the requested result, such as "the estimate", for
+        """Return a context for a request to the estimator. ``what``: the requested result, such as "the estimate", for
         messages. ``t`` [s]: its time, or None."""
         self._computing, self._of = what, t
         return self

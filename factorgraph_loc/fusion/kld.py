@@ -14,8 +14,8 @@ KERNEL = 0.25  # standard deviation of a kernel as a fraction of the distance be
 
 
 def enough(cells: Array | NDArray[np.int64]) -> Array:
-    """The number of particles that represent a distribution well enough if they occupy this number of ``cells`` of a
-    grid (Fox, 2003, eq. 7, with the approximation of Wilson and Hilferty)."""
+    """Return the number of particles that represent a distribution well enough if they occupy this number of ``cells``
+    of a grid (Fox, 2003, eq. 7, with the approximation of Wilson and Hilferty)."""
     freedom = np.maximum(np.asarray(cells, dtype=float) - 1.0, 1.0)
     a = 2.0 / (9.0 * freedom)
     return np.asarray(freedom / (2.0 * ERROR) * (1.0 - a + np.sqrt(a) * QUANTILE) ** 3)

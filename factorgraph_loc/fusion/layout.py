@@ -43,16 +43,16 @@ class Layout:
         return columns
 
     def plus(self, name: str, size: int) -> Layout:
-        """The layout with one more block at the end. ``size``: its number of components."""
+        """Return the layout with one more block at the end. ``size``: its number of components."""
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:
-        """The values of the blocks by name. ``rest`` (R,): the state without the pose."""
+        """Return the values of the blocks by name. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}
 
 
 def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Estimated]:
-    """The estimated constants of the odometry (``motion``) and of the sensors, by the name of their block."""
+    """Return the estimated constants of the odometry (``motion``) and of the sensors, by the name of their block."""
     return {MOTION: motion.constants} | {name: sensor.constants for name, sensor in sensors.items()}
 
 

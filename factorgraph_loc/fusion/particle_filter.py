@@ -143,7 +143,7 @@ class ParticleFilter(Filter):
         return Belief(modes, cloud.poses, cloud.weights)
 
     def learnt(self) -> Learnt:
-        """The estimated constants."""
+        """Return the estimated constants."""
         if self._state is None:
             return Learnt()
         cloud = self._state
@@ -244,7 +244,7 @@ class ParticleFilter(Filter):
         self._odometry, _ = self._motion.travelled(self._odometry, t)
 
     def _moved_on(self, rng: np.random.Generator) -> Cloud:
-        """The particles moved by odometry to the time of the filter."""
+        """Return the particles moved by odometry to the time of the filter."""
         cloud = self._state
         if cloud.odometry.t == self._t:
             return cloud

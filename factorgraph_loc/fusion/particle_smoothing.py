@@ -83,8 +83,8 @@ class BackwardSimulation:
             self._missed.insert(0, missed)
 
     def at(self, record: Record) -> tuple[Array, Array]:
-        """The mean (3,) and covariance (3, 3), in the world frame, of the trajectories at any record. Between two
-        clouds they are interpolated along the odometry."""
+        """Return the mean (3,) and covariance (3, 3), in the world frame, of the trajectories at any record. Between
+        two clouds they are interpolated along the odometry."""
         k = int(np.searchsorted(self._t, record.t, side="right")) - 1
         if any(self._t[k] < end <= record.t for _, end in self._changes):
             # the robot was carried since the earlier cloud: move the later cloud back by odometry
@@ -143,7 +143,7 @@ class BackwardSimulation:
 
 
 def _moments(poses: Array, extra: Array) -> tuple[Array, Array]:
-    """The mean (3,) and covariance (3, 3), in the world frame, of poses (N, 3). ``extra`` (3, 3): a body-frame
+    """Return the mean (3,) and covariance (3, 3), in the world frame, of poses (N, 3). ``extra`` (3, 3): a body-frame
     covariance of each pose, which is added."""
     mean, covariance = pose_moments(poses, np.full(len(poses), 1.0 / len(poses)))
     return mean, covariance + se2.body_to_world(mean, extra)
@@ -196,8 +196,9 @@ def _draw(
     whitener: Array,
     uniform: Array,
 ) -> Integers:
-    """The compiled loop of :func:`draw_ancestors`. ``whitened`` (P+3, N), ``whitened_later`` (P+3, M): the part of the whitened
-    states that depends on the constants. ``whitener`` (3, 3): the matrix that whitens the pose's error given the constants."""
+    """The compiled loop of :func:`draw_ancestors`. ``whitened`` (P+3, N), ``whitened_later`` (P+3, M): the part
+    of the whitened states that depends on the constants. ``whitener`` (3, 3): the matrix that whitens the pose's error
+    given the constants."""
     count = len(predicted)
     size = len(whitened) - 3
     cosine, sine = np.empty(count), np.empty(count)

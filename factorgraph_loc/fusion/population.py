@@ -259,8 +259,8 @@ class Population:
         return float(area) * 2.0 * math.pi
 
     def _room_of(self, count: int) -> Array:
-        """The volume (N,) per particle, in grid cells, if ``count`` particles are drawn from the whole space of poses.
-        Zero if the start position is known."""
+        """Return the volume (N,) per particle, in grid cells, if ``count`` particles are drawn from the whole space of
+        poses. Zero if the start position is known."""
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:

@@ -32,8 +32,8 @@ class Description:
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
-    """The settings of the estimator ``name``: the defaults, changed by ``overrides``. These are values by dotted key,
-    without the estimator's name in the key.
+    """Return the settings of the estimator ``name``: the defaults, changed by ``overrides``. These are values by dotted
+    key, without the estimator's name in the key.
 
     Raises InputError if the estimator or a key is unknown, or if a value is out of bounds.
     """
@@ -46,7 +46,7 @@ def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
 
 
 def describe(name: str) -> Description:
-    """The description of the estimator with this name. Raises InputError if the name is unknown."""
+    """Return the description of the estimator with this name. Raises InputError if the name is unknown."""
     kind = estimator_type(name)
     taken = tuple(channel.name for channel in channels().values() if _takes(kind, channel))
     return Description(
@@ -74,13 +74,13 @@ def check_names(names: Sequence[str]) -> None:
 
 
 def estimator_type(name: str) -> type[Any]:
-    """The class of the estimator with this name. Raises InputError if the name is unknown."""
+    """Return the class of the estimator with this name. Raises InputError if the name is unknown."""
     check_names([name])
     return cast(type[Any], ESTIMATORS[name])
 
 
 def settings_type(name: str) -> type[FileModel]:
-    """The settings class of the estimator with this name, such as ``EkfSettings`` in the module of ``Ekf``. Raises
-    InputError if the name is unknown."""
+    """Return the settings class of the estimator with this name, such as ``EkfSettings`` in the module of ``Ekf``.
+    Raises InputError if the name is unknown."""
     check_names([name])
     return cast(type[FileModel], load(f"{ESTIMATORS.place(name)}Settings"))

@@ -140,8 +140,8 @@ class Search:
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
-        """The hypotheses of the pose at time ``t`` [s], most likely first. The list is empty if nothing is known. With
-        a known start position, it is never empty."""
+        """Return the hypotheses of the pose at time ``t`` [s], most likely first. The list is empty if nothing is
+        known. With a known start position, it is never empty."""
         now, leading = self._motion.state(t), self._leading
         if leading is None or leading.newest is None or not leading.hypotheses:
             return [] if self.start is None else [self.start.mode(now)]

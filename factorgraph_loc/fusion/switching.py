@@ -114,19 +114,19 @@ class Switching:
             self.diagnostics.ignore("landmarks while tags are read")
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The estimate of the active filter."""
+        """Return the estimate of the active filter."""
         return self._active.estimate(t)
 
     def belief(self, t: float | None = None) -> Belief:
-        """The belief of the active filter."""
+        """Return the belief of the active filter."""
         return self._active.belief(t)
 
     def learnt(self) -> Learnt:
-        """An empty result, because no constants are estimated."""
+        """Return an empty result, because no constants are estimated."""
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """The smoothed estimates at the ticks, or the causal ones if the setting ``smooth`` is false."""
+        """Return the smoothed estimates at the ticks, or the causal ones if the setting ``smooth`` is false."""
         times = sorted(self._records)
         records = [self._records[t] for t in times]
         track = [(r.pose, r.covariance) for r in records[-1:]]
@@ -163,8 +163,9 @@ class Switching:
 
 
 def _smoothed(record: _PoseBelief, step: Increment, later: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The smoothed pose (3,) and covariance (3, 3) of ``record``. ``step``: the motion to the next record. ``later``: the smoothed
-    pose and covariance of the next record. If the next pose does not follow from ``record``, ``record`` is not smoothed."""
+    """Return the smoothed pose (3,) and covariance (3, 3) of ``record``. ``step``: the motion to the next record.
+    ``later``: the smoothed pose and covariance of the next record. If the next pose does not follow from ``record``,
+    ``record`` is not smoothed."""
     predicted = propagate(record.covariance, step)
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), later[0]))
     if positive.squared(error, predicted + later[1]) > JUMPED:

@@ -68,7 +68,7 @@ class Timeline(ABC):
             self._process(measurement)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """The pose at the time of the newest measurement or tick, or at ``t`` [s] if that is later.
+        """Return the pose at the time of the newest measurement or tick, or at ``t`` [s] if that is later.
 
         Before the start, the estimate is the most likely hypothesis of the search with the status ``ambiguous``, or NaN
         with the status ``unlocalized`` if there is none. After the start, the status is ``ambiguous`` while a search is
@@ -85,8 +85,8 @@ class Timeline(ABC):
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
 
     def belief(self, t: float | None = None) -> Belief:
-        """The probability distribution behind :meth:`estimate`. Before the start it has all hypotheses of the search,
-        and the search's particles."""
+        """Return the probability distribution behind :meth:`estimate`. Before the start it has all hypotheses of the
+        search, and the search's particles."""
         if self._begun < math.inf or self._seeking is None:
             return gaussian_belief(self.estimate(t))
         at = self._t if t is None else max(t, self._t)
@@ -150,7 +150,7 @@ class Timeline(ABC):
         self._replay(again)
 
     def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
-        """The prior for a start at time ``t`` [s], from the result of the search.
+        """Return the prior for a start at time ``t`` [s], from the result of the search.
 
         ``best``: the pose that the search found, at a later time. ``moved``: the robot's motion from ``t`` to that
         time. ``start``: the known position at ``t``, or None.

@@ -255,14 +255,14 @@ class _Compared(NamedTuple):
     correction: Correction
 
     def fit(self, observation: Observation) -> float:
-        """The log-likelihood of the observation given the track: at the corrected pose, minus half the squared
+        """Return the log-likelihood of the observation given the track: at the corrected pose, minus half the squared
         Mahalanobis distance of the correction."""
         delta = self.correction.delta[:3]
         moved = float(positive.squared(delta, self.covariance))
         return float(observation.log_likelihood(self.corrected()[None], {})[0]) - 0.5 * moved
 
     def corrected(self) -> Array:
-        """The corrected pose (3,) of the robot at the time of the observation."""
+        """Return the corrected pose (3,) of the robot at the time of the observation."""
         pose = se2.moved(self.pose, self.correction.delta[:3])
         return pose if self.offset is None else se2.compose(pose, self.offset.delta)
 
@@ -344,7 +344,7 @@ class SlipMonitor:
 
 
 def surprise(correction: Correction) -> float:
-    """The excess of a correction's innovation over its expected size, in standard deviations."""
+    """Return the excess of a correction's innovation over its expected size, in standard deviations."""
     if correction.dof:
         return (correction.nis - correction.dof) / math.sqrt(2.0 * correction.dof)
     return correction.excess_nll / math.sqrt(correction.variance) if correction.variance > 0.0 else 0.0
@@ -363,8 +363,8 @@ def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
 
 
 def beyond(covariance: Array, distance: float) -> float:
-    """The probability that the position of a Gaussian pose with ``covariance`` (3, 3) differs from its mean by more
-    than ``distance`` [m]."""
+    """Return the probability that the position of a Gaussian pose with ``covariance`` (3, 3) differs from its mean by
+    more than ``distance`` [m]."""
     angle = math.pi * np.arange(180) / 180.0
     direction = np.column_stack((np.cos(angle), np.sin(angle)))
     curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)
@@ -373,7 +373,7 @@ def beyond(covariance: Array, distance: float) -> float:
 
 
 def laplace_evidence(observation: Observation, pose: Array, covariance: Array, correction: Correction) -> float:
-    """The marginal log-likelihood of an observation under a Gaussian prediction, by Laplace's method.
+    """Return the marginal log-likelihood of an observation under a Gaussian prediction, by Laplace's method.
 
     ``observation``: depends on the pose only. ``pose`` (3,), ``covariance`` (3, 3): the prediction and its body-frame
     covariance. ``correction``: the correction of this prediction by the observation.

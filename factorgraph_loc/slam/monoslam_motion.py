@@ -49,7 +49,7 @@ class RobotState:
         )
 
     def minus(self, reference: RobotState) -> Array:
-        """The error (12,) of this state relative to ``reference``."""
+        """Return the error (12,) of this state relative to ``reference``."""
         turn = log(reference.rotation.T @ self.rotation)
         shift = reference.rotation.T @ (self.position - reference.position)
         return np.concatenate((turn, shift, self.velocity - reference.velocity, self.rate - reference.rate))
@@ -192,26 +192,26 @@ def tilt_of(robot: RobotState) -> Array:
 
 
 def exp(turn: Array) -> Array:
-    """The rotation (3, 3) of the rotation vector ``turn`` (3,) [rad]."""
+    """Return the rotation (3, 3) of the rotation vector ``turn`` (3,) [rad]."""
     return np.asarray(gtsam.Rot3.Expmap(turn).matrix())
 
 
 def log(rotation: Array) -> Array:
-    """The rotation vector (3,) of a rotation (3, 3)."""
+    """Return the rotation vector (3,) of a rotation (3, 3)."""
     return np.asarray(gtsam.Rot3.Logmap(gtsam.Rot3(rotation)))
 
 
 def about_z(angle: float) -> Array:
-    """The rotation (3, 3) by ``angle`` [rad] about z."""
+    """Return the rotation (3, 3) by ``angle`` [rad] about z."""
     return np.asarray(gtsam.Rot3.Yaw(angle).matrix())
 
 
 def cross(v: Array) -> Array:
-    """The matrix (3, 3) of the cross product with ``v`` (3,)."""
+    """Return the matrix (3, 3) of the cross product with ``v`` (3,)."""
     x, y, z = v.tolist()
     return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
 
 def orthonormal(rotation: Array) -> Array:
-    """A rotation (3, 3) with the accumulated rounding errors removed."""
+    """Return a rotation (3, 3) with the accumulated rounding errors removed."""
     return np.asarray(rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation))

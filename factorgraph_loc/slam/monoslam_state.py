@@ -90,7 +90,7 @@ class SlamState:
         return ROBOT + len(self.constants)
 
     def starts(self) -> Integers:
-        """The index of each point's first value in ``values``."""
+        """Return the index of each point's first value in ``values``."""
         return np.cumsum([0, *(p.size for p in self.points)], dtype=np.int64)[:-1]
 
     def plus(self, error: Array, covariance: Array) -> SlamState:

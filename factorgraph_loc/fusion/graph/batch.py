@@ -22,8 +22,9 @@ NARROWED = 0.5  # the ratio of the scales of a step to those of the step before
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
-    """All measurements of a graph as one problem. ``width`` multiplies the scales of robust losses. ``link_width``
-    multiplies the scales of the losses of links (factors between two poses, such as loop closures) instead."""
+    """Return all measurements of a graph as one problem. ``width`` multiplies the scales of robust losses.
+    ``link_width`` multiplies the scales of the losses of links (factors between two poses, such as loop closures)
+    instead."""
     assert graph.prior is not None
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
@@ -41,8 +42,8 @@ def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> 
 
 
 def convex_width(graph: Graph, values: Values) -> float:
-    """The smallest factor, at least 1, that makes the losses of all links (such as loop closures) convex at ``values``
-    when it multiplies their scales."""
+    """Return the smallest factor, at least 1, that makes the losses of all links (such as loop closures) convex at
+    ``values`` when it multiplies their scales."""
     linked = {name: sensor for name, sensor in graph.sensors.items() if sensor.links}
     nodes = (node for k in graph.keyframes.values() for node in k.nodes if linked and node.sensor in linked)
     return max(
@@ -120,7 +121,7 @@ class AtTheEnd:
     extend = attach
 
     def current(self, key: int) -> Array:
-        """The present estimate of the variable ``key``, which must not be a pose."""
+        """Return the present estimate of the variable ``key``, which must not be a pose."""
         return self._guesses[key]
 
     def is_open(self, keyframe: int) -> bool:

@@ -116,8 +116,8 @@ class Smoother(Timeline):
             self._doubt(m)
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """The newest keyframe's pose, predicted by odometry. With ``final_only`` it is a rough estimate with the status
-        ``unlocalized``."""
+        """Return the newest keyframe's pose, predicted by odometry. With ``final_only`` it is a rough estimate with the
+        status ``unlocalized``."""
         at = self._t if t is None else max(t, self._t)
         pose, _, covariance = self._graph.moved(at)
         doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
@@ -127,22 +127,22 @@ class Smoother(Timeline):
         return PoseEstimate(at, pose, covariance, status)
 
     def learnt(self) -> Learnt:
-        """The estimated constants and landmarks of the final solution."""
+        """Return the estimated constants and landmarks of the final solution."""
         if self._graph.prior is None:
             return _learnt(self._graph)
         end = self._concluded()
         return _learnt(end.graph, end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of all poses since the start, at the ticks (the times at which a run records the pose).
-        Empty if the start pose was never found."""
+        """Return the best estimate of all poses since the start, at the ticks (the times at which a run records the
+        pose). Empty if the start pose was never found."""
         if self._graph.prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         end = self._concluded()
         return _trajectory(end.graph, end.poses, end.covariances)
 
     def final_diagnostics(self) -> Diagnostics:
-        """The diagnostics of the run and of the final solution."""
+        """Return the diagnostics of the run and of the final solution."""
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
     def forget(self, until: float) -> None:
@@ -152,8 +152,8 @@ class Smoother(Timeline):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
     def _concluded(self) -> _Conclusion:
-        """The final solution, on a copy of the graph. The graph itself is not changed, so that later results do not
-        depend on this call."""
+        """Return the final solution, on a copy of the graph. The graph itself is not changed, so that later results do
+        not depend on this call."""
         if self._conclusion is None:
             graph = self._graph.copy()
             graph.newest.nodes += self._builder.waiting()
@@ -222,8 +222,8 @@ class Smoother(Timeline):
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
-        """The robot's pose (3,) at time ``t`` [s], computed back from the pose ``best`` that the search has found for a
-        later time, by the odometry in between."""
+        """Return the robot's pose (3,) at time ``t`` [s], computed back from the pose ``best`` that the search has
+        found for a later time, by the odometry in between."""
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
 
@@ -256,8 +256,8 @@ class Batch(Smoother):
 
 
 def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
-    """The estimated constants, landmarks and points of a graph. ``poses``, ``covariances``: the final poses (3,) of all
-    keyframes, and their body-frame covariances (3, 3)."""
+    """Return the estimated constants, landmarks and points of a graph. ``poses``, ``covariances``: the final poses (3,)
+    of all keyframes, and their body-frame covariances (3, 3)."""
     blocks = [(name, graph.values[key], graph.covariances[key]) for name, key in graph.keys.items()]
     numbered = graph.keyframes.values()
     means, bodies = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905
@@ -266,7 +266,7 @@ def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Arr
 
 
 def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:
-    """The trajectory at the ticks, interpolated between keyframes. See :func:`factors.motion.poses_between`.
+    """Return the trajectory at the ticks, interpolated between keyframes. See :func:`factors.motion.poses_between`.
 
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the final poses of all keyframes and their body-frame covariances.
     Ticks at which the pose is unknown, because the robot was carried, are left out.

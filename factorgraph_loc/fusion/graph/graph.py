@@ -142,7 +142,7 @@ class Mapper:
         return False
 
     def point(self, node: Node) -> int | None:
-        """The key of the point if a node is an observation of a point, otherwise None."""
+        """Return the key of the point if a node is an observation of a point, otherwise None."""
         return None
 
     def leave(self, t: float) -> Sequence[int]:
@@ -158,8 +158,8 @@ class Mapper:
         return ()
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        """A map of all points that were ever in the graph and are not deleted, or None. ``values``, ``covariances``:
-        the estimates of points and keyframes by key."""
+        """Return a map of all points that were ever in the graph and are not deleted, or None. ``values``,
+        ``covariances``: the estimates of points and keyframes by key."""
         return None
 
 
@@ -201,7 +201,7 @@ class Graph:
         return self.newest
 
     def copy(self) -> Graph:
-        """An independent copy of the graph, which can be solved separately."""
+        """Return an independent copy of the graph, which can be solved separately."""
         graph = object.__new__(Graph)
         vars(graph).update(vars(self))
         graph.diagnostics = self.diagnostics.copy()
@@ -236,20 +236,20 @@ class Graph:
                 departed.pop(key, None)
 
     def keyframe_before(self, t: float) -> Keyframe:
-        """The last keyframe at or before the time ``t`` [s], or the oldest keyframe if all are later."""
+        """Return the last keyframe at or before the time ``t`` [s], or the oldest keyframe if all are later."""
         keyframe = self.newest
         while keyframe.t > t and keyframe.index - 1 in self.keyframes:
             keyframe = self.keyframes[keyframe.index - 1]
         return keyframe
 
     def since(self, keyframe: Keyframe, t: float) -> Increment:
-        """The motion from a keyframe to time ``t`` [s], with the estimated constants of the odometry."""
+        """Return the motion from a keyframe to time ``t`` [s], with the estimated constants of the odometry."""
         start = keyframe.odometry if self.is_anchored else self.motion.state(keyframe.t)
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
     def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
-        """The motion from a keyframe to a time ``t`` [s] before the next keyframe. It is interpolated along the arc to
-        the next keyframe in proportion to time, because the odometry may already be deleted."""
+        """Return the motion from a keyframe to a time ``t`` [s] before the next keyframe. It is interpolated along the
+        arc to the next keyframe in proportion to time, because the odometry may already be deleted."""
         following = self.keyframes[keyframe.index + 1]
         assert following.from_previous is not None
         step, share = self.recalibrated(following.from_previous), (t - keyframe.t) / (following.t - keyframe.t)
@@ -257,8 +257,8 @@ class Graph:
         return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
 
     def moved(self, t: float) -> tuple[Array, Array, Array]:
-        """The newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns its covariance (3,
-        3) twice, in the body frame and in the world frame."""
+        """Return the newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns its
+        covariance (3, 3) twice, in the body frame and in the world frame."""
         newest = self.newest
         if t <= newest.t:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
@@ -280,14 +280,14 @@ class Graph:
         return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
     def value(self, name: str, default: Array | None = None) -> Array:
-        """The estimate of the constants or the landmark with this name. If it is not in the graph, ``default`` is
-        returned, or KeyError is raised if it is None."""
+        """Return the estimate of the constants or the landmark with this name. If it is not in the graph, ``default``
+        is returned, or KeyError is raised if it is None."""
         if default is not None and name not in self.keys:
             return default
         return self.values[self.keys[name]]
 
     def constant_priors(self) -> tuple[Values, Values]:
-        """The prior means and covariances of the estimated sensor constants, by key."""
+        """Return the prior means and covariances of the estimated sensor constants, by key."""
         sigmas = {self.keys[name]: c.sigmas for name, c in self.constants.items() if c.names}
         return {key: np.zeros(len(s)) for key, s in sigmas.items()}, {key: np.diag(s**2) for key, s in sigmas.items()}
 
@@ -308,8 +308,8 @@ class Graph:
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
     def odometry_factor(self, keyframe: Keyframe) -> tuple[Factor, tuple[int, ...]]:
-        """The odometry factor from the previous keyframe to this one, and the keys of its variables. If the robot was
-        carried in between, the factor does not depend on the odometry's constants."""
+        """Return the odometry factor from the previous keyframe to this one, and the keys of its variables. If the
+        robot was carried in between, the factor does not depend on the odometry's constants."""
         assert keyframe.from_previous is not None
         keys: tuple[int, ...] = (keyframe.key - 1, keyframe.key)
         if MOTION in self.keys and not keyframe.is_elsewhere:
@@ -384,7 +384,7 @@ class Graph:
         return f"the measurements do not determine {self._named(key)}"
 
     def _named(self, key: int) -> str:
-        """The description of the variable ``key``, for messages."""
+        """Return the description of the variable ``key``, for messages."""
         if is_of_keyframe(key):
             return f"the {'pose' if is_pose(key) else 'tilt'} at {self.keyframes[index_of(key)].t:.3f} s"
         if is_point(key):

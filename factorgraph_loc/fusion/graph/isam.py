@@ -76,10 +76,12 @@ class Incremental:
         graph.forget(min(last, self._solver.oldest))  # a rebuilt solver needs the rest
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """The final poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes of ``graph``, a copy of the graph.
+        """Return the final poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes of ``graph``, a copy of
+        the graph.
 
-        If the setting ``lag`` is a number, a pose keeps the estimate that it had when it left the window. Poses in the window have
-        their present estimate. Poses that wait for the solver have a predicted estimate. Otherwise the whole problem is solved.
+        If the setting ``lag`` is a number, a pose keeps the estimate that it had when it left the window. Poses in the
+        window have their present estimate. Poses that wait for the solver have a predicted estimate. Otherwise the
+        whole problem is solved.
         """
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)
@@ -101,7 +103,7 @@ class Incremental:
         return np.array([p for p, _ in known]), np.array([c for _, c in known])
 
     def _newest_values(self, graph: Graph) -> Values:
-        """The present estimates of all variables of ``graph``, a copy of the graph."""
+        """Return the present estimates of all variables of ``graph``, a copy of the graph."""
         known = self._waiting.values | {k.key: k.final[0] for k in graph.keyframes.values() if k.final is not None}
         keys = [*(k.key for k in graph.keyframes.values()), *graph.values]
         return known | {key: self._solver.value(key) for key in keys if key not in known}
@@ -144,7 +146,7 @@ class Incremental:
         self._graph.pose, self._graph.covariance = guess
 
     def current(self, key: int) -> Array:
-        """The solver's present estimate of the variable ``key``."""
+        """Return the solver's present estimate of the variable ``key``."""
         return self._solver.value(key)
 
     def is_open(self, keyframe: int) -> bool:
@@ -193,15 +195,15 @@ class Incremental:
                 graph.values[key] = self._value(key)
 
     def _value(self, key: int) -> Array:
-        """The solver's estimate of the variable ``key``. Raises IndeterminateError if it is not finite."""
+        """Return the solver's estimate of the variable ``key``. Raises IndeterminateError if it is not finite."""
         value = self._solver.value(key)
         if not all(map(math.isfinite, value.tolist())):
             raise IndeterminateError(key)
         return value
 
     def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
-        """The estimate and covariance of the variable ``key``. ``known``: the covariance if it is already computed.
-        ``graph``: where a damping of the covariance is reported, by default the graph of the run."""
+        """Return the estimate and covariance of the variable ``key``. ``known``: the covariance if it is already
+        computed. ``graph``: where a damping of the covariance is reported, by default the graph of the run."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if known is None else known
@@ -292,7 +294,7 @@ class Incremental:
             raise graph.unsolved(error) from error
 
     def _priors(self) -> list[gtsam.NonlinearFactor]:
-        """The prior factors of the first pose and of the constants."""
+        """Return the prior factors of the first pose and of the constants."""
         prior, gaussian = self._graph.prior, gtsam.noiseModel.Gaussian.Covariance
         assert prior is not None
         noise = gaussian(se2.world_to_body(prior.pose, prior.covariance))
@@ -301,15 +303,15 @@ class Incremental:
         return [start, *(gtsam.PriorFactorVector(key, mean, gaussian(covariances[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
-        """The time [s] of each variable of a new window, by key. A variable leaves the window when it is older than the
-        lag. Points get the time of the newest keyframe."""
+        """Return the time [s] of each variable of a new window, by key. A variable leaves the window when it is older
+        than the lag. Points get the time of the newest keyframe."""
         now = keyframes[-1].t
         oldest = -math.inf if self._lag is None else now - self._lag - self._margin
         stamps = {key: now if key in self._graph.values else oldest for key in values}
         return stamps | {key: k.t for k in keyframes for key in (k.key, tilt_key(k.index)) if key in values}
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
-        """The odometry factor from the previous keyframe."""
+        """Return the odometry factor from the previous keyframe."""
         step = keyframe.from_previous
         assert step is not None
         if self._maps or (MOTION in self._graph.keys and not keyframe.is_elsewhere):
@@ -321,7 +323,7 @@ class Incremental:
         return Node((previous, keyframe.key), native=native)
 
     def _new_solver(self, *, failed: bool = False) -> FullHistory | Window:
-        """An empty solver. ``failed``: True if the previous solver failed."""
+        """Return an empty solver. ``failed``: True if the previous solver failed."""
         parameters = gtsam.ISAM2Params()
         # Cholesky fails in long dead reckoning, but is twice as fast as QR if there are points
         parameters.setFactorization("CHOLESKY" if self._maps and not failed else "QR")

@@ -65,8 +65,9 @@ class Covariances:
 
 
 def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys: Sequence[int]) -> Covariances:
-    """The marginal covariances of the variables ``keys`` of a linear graph. ``sizes``: the number of components of each
-    variable of the graph. Raises IndeterminateError if the graph does not determine a variable even with damping."""
+    """Return the marginal covariances of the variables ``keys`` of a linear graph. ``sizes``: the number of components
+    of each variable of the graph. Raises IndeterminateError if the graph does not determine a variable even with
+    damping."""
     result = _solved(graph, keys, robust=False)
     if isinstance(result, dict):
         return Covariances(result, 0.0)
@@ -88,8 +89,8 @@ def blamed(error: Exception) -> int | None:
 def _solved(
     graph: gtsam.GaussianFactorGraph, keys: Sequence[int], *, robust: bool
 ) -> dict[int, Array] | IndeterminateError:
-    """The marginal covariances of the variables ``keys`` of a linear graph, by key. If the graph cannot be solved, the
-    error is returned and not raised. ``robust``: True to use QR instead of Cholesky."""
+    """Return the marginal covariances of the variables ``keys`` of a linear graph, by key. If the graph cannot be
+    solved, the error is returned and not raised. ``robust``: True to use QR instead of Cholesky."""
     order = gtsam.Ordering.OrderingType.COLAMD
     marginals: dict[int, Array] = {}
     try:
@@ -113,8 +114,8 @@ def _solved(
 
 
 def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
-    """The graph with a prior on each variable, whose information is ``damping`` times the diagonal of the graph's
-    information. ``sizes``: the number of components of each variable by key."""
+    """Return the graph with a prior on each variable, whose information is ``damping`` times the diagonal of the
+    graph's information. ``sizes``: the number of components of each variable by key."""
     keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
     ends = np.cumsum([sizes[key] for key in keys])
     # the last column is the right side of the equations
@@ -170,7 +171,7 @@ class Chained:
         return sum(stack.cost(*state) for stack in self._stacks)
 
     def system(self, state: State) -> chain.System:
-        """The normal equations of the problem, linearised at a state."""
+        """Return the normal equations of the problem, linearised at a state."""
         poses, parameters = state
         jacobian, residual = np.zeros((len(self._first), 6 + len(parameters))), np.zeros(len(self._first))
         begin = 0
@@ -193,7 +194,7 @@ class Chained:
         return (se2.compose(state[0], se2.exp(poses)), state[1] + parameters), float(largest)
 
     def covariances(self, values: Values) -> Covariances | None:
-        """The marginal covariances of all variables. None if this solver is not accurate enough for them."""
+        """Return the marginal covariances of all variables. None if this solver is not accurate enough for them."""
         state = self.begin(values)
         if state is None:
             return None
@@ -323,20 +324,21 @@ class Problem:
         return {key: retract(key, value, step.at(key)) for key, value in values.items()}, largest
 
     def cost(self, values: Values) -> float:
-        """The robust cost at ``values``. It is infinite if the sum of the factors' costs is NaN."""
+        """Return the robust cost at ``values``. It is infinite if the sum of the factors' costs is NaN."""
         cost = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
         return math.inf if math.isnan(cost) else cost
 
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
-        """All factors, linearised at ``values`` with their robust weights."""
+        """Return all factors, linearised at ``values`` with their robust weights."""
         graph = gtsam.GaussianFactorGraph()
         for factor in jacobian_factors(self._factors, values):
             graph.add(factor)
         return graph
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
-        """The marginal covariances of the variables ``keys``, and possibly of further variables, at the solution ``values``. A
-        covariance of a pose is in the body frame. Raises IndeterminateError if the graph does not determine a variable."""
+        """Return the marginal covariances of the variables ``keys``, and possibly of further variables, at the solution
+        ``values``. A covariance of a pose is in the body frame. Raises IndeterminateError if the graph does not
+        determine a variable."""
         marginals = None if self._chain is None else self._chain.covariances(values)
         if marginals is not None:
             return marginals

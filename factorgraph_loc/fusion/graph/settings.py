@@ -27,7 +27,7 @@ def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
 
 
 def _written(lag: float | None) -> float | str | None:
-    """The value of the setting ``lag`` in files. Infinity is written as ``all``."""
+    """Return the value of the setting ``lag`` in files. Infinity is written as ``all``."""
     return "all" if lag == math.inf else lag
 
 

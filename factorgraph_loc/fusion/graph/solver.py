@@ -94,19 +94,19 @@ class FullHistory:
         return 0
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        """The information of all variables that have left the solver, or None if none has left. ``failed``: True if the
-        last update failed, to return the information from before this update."""
+        """Return the information of all variables that have left the solver, or None if none has left. ``failed``: True
+        if the last update failed, to return the information from before this update."""
         return None
 
     def value(self, key: int) -> Array:
-        """The present estimate of the variable ``key``."""
+        """Return the present estimate of the variable ``key``."""
         if key not in self._touched:
             return read(self._isam, key)
         step = np.linalg.solve(*self._isam.marginalFactor(key).jacobian())
         return retract(key, self._ours.at[key], np.asarray(step, dtype=float))
 
     def covariance(self, key: int) -> Array:
-        """The marginal covariance of the variable ``key``. The covariance of a pose is in the body frame."""
+        """Return the marginal covariance of the variable ``key``. The covariance of a pose is in the body frame."""
         return np.asarray(self._solver.marginalCovariance(key))
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
@@ -182,8 +182,8 @@ class Window(FullHistory):
         return read(self._solver, key)
 
     def covariances(self, keys: Sequence[int]) -> dict[int, Array]:
-        """The marginal covariances of the variables ``keys``, by key, from one elimination of the window. Empty if the
-        elimination fails, or if a variable has left."""
+        """Return the marginal covariances of the variables ``keys``, by key, from one elimination of the window. Empty
+        if the elimination fails, or if a variable has left."""
         order = gtsam.Ordering()
         for key in keys:
             order.push_back(key)
@@ -206,7 +206,7 @@ class Window(FullHistory):
         return MarginalSummary.of(graph, points, at, ours) if graph.size() else None
 
     def _state(self) -> _State:
-        """A copy of the solver's state, which the solver changes in place."""
+        """Return a copy of the solver's state, which the solver changes in place."""
         points = gtsam.Values(self._solver.getISAM2().getLinearizationPoint())
         return gtsam.NonlinearFactorGraph(self._solver.getFactors()), points, self._ours.framed, self._ours.slots
 
@@ -336,9 +336,11 @@ class LinearFactors:
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
     def _followed(self, estimates: Values) -> list[int]:
-        """The held variables whose factors must be linearised again. ``estimates``: the present estimates of all held variables.
+        """Return the held variables whose factors must be linearised again. ``estimates``: the present estimates of all
+        held variables.
 
-        Empty if all held variables are poses. Then the map is known, and their odometry factors are never linearised again.
+        Empty if all held variables are poses. Then the map is known, and their odometry factors are never linearised
+        again.
         """
         if all(map(is_pose, estimates)):
             return []

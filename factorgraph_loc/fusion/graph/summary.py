@@ -19,7 +19,7 @@ KINDS = (gtsam.LinearContainerFactor, gtsam.PriorFactorPose2, gtsam.PriorFactorV
 
 
 def oldest_pose(keys: Iterable[int]) -> int:
-    """The index of the oldest pose among ``keys``, 0 if there is none."""
+    """Return the index of the oldest pose among ``keys``, 0 if there is none."""
     return min((index_of(key) for key in keys if is_pose(key)), default=0)
 
 
