@@ -56,7 +56,7 @@ def require(
 
 
 def message_of(error: FglocError | OSError | UnicodeEncodeError) -> str:
-    """Return the message of an error on one line. If the system's encoding lacks a character, the message has a remedy."""
+    """Return the message of an error on one line, for display to the user."""
     if isinstance(error, UnicodeEncodeError):
         text = quoted(error.object[error.start : error.end])
         return f"{text} cannot be written in {error.encoding}, the encoding of this system: set PYTHONUTF8=1"

@@ -18,31 +18,34 @@ Place = str  # "package.module:name", or "package.module"
 
 
 def load(place: Place) -> Any:
-    """Import and return the object at ``place``. Raises ImportError or AttributeError if it does not exist."""
+    """Import and return the object with the import path ``place``, such as "package.module:name".
+
+    Raises ImportError or AttributeError if it does not exist.
+    """
     module, _, name = place.partition(":")
     loaded = importlib.import_module(module)
     return getattr(loaded, name) if name else loaded
 
 
 class Group(Mapping[str, Any]):
-    """A registry of one kind of plug-in. ``group[name]`` imports and returns an object. Built-in objects come first.
+    """A registry of plug-ins of one kind. ``group[name]`` imports the plug-in of that name and returns it.
 
-    ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in objects by name. ``needs``:
-    attributes that an object must have. Raises InputError if an object of another package cannot be imported, lacks
-    such an attribute, or has a name that another object has.
+    ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in plug-ins by name. ``needs``:
+    names of the attributes that a plug-in must have. Access raises InputError if a plug-in of another package cannot be
+    imported, lacks an attribute, or has a name that is already registered.
     """
 
     def __init__(self, kind: str, *needs: str) -> None:
         self.kind, self.needs = kind, needs
         self.own: dict[str, Place] = {}
-        self._others: dict[str, tuple[Place, str]] | None = None  # import path and package of objects of other packages
+        self._others: dict[str, tuple[Place, str]] | None = None  # plug-ins of other packages: import path and package
 
     def place(self, name: str) -> Place:
-        """Return the import path of the object with this name. Raises KeyError if the name is unknown."""
+        """Return the import path of the plug-in ``name``. Raises KeyError if the name is unknown."""
         return self.own[name] if name in self.own else self._installed()[name][0]
 
     def _installed(self) -> dict[str, tuple[Place, str]]:
-        """Return the import path and the package of each object that other packages register, by name."""
+        """Return the plug-ins of other packages by name: the import path, and the name of the package."""
         if self._others is None:
             from importlib.metadata import entry_points  # noqa: PLC0415 - most commands need built-in ones only
 
@@ -72,7 +75,7 @@ class Group(Mapping[str, Any]):
         return loaded
 
     def __contains__(self, name: object) -> bool:
-        """True if a name is registered. Imports nothing."""
+        """True if ``name`` is registered. The plug-in is not imported."""
         return name in self.own or name in self._installed()
 
     def __iter__(self) -> Iterator[str]:

@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 from factorgraph_loc.errors import RunFailedError
 from factorgraph_loc.threads import use_one_thread
 
-BEAT = 0.3  # s between two calls of the heartbeat function
+BEAT = 0.3  # s between two calls of the argument ``beat`` of ``run_each``
 READY = "ready"  # message of a worker process that has loaded its modules
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that end a command
 _PR_SET_PDEATHSIG = 1  # prctl(2)
@@ -67,8 +67,8 @@ class Worker:
     job: Any = None
 
     def send(self, content: object) -> None:
-        """Send an object to the process: first the function that it calls, then one job at a time."""
-        with suppress(OSError):  # if the process has died, the next call of `hear` reports that
+        """Send ``content`` to the process. The first object must be the function, each later one is a job."""
+        with suppress(OSError):  # `hear` reports that the process has died
             self.connection.send(content)
 
     def hear(self) -> Any:
@@ -93,10 +93,10 @@ class Worker:
 
 
 def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]:
-    """Spawn a process that calls ``function(connection, *args)``. Return the process and the parent's end of the connection.
+    """Start a process that calls ``function(connection, *args)``. ``connection`` leads to this process.
 
-    The process does not import the running script, so ``function`` must be defined in a module. The module must load fast, because
-    the process can outlive its parent until it has loaded the module. The process ignores keyboard interrupts.
+    Return the new process, and this process's end of the connection. ``function`` must be defined in a module that can
+    be imported, not in the running script. The new process ignores keyboard interrupts.
     """
     use_one_thread()
     parent_end, child_end = Pipe()
@@ -114,12 +114,11 @@ def run_each(
     *,
     beat: Callable[[], None] | None = None,
 ) -> Iterator[tuple[int, Value | Exception]]:
-    """Call ``function`` on each job in at most ``workers`` parallel processes.
+    """Call ``function`` on each job in at most ``workers`` parallel processes. A crash affects only one job.
 
-    Yields the index of a job and its value, or the exception that it raised, as soon as the job finishes. Each
-    job runs in a new process. Thus a crash affects only one job, and peak memory can be measured per job. ``beat`` is
-    called about every :data:`BEAT` seconds. Closing the iterator ends the processes. Function, jobs and values must be
-    picklable, and defined in modules that can be imported.
+    When a job ends, yield its index in ``jobs``, and the value that ``function`` returned or the exception that it
+    raised. ``beat`` is called about every :data:`BEAT` seconds. Closing the iterator kills the processes. The function,
+    the jobs and the values must be picklable, and their classes must be defined in modules that can be imported.
     """
     waiting = deque(range(len(jobs)))
     team: list[Worker] = []
@@ -153,7 +152,7 @@ def run_each(
 
 
 class RemoteError(Exception):
-    """The traceback of an exception that another process raised. It is attached to the exception as its cause."""
+    """The ``__cause__`` of an exception that another process raised. It displays the traceback in that process."""
 
     def __str__(self) -> str:
         return f'\n"""\n{self.args[0]}"""'
@@ -162,7 +161,8 @@ class RemoteError(Exception):
 def serve(connection: Connection, *modules: str) -> None:
     """Run the main loop of a worker process. ``modules``: names of modules that are imported first.
 
-    The loop receives a function, and then jobs. It answers each job with the value of the function, or the exception it raised.
+    The process receives a function from ``connection``, and then jobs. It calls the function on each job, and sends the
+    value or the exception back.
     """
     for name in modules:
         importlib.import_module(name)
@@ -197,10 +197,7 @@ def _portable(error: Exception) -> Exception:
 
 
 def _end_with_parent() -> None:
-    """Let this process end when its parent ends.
-
-    A thread waits for the end of the parent. Native code may block that thread, so on Linux the kernel kills the process too.
-    """
+    """Make this process end when its parent process ends. On Linux this works also while native code blocks threads."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     if sys.platform == "linux":
@@ -217,10 +214,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _without_script() -> Iterator[None]:
-    """Let processes that start in this block not import the script that is running.
-
-    Therefore the script needs no ``if __name__ == "__main__"``.
-    """
+    """Prevent new processes from importing the running script. It then needs no ``if __name__ == "__main__"``."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -231,8 +225,8 @@ def _without_script() -> Iterator[None]:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """Let processes that start in this block ignore keyboard interrupts. This process gets its signals after it."""
-    resource_tracker.ensure_running()  # otherwise it starts with the first process, and unblocks interrupts
+    """Make processes that start in this block ignore keyboard interrupts. Delay signals to this process meanwhile."""
+    resource_tracker.ensure_running()  # its start unblocks keyboard interrupts, so it must not start in the block
     came: list[int] = []
     replaced = {}
     if threading.current_thread() is threading.main_thread():

@@ -24,9 +24,10 @@ CUT = "..."  # replaces the middle of a text that is too long
 
 @dataclass(frozen=True)
 class Notice:
-    """A warning or note. ``str(notice)`` is the ``sentence`` after the names in braces are replaced by ``fields``.
+    """A warning or note for the user. ``str(notice)`` is its text.
 
-    ``kind``: identifies the warning for programs, such as ``late_rows``.
+    ``kind``: identifies the warning for programs, such as ``late_rows``. ``sentence``: the text, with names in braces
+    as in :meth:`str.format`. ``fields``: the values that replace these names.
     """
 
     kind: str
@@ -45,7 +46,7 @@ class Notice:
 
 
 def notice(kind: str, sentence: str, *values: object) -> Notice:
-    """Return a :class:`Notice`. ``values``: the values of the names in the braces of ``sentence``, in order of appearance."""
+    """Return a :class:`Notice`. ``values``: a value for each name in braces in ``sentence``, in order of appearance."""
     names = dict.fromkeys(name for _, name, _, _ in Formatter().parse(sentence) if name)
     numbers = (value.item() if hasattr(value, "item") else value for value in values)
     plainly = (value if isinstance(value, int | float | str) else str(value) for value in numbers)
@@ -53,7 +54,7 @@ def notice(kind: str, sentence: str, *values: object) -> Notice:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number as text with so many ``digits`` after the point. Return "-" if it is None or not finite."""
+    """Return a number as text. ``digits``: how many follow the decimal point. Return "-" for None, NaN and infinity."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
@@ -85,7 +86,7 @@ def plain(text: object, limit: int | None = NAME) -> str:
 
 
 class _Brief(reprlib.Repr):
-    """A ``repr`` of limited length. It does not compute the parts of a large value that are not displayed."""
+    """Makes a ``repr`` of limited length. Parts of a large value that are not displayed cost no time."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -177,6 +178,6 @@ def shortened(text: str, limit: int) -> str:
 
 
 def _escape(character: str) -> str:
-    """Return the escape sequence of a character: of Python for ASCII, of JSON and TOML for other characters."""
+    """Return the escape sequence of a character: for ASCII as in Python, for other characters as in JSON and TOML."""
     code = ord(character)
     return repr(character)[1:-1] if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

@@ -29,9 +29,10 @@ ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
 
 @dataclass(frozen=True)
 class NamedSettings:
-    """A reader of logs, a preset of simulations, or a policy of active localization. ``about``: one sentence about it.
+    """A reader of logs, a preset of simulations, or a policy of active localization. ``about``: its description.
 
-    ``settings``: the options of a reader, the settings of a preset except its rig, or the settings that all policies share.
+    ``settings``: the options of the reader, the settings of the preset without those of the rig, or the settings that
+    all policies share.
     """
 
     name: str
@@ -41,9 +42,9 @@ class NamedSettings:
 
 @dataclass(frozen=True)
 class SensorDescription:
-    """A sensor. ``about``: one sentence about it. ``channels``: its names in the option ``sensors``.
+    """A sensor. ``about``: its description. ``channels``: the names that the option ``--sensors`` has for it.
 
-    ``tables``: the columns of each of its tables. ``rig``: the settings in each of its sections of the rig.
+    ``tables``: the columns of each table by its name. ``rig``: the settings of each section of the rig by its name.
     """
 
     name: str

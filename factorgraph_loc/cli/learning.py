@@ -242,18 +242,18 @@ def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[s
 
 
 def _reasons(made: MadeTags) -> dict[str, str]:
-    """Return by name why a tag could not be located, for all tags that are not located."""
+    """Return the reason why a tag could not be located, by the name of each such tag."""
     return {name: str(why) for name, why in made.open.items()}
 
 
 def _notes(made: LandmarkMap) -> list[str]:
-    """Return lines about results that the table lacks: notes, and landmarks of the given map that no measurement observes."""
+    """Return lines to print below the table: notes, and landmarks of the given map that were not observed."""
     unseen = ", ".join(made.unseen)
     return [*map(str, made.notes), *([f"not observed, kept from the given map: {unseen}"] if unseen else [])]
 
 
 def _notes_on_tags(made: MadeTags) -> list[str]:
-    """Return lines about results that the table lacks: notes, tags that are not located, the distance from given positions."""
+    """Return lines to print below the table: notes, tags that are not located, the distance from given positions."""
     listed = {entry.landmark for entry in made.made.entries}
     unmapped = {name: why for name, why in made.open.items() if name not in listed}
     lines = [*map(str, made.made.notes)]

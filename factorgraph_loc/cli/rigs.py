@@ -122,9 +122,9 @@ def new(
 def _value(option: str, given: str | None, default: str, expected: str, parse: Callable[[str], T], asks: bool) -> T:
     """Return the parsed value of an option.
 
-    ``given``: the text on the command line. If it is None and ``asks`` is set, the user is asked until the answer is valid.
-    ``default``: the text that is used without an answer. ``expected``: describes valid texts in messages. ``parse``: raises
-    KeyError or ValueError for an invalid text. Raises InputError for an invalid text that is no answer of the user.
+    ``given``: the text on the command line, None if the option is missing. If it is missing and ``asks`` is true, the
+    user is asked until the answer is valid. ``default``: the text without an answer. ``expected``: describes valid
+    texts. ``parse`` raises KeyError or ValueError for an invalid text. Raises InputError if ``given`` is invalid.
     """
     while True:
         text = default if given is None else given

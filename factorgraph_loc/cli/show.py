@@ -44,7 +44,8 @@ def warnings(doubts: Sequence[object]) -> None:
 def outcome(doubts: Sequence[str], failures: Sequence[str], most: int | None = None, more: str = "") -> None:
     """Print warnings and failures of several runs on stderr, one per line.
 
-    ``most``: maximum number of failures to print, None for all. ``more``: text that follows the number of the remaining ones.
+    ``most``: maximum number of failures to print, None for all. ``more``: end of the line "failed: N more", which is
+    printed if there are further failures.
     """
     warnings(doubts)
     for failure in failures[:most]:

@@ -70,7 +70,7 @@ def dress(axes: Iterable[Axes]) -> None:
 
 
 def styles() -> Iterator[dict[str, Any]]:
-    """Yield a colour and a line style for each curve of a plot, such as one per estimator, without end."""
+    """Yield distinct line styles without end. Each is a dict of the keyword arguments ``color`` and ``linestyle``."""
     for colour, line in zip(cycle(COLOURS), cycle(_STYLES), strict=False):
         yield {"color": colour, "linestyle": line}
 

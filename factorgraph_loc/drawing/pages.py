@@ -52,12 +52,15 @@ Part = str | Rows | Picture
 
 
 def render(template: str, **values: Any) -> str:
-    """Return the HTML page that a template in ``templates`` gives with these values. ``template``: the name of its file."""
+    """Return an HTML page. ``template``: a file name in ``drawing/templates``. ``values``: its variables by name."""
     return _environment().get_template(template).render(version=__version__, **values)
 
 
 def sectioned(title: str, lead: str, doubts: Sequence[Notice], sections: Mapping[str, Sequence[Part]]) -> str:
-    """Return an HTML page with an introduction ``lead``, highlighted warnings ``doubts``, and ``sections`` by title."""
+    """Return an HTML page with headings. ``lead``: the introduction. ``doubts``: warnings, which are highlighted.
+
+    ``sections``: the paragraphs, tables and pictures of each section, by its heading.
+    """
     names = {f"section-{i}": name for i, name in enumerate(sections)}
     parts = dict(zip(names, sections.values(), strict=True))
     return render("sectioned.html", title=title, lead=lead, doubts=doubts, sections=names, parts=parts)
@@ -85,7 +88,7 @@ def _environment() -> Environment:
 
 
 def _without_controls(value: Any) -> Any:
-    """Return a text with its control characters escaped, because a terminal would execute them. Return other values unchanged."""
+    """Return a text with its control characters escaped. Return other values unchanged."""
     if not isinstance(value, str) or not CONTROL.search(value):
         return value
     return type(value)(CONTROL.sub(lambda match: plain(match[0]), value))

@@ -58,10 +58,10 @@ def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 
 
 def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
-    """Show a log and its runs in the Rerun viewer. A viewer that is open is used.
+    """Show a log and its runs in the Rerun viewer. A new viewer is started unless one is open.
 
-    ``bind``: the IP address of a new viewer. Only this machine reaches the default address. Raises
-    InputError if an image cannot be read, if there is no display, or if the viewer does not start.
+    ``bind``: the IP address at which a new viewer listens. The default accepts only connections from this machine.
+    Raises InputError if an image cannot be read, if there is no display, or if the viewer does not start.
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         raise InputError(
@@ -184,7 +184,7 @@ def _robot(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 
 def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) -> None:
-    """Record images with identified points and predicted map points. They are drawn in front of the robot of the first run."""
+    """Draw the images, with identified points and predicted map points, in front of the robot of the first run."""
     settings = log.rig.find(CameraSettings)
     if settings is None or not pictures_of.has_pictures(log):
         return
@@ -221,16 +221,14 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
 def _pixels_over_time(
     recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
 ) -> None:
-    """Draw ``pixels`` (K, 2) in the image at each of the times ``t`` [s]. ``labels``: the names of all points.
-
-    Points are shifted by half a pixel, because the viewer's origin is a corner of the first pixel, not its centre.
-    """
+    """Draw points over images. ``pixels[i]`` (K, 2) is drawn at ``t[i]`` [s]. ``labels``: the name of each point."""
+    # the viewer's origin is a corner of the first pixel; the origin of ``pixels`` is the centre of the first pixel
     columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
     recording.send_columns(at, _times(t), columns.partition([len(p) for p in pixels]))
 
 
 def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
-    """Return the pixels (K, 2) of the nearest ``points`` (P, 3) in the image from ``pose`` (3,). K is 0 if the pose is NaN."""
+    """Return the pixels (K, 2) of the nearest visible ``points`` (P, 3). K is 0 if the robot's ``pose`` (3,) is NaN."""
     if not np.isfinite(pose).all():
         return np.empty((0, 2))
     pixels, depths = reprojection.predict(model, pose, points)
@@ -239,9 +237,9 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
 
 
 def _carried(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
-    """Return the entity path of the drawn camera, and the trajectory of its robot, or None.
+    """Return the entity path of the camera in Rerun, and the trajectory of the robot that carries the camera, or None.
 
-    The robot is the robot of the first run that has a trajectory. If no run has one, its trajectory is the reference.
+    It is the trajectory of the first run that has one, or else the reference of the log.
     """
     for run in runs:
         if len(run.played()):

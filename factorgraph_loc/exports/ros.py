@@ -188,7 +188,7 @@ class _Maker:
         return self.message(t_ns, topic, "visualization_msgs/MarkerArray", markers=made)
 
     def dots(self, name: str, positions: Mapping[str, Array], colour: Colour) -> list[dict[str, Any]]:
-        """Return the shapes of spheres at ``positions`` (3,) [m] by label, and of their labels above them. ``name``: namespace."""
+        """Return the shapes of labelled spheres. ``name``: their namespace. ``positions``: (3,) [m] by label."""
         places = {label: position.tolist() for label, position in positions.items()}
         labels = [
             self.shape(f"{name}: names", TEXT, LETTERS, colour, [], text=label, at=(x, y, z + DOT))

@@ -50,9 +50,9 @@ class RunFolder(FileModel, extra="ignore"):
 class StoredRun:
     """A stored run. Times are in seconds from the start of its log.
 
-    ``causal``: causal estimates from the first localized one on. ``final``: the trajectory estimated from the whole
-    log. Both may be empty. ``series``: times (K,) and values (K,) of the ``error_position`` [m], ``error_heading``
-    [rad] and ``nees`` of the estimates in :meth:`played`. ``landmarks``: estimated landmarks by name.
+    ``causal``: causal estimates since the first localization. ``final``: the trajectory estimated from the whole log.
+    Both may be empty. ``series``: times (K,) and values (K,) by name: ``error_position`` [m], ``error_heading`` [rad],
+    ``nees``. ``landmarks``: estimated landmarks by name. ``events``: times [s] and texts.
     """
 
     name: str

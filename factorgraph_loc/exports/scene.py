@@ -22,15 +22,15 @@ REFERENCE, DARK, DETECTION, SIGHTING = (128, 128, 128), (160, 160, 160), (230, 1
 
 @dataclass(frozen=True)
 class Lights:
-    """The objects of a map that are highlighted over time. The objects ``names[i]`` are highlighted from ``t[i]`` to
-    ``t[i + 1]`` [s]."""
+    """The objects of a map that are highlighted over time. ``names[i]``: names of all objects that are highlighted from
+    ``t[i]`` to ``t[i + 1]`` [s]."""
 
     t: Array
     names: tuple[tuple[str, ...], ...]
 
 
 def colours() -> Iterator[Colour]:
-    """Yield a colour for each of any number of runs, the same as in plots. Colours repeat after the last one."""
+    """Yield the colours of plots, one for each run. After the last colour they repeat."""
     # without the last colour, black, because the background of viewers is black
     for colour in itertools.cycle(drawing_figures.COLOURS[:-1]):
         red, green, blue = bytes.fromhex(colour[1:])
@@ -38,7 +38,7 @@ def colours() -> Iterator[Colour]:
 
 
 def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
-    """Return the mapped objects of each sensor, their positions (3,) [m] by name, and when each is highlighted.
+    """Return the mapped objects of each sensor, the position (3,) [m] of each by name, and when each is highlighted.
 
     An object is highlighted for :data:`LIT_FOR` seconds after each observation.
     """

@@ -19,6 +19,7 @@ from typing import BinaryIO
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.text import error_text, plain, quoted
 
+# maximum sizes of what is read
 SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
 YAML = 2**16  # bytes of a YAML file, which is a hundred times slower to read than TOML
 DEFINITION = 2**20  # characters of the definition of a ROS message, which is compiled to functions
@@ -27,14 +28,12 @@ IMAGE = 2**28  # bytes of an image file
 GRID = 2**26  # bytes of an uncompressed occupancy grid
 PIXELS = 2**26  # pixels of an image; the limit of OpenCV is 2^30
 CELLS = 2**27  # rows times columns that a Parquet file declares
-MEMORY, MEMORY_PER_BYTE = 2**30, 32  # a file of N bytes may take MEMORY + MEMORY_PER_BYTE * N bytes of memory
+MEMORY, MEMORY_PER_BYTE = 2**30, 32  # reading a file of N bytes may take MEMORY + MEMORY_PER_BYTE * N bytes of memory
 CHECK_INTERVAL = 0.01  # s between checks of the memory
 LARGEST_POINTER = 1024  # bytes of a pointer file of Git LFS, by its specification
 
 _limited = threading.Event()  # set if this process limits the memory that reading a file takes
-POINTER = (
-    b"version https://git-lfs.github.com/spec/v1"  # first line of a pointer file, which replaces a file not downloaded
-)
+POINTER = b"version https://git-lfs.github.com/spec/v1"  # first line of a pointer file of Git LFS
 _KINDS = {
     stat.S_IFREG: "a file",
     stat.S_IFDIR: "a folder",
@@ -150,8 +149,8 @@ def limited_memory(source: object, size: int) -> Iterator[None]:
     """End the process with one line on stderr if this block takes too much memory. No effect without :func:`limit_memory`.
 
     ``source``: the file that the block reads. ``size``: its size in bytes. The limit is :data:`MEMORY` plus
-    :data:`MEMORY_PER_BYTE` times the size. A file of a few kilobytes may unpack to gigabytes, and polars does not report that size
-    in advance. A limit set in the operating system is no alternative, because compiled parsers then abort without a message.
+    :data:`MEMORY_PER_BYTE` times ``size``. A compressed file of a few kilobytes may unpack to gigabytes. The limits of
+    the operating system are not used, because they make compiled parsers abort without a message.
     """
     if not _limited.is_set():
         yield
@@ -198,8 +197,7 @@ def _require_file(path: Path, kind: str) -> None:
 def quiet() -> Iterator[None]:
     """Discard all output to descriptor 2 (stderr) in this block. No effect outside of the main thread.
 
-    All threads share the descriptor, so messages of other threads are discarded too. Therefore the block should contain
-    only the call that reads one file. If several threads redirected it at the same time, it could stay redirected.
+    Messages that other threads print in the meantime are discarded too, so keep the block short.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -18,7 +18,7 @@ from factorgraph_loc.files.row_rules import MOST_SKIPPED, Fault, RowRules
 from factorgraph_loc.text import Notice, quoted
 from factors.se2 import Array, Integers
 
-SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # units of time, as powers of ten of a nanosecond
+SECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}  # units of time: exponents of ten, in nanoseconds
 ISO = "iso"
 MOST_DIGITS = 20  # maximum number of digits of a timestamp before its decimal point
 NUMBERS, NAMES = ("number", "whole"), ("name", "file")  # kinds of columns
@@ -27,16 +27,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Cells:
-    """The unparsed cells of N rows of a file.
+    """The unparsed cells of N rows of a file. A field is the name that this project has for a column, such as ``t_ns``.
 
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file.
-    ``columns``: for each field N texts, or numbers (N,) with NaN for empty cells.
-    ``labels``: for each field the name of the column in the file, if it differs from the field.
-    ``units``: for each field the unit in the file: a name, or the factor to ``Column.unit``.
-    ``decimal``: the decimal mark. ``left_out``: columns of the file that are not read.
-    ``passed``, ``unwanted``: numbers of JSON objects that lack needed columns, and of rows that ``where`` excludes.
-    ``rules``: what the manifest says about invalid and late rows, None without a manifest.
-    ``unread``: number and error of each row that could not be split into cells.
+    ``columns``: the cells of each field: N texts, or an array (N,) of numbers with NaN for empty cells.
+    ``labels``: the name of the column in the file, for each field with another name.
+    ``units``: the unit of a field in the file: a name, or the factor that converts values to ``Column.unit``.
+    ``decimal``: the decimal mark. ``left_out``: names of the columns of the file that are not read.
+    ``passed``: number of JSON objects without a needed column. ``unwanted``: number of rows that ``where`` excludes.
+    ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors.
+    ``unread``: row number and error message of each row that could not be split into cells.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """
 
@@ -91,10 +91,10 @@ class Cells:
     def usable(
         self, columns: Mapping[str, Column], warnings: list[Notice], *, offset: float = 0.0, more: Sequence[Fault] = ()
     ) -> "Cells":
-        """Return the cells without invalid rows if the manifest skips them, and in order of time if the manifest sorts them.
+        """Return the cells after ``rules`` are applied: without invalid rows, and sorted by timestamp.
 
         ``columns``: the description of each field, the timestamps first. ``offset`` [s]: is added to the timestamps.
-        ``more``: further invalid cells. Skipped rows and sorted rows add a warning each to ``warnings``.
+        ``more``: further invalid cells. If rows are skipped or sorted, a warning is appended to ``warnings``.
         """
         rules = self.rules
         if rules is None or rules.refuse:
@@ -110,9 +110,9 @@ class Cells:
         return kept
 
     def without(self, faults: Sequence[Fault], warnings: list[Notice]) -> "Cells":
-        """Return the cells of the rows without ``faults``. Skipped rows add a warning to ``warnings``.
+        """Return the cells of the rows without ``faults``. If rows are skipped, a warning is appended to ``warnings``.
 
-        Raises InputError at the first fault if the manifest does not skip invalid rows.
+        Raises InputError at the first fault unless ``rules`` skip invalid rows.
         """
         if self.rules is None or self.rules.bad_rows == "refuse":
             self.require(faults)
@@ -131,19 +131,18 @@ class Cells:
         return replace(self, rows=self.rows[which], columns=columns, unread=(), resumed=self.resumed[which])
 
     def require(self, faults: Sequence[Fault]) -> None:
-        """Raise InputError at the first invalid cell of ``faults``. If few rows are invalid, the message names the key
-        of the manifest that skips them."""
+        """Raise InputError at the first invalid cell of ``faults``."""
         for fault in faults:
             if fault.wrong.any():
                 is_few = self.rules is not None and fault.wrong.mean() <= MOST_SKIPPED
                 raise fault.error(self.path, self.rows, self.rules.skipping if self.rules and is_few else "")
 
     def fault(self, name: str, wrong: NDArray[np.bool_], expected: str) -> Fault:
-        """Return a Fault for the field ``name``. ``wrong`` (N,): mask of its invalid cells. ``expected``: describes valid cells."""
+        """Return the fault of a field. ``wrong`` (N,): mask of invalid cells. ``expected``: describes valid cells."""
         return Fault(self.labels.get(name, name), self.columns[name], wrong, expected)
 
     def _faults(self, name: str, column: Column) -> Sequence[Fault]:
-        """Return the faults of the field ``name``, which ``column`` describes: one for each reason why cells are invalid."""
+        """Return the faults of a field: one for each reason why cells are invalid. ``column``: describes the field."""
         if column.kind in NAMES:
             return self._names(name, column)[1]
         if column.kind in NUMBERS:
@@ -153,12 +152,12 @@ class Cells:
         return *faults, self.fault(name, away, f"a time at most {MAX_SPAN / 86_400.0:g} days from most of the file")
 
     def _known(self, stamps: tuple[Integers, Sequence[Fault]]) -> Integers:
-        """Return the timestamps [ns] in the first element of ``stamps``. Raises InputError if the second element has a fault."""
+        """Return the timestamps ``stamps[0]`` [ns]. Raises InputError if ``stamps[1]`` contains a fault."""
         self.require(stamps[1])
         return stamps[0]
 
     def _of_one_log(self, t_ns: Integers) -> Integers:
-        """Return ``t_ns``. Raises InputError, with the key that skips outliers, if timestamps are too far apart."""
+        """Return ``t_ns``. Raises InputError if timestamps are further apart than a log may last."""
         try:
             require_span([(self.path, self.rows, t_ns)])
         except InputError as error:
@@ -213,11 +212,12 @@ class Cells:
         return bad_field(self.path, self.labels.get(name, name), self.columns[name][i], expected, row=int(self.rows[i]))
 
     def _floats(self, texts: Sequence[Any]) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Convert N texts of a field to numbers (N,), with NaN for empty and invalid texts. Also return a mask (N,) of
-        the empty texts and a mask (N,) of the invalid ones.
+        """Return the numbers (N,) in N texts, and masks (N,) of the empty and of the invalid texts.
+
+        The numbers of empty and invalid texts are NaN.
         """
         if self.decimal == ".":
-            with suppress(ValueError):  # several times as fast, if no text is empty or invalid
+            with suppress(ValueError):  # the fast case: no text is empty or invalid
                 values = np.array(list(map(float, texts)), dtype=float)
                 return values, np.zeros(len(texts), dtype=bool), np.zeros(len(texts), dtype=bool)
 

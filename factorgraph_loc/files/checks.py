@@ -28,7 +28,7 @@ def require_finite(source: object, rows: Integers, names: Sequence[str], table: 
 
 
 def not_finite(names: Sequence[str], table: Array) -> list[Fault]:
-    """Return the NaN and infinite numbers of ``table`` (N, K) as a :class:`Fault` for each of the K columns ``names``."""
+    """Return a :class:`Fault` for each of the columns ``names`` of ``table`` (N, K). It marks NaN and infinity."""
     columns = zip(names, table.T, strict=True)
     return [Fault(name, values, ~np.isfinite(values), "a finite number") for name, values in columns]
 
@@ -36,10 +36,10 @@ def not_finite(names: Sequence[str], table: Array) -> list[Fault]:
 def in_order(
     source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], rules: RowRules | None = None
 ) -> Integers:
-    """Return the indices (M,) of the rows to keep: the last of all rows with equal timestamps ``t_ns`` (N,).
+    """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last.
 
-    ``rows`` (N,): row numbers in the file ``source``. ``rules``: keys of the manifest that the message names. Skipped
-    rows add a warning to ``warnings``. Raises InputError if a timestamp is older than the one before it.
+    ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, errors name the key that sorts the rows. If
+    rows are dropped, a warning is appended to ``warnings``. Raises InputError if a timestamp precedes the previous one.
     """
     _require_order(source, rows, t_ns, rules)
     keep = np.flatnonzero(np.append(np.diff(t_ns) > 0, True)[: len(t_ns)])
@@ -57,11 +57,11 @@ def increments_in_order(
     warnings: list[Notice],
     rules: RowRules | None = None,
 ) -> tuple[Integers, Array]:
-    """Merge the odometry increments that have equal timestamps ``t_ns`` (N,), by composition of their motions.
+    """Compose the odometry increments that have equal timestamps ``t_ns`` (N,).
 
-    ``moves`` (N, 3 or 4): motion (x, y, heading) [m, m, rad] since the row before, in the body frame there, and
-    optionally the time [s] of unknown motion. Returns distinct timestamps (M,) and the motion (M, 3 or 4)
-    since the timestamp before. For errors and the other arguments see :func:`in_order`.
+    ``moves`` (N, 3 or 4): the motion (x, y, heading) [m, m, rad] since the previous row, in the body frame of that row.
+    The optional fourth column is the part [s] of this time without odometry. Returns the distinct timestamps (M,) and
+    their motions (M, 3 or 4). For errors and the other arguments see :func:`in_order`.
     """
     _require_order(source, rows, t_ns, rules)
     last, out = composed(t_ns, moves[:, :3])
@@ -76,7 +76,7 @@ def increments_in_order(
 
 
 def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRules | None) -> None:
-    """Raise InputError at the first timestamp ``t_ns`` (N,) that is older than the one before it, see :func:`in_order`."""
+    """Raise InputError at the first timestamp that precedes the previous one. For arguments see :func:`in_order`."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
@@ -85,7 +85,7 @@ def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRul
 
 
 def _remedy(rules: RowRules | None) -> str:
-    """Return the end of an error message, with the manifest's key for sorting rows. Return "" if ``rules`` is None."""
+    """Return the end of an error message, which names the key that sorts rows. Return "" if ``rules`` is None."""
     return "" if rules is None else rules.sorting
 
 
@@ -98,10 +98,10 @@ def arrivals(
     *,
     max_late_ns: int | None = MAX_LATE_NS,
 ) -> None:
-    """Check timestamps ``t_ns`` (N,) in file order. A row is late if a row before it has a newer timestamp.
+    """Check that no timestamp ``t_ns`` (N,) is more than ``max_late_ns`` older than a previous one in the file.
 
-    Late rows add a warning to ``warnings``. Raises InputError if a row is late by more than ``max_late_ns``, unless it
-    is None. For the other arguments see :func:`in_order`.
+    Rows with smaller delays add a warning to ``warnings``. Raises InputError for a larger delay. If ``max_late_ns`` is
+    None, any delay is valid. For the other arguments see :func:`in_order`.
     """
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
@@ -129,8 +129,8 @@ def last_in_order(
 ) -> Integers:
     """Check timestamps ``t_ns`` (N,) by :func:`arrivals`. Return the indices (M,) of the rows to keep, in file order.
 
-    Of rows with equal timestamps, only the last is kept. ``names``: the landmark of each row. If it is given, only rows
-    with equal landmark and timestamp count as equal. For the other arguments see :func:`in_order`.
+    Of rows with equal timestamps, only the last is kept. If ``names`` gives the landmark of each row, rows with
+    different landmarks are all kept. For the other arguments see :func:`in_order`.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)

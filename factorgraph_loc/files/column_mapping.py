@@ -31,7 +31,7 @@ Value = bool | int | str
 
 
 class ReadNames(FileModel):
-    """How names of antennas and EPCs in RFID reads are converted to the names in the rig and in the map."""
+    """Settings that convert antenna names and EPCs of RFID reads to the names in the rig and in the map."""
 
     antenna: str | None = None
     """name of the only antenna, if the reads do not name it"""
@@ -42,7 +42,7 @@ class ReadNames(FileModel):
 
 
 class ColumnMapping(FileModel):
-    """How a table of another program is read."""
+    """Settings for reading a table of another program. A field is the name that this project has for a column."""
 
     file: str
     """file of the table, relative to the path of the manifest"""
@@ -60,7 +60,7 @@ class ColumnMapping(FileModel):
     """which rows to read: by column of the file, the value or the list of possible values"""
 
     def chosen(self) -> dict[str, set[str]]:
-        """Return the setting ``where`` with values as texts: for each column in it, the values of the rows to read."""
+        """Return the setting ``where`` with values as texts: by column, the values of the rows to read."""
         return {
             column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
             for column, values in self.where.items()
@@ -68,7 +68,7 @@ class ColumnMapping(FileModel):
 
 
 class TimedMapping(ColumnMapping, RowRules):
-    """How a table of another program with timestamps is read."""
+    """Settings for reading a table with timestamps of another program."""
 
     clock_offset: Annotated[float, Field(ge=-1e10, le=1e10), InUnit("s")] = 0.0
     """added to all timestamps"""
@@ -81,11 +81,11 @@ def read_mapped(
     optional: Collection[str] = (),
     either: Collection[str] = (),
 ) -> Cells:
-    """Read those columns of the file ``path`` that ``mapping`` assigns to fields.
+    """Read the columns of the file ``path`` that ``mapping.columns`` assigns to fields.
 
-    ``shapes``: sets of fields. The mapping must have all fields of one of these sets.
-    ``optional``: further fields that the mapping may have. The file may lack the columns of these fields.
-    ``either``: fields of the shapes. The file may lack some of their columns, but not all.
+    ``shapes``: alternative sets of fields. The mapping must have all fields of one set.
+    ``optional``: further fields that the mapping may have. The file may lack their columns.
+    ``either``: fields in ``shapes``. The file must have the column of at least one of them.
 
     Raises InputError if the mapping or the file is invalid, or if no row has the values in ``mapping.where``.
     """
@@ -121,9 +121,9 @@ def _mapped(
     passed: int = 0,
     unread: tuple[tuple[int, str], ...] = (),
 ) -> Cells:
-    """Return the cells of a file by field.
+    """Return the cells of a file by field. ``columns``: the cells by column name. ``available``: all column names.
 
-    ``columns``: cells by column of the file. ``available``: all column names. For other arguments see :class:`Cells`.
+    For the other arguments see :class:`Cells`.
     """
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
@@ -139,10 +139,9 @@ def _rules(mapping: ColumnMapping) -> RowRules | None:
 
 
 class TableFolder:
-    """Reads the tables of a folder, and records which rows and columns are not read.
+    """Reads the tables of a folder, and records which rows and columns no mapping reads.
 
-    ``warnings``: warnings about the content of the tables. Several mappings may read one file. A row or column of the
-    file counts as read if any of them reads it.
+    ``warnings``: warnings about the content of the tables. Several mappings may read the same file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -164,9 +163,9 @@ class TableFolder:
     def noted(
         self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
     ) -> Cells:
-        """Record the rows and columns of ``cells``. Return the cells without the rows that the mapping skips.
+        """Record that the rows and columns of ``cells`` are read. Return the cells after :meth:`Cells.usable`.
 
-        ``columns``: the description of each field. ``more``: further invalid cells, whose rows are skipped too.
+        ``columns``: the description of each field. ``more``: further invalid cells.
         """
         if cells.passed:
             sentence = "{source}: {objects} objects that lack mapped columns are skipped"
@@ -176,8 +175,7 @@ class TableFolder:
         return cells.usable(own, self.warnings, offset=mapping.clock_offset, more=more)
 
     def left_out(self) -> list[Notice]:
-        """Return warnings about rows and columns that no mapping reads. Each file with unread rows has a warning. Files
-        with the same unread columns have one warning together."""
+        """Return warnings about the rows and columns that no mapping reads."""
         warnings = []
         columns: dict[tuple[str, ...], list[str]] = {}
         for path, tables in self._read.items():
@@ -185,7 +183,7 @@ class TableFolder:
             count = tables[0][0].unwanted + len(tables[0][0].rows) + len(tables[0][0].unread)
             unchosen = count if all(cells.unwanted for cells, _ in tables) else 0
             for rows in ([*cells.rows.tolist(), *(row for row, _ in cells.unread)] for cells, _ in tables):
-                unchosen -= sum(row not in read for row in rows)  # several rows of one JSON line have the same number
+                unchosen -= sum(row not in read for row in rows)  # the rows of one JSON line have the same row number
                 read.update(rows)
             if unchosen > 0:
                 names = listed(dict.fromkeys(name for _, mapping in tables for name in mapping.where))
@@ -205,8 +203,7 @@ class TableFolder:
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
-    """Convert EPCs to the letter case ``case``, or decode hexadecimal digits if it is "ascii-hex". EPCs that cannot be
-    decoded stay unchanged."""
+    """Convert EPCs to the letter case ``case``. If it is "ascii-hex", decode hexadecimal EPCs to ASCII if possible."""
     if case == "as written":
         return list(epcs)
     if case == "ascii-hex":
@@ -223,8 +220,10 @@ def text_of_hex(digits: str) -> str:
 
 
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """Read the mapped columns of a CSV file, in the rows that ``where`` selects. Raises InputError if a column of
-    ``needed`` is missing."""
+    """Read the columns of a CSV file that ``mapping`` assigns to fields, in the rows that ``where`` selects.
+
+    Raises InputError if all columns of one entry of ``needed`` are missing.
+    """
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     if not content:
@@ -245,7 +244,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         header = _numbers(len(first))
         if (
             rules := _rules(mapping)
-        ) is not None and rules.bad_rows == "skip":  # a row that was cut off does not define the columns
+        ) is not None and rules.bad_rows == "skip":  # the number of columns is that of most rows
             lengths = Counter(len(parts) for _, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
             header = _numbers(lengths.most_common(1)[0][0] if lengths else len(first))
     _require_columns(path, mapping, needed, header, first_row)
@@ -293,8 +292,7 @@ def _has(names: Collection[str], needed: Sequence[Alternatives]) -> bool:
 def _require_columns(
     path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives], header: Sequence[str], row: int
 ) -> None:
-    """Raise InputError if a needed column is missing in ``header``, or a mapped column occurs twice. ``row``: line
-    number of the header."""
+    """Raise InputError if a needed column is missing in ``header``, or a mapped one occurs twice. ``row``: its line."""
     counts = Counter(header)
     for columns in [*needed, *((column,) for column in mapping.where)]:
         if not _has(counts, [columns]):
@@ -305,9 +303,10 @@ def _require_columns(
 
 
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """Read the mapped columns of JSON lines, whose lines are objects or lists of objects.
+    """Read the mapped columns of a file in which each line is a JSON object or a list of JSON objects.
 
-    Only objects are read that ``where`` selects and that have all ``needed`` columns. Raises InputError if none has such a column.
+    Objects that ``where`` excludes or that lack a ``needed`` column are ignored. Raises InputError if a needed column
+    is missing in all objects.
     """
     unread: list[tuple[int, str]] = []
     objects = list(_objects(path, unread))
@@ -356,10 +355,10 @@ def _text(value: Any) -> str:
 
 
 def _objects(path: Path, unread: list[tuple[int, str]]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Return the line number and the content of each object of JSON lines. The key of a nested value is the path of
-    keys to it, joined by dots.
+    """Yield the line number and the content of each object in a file of JSON lines.
 
-    The number and the error of each invalid line are appended to ``unread``.
+    A nested value has the keys that lead to it, joined by dots, as its key. The number and the error of each invalid
+    line are appended to ``unread``.
     """
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():

@@ -60,9 +60,9 @@ def symmetric(upper: Sequence[Array]) -> Array:
 class Column:
     """Description of a column of a table.
 
-    ``units``: names of the units that a file may use, with the factors to the first one. Values are converted to the
-    first one. ``low``, ``high``: inclusive bounds of converted values. ``may_lack``: whether a cell may be empty.
-    ``doc``: meaning of the column. ``field``: name of the values in a stream object, if it differs from ``name``.
+    ``units``: the units that a file may use, with the factors that convert values to the first unit. ``low``, ``high``:
+    inclusive bounds of converted values. ``may_lack``: whether a cell may be empty. ``doc``: meaning of the column.
+    ``field``: attribute of a ``Stream`` with the values of the column, "" if it has the name of the column.
     ``left_out_below``: smaller values are treated as empty cells, with a warning.
     """
 
@@ -78,8 +78,7 @@ class Column:
 
     @cached_property
     def measured(self) -> Column:
-        """The description of the values in a stream object: ``name`` is the name of its field, and ``low`` is at least
-        ``left_out_below``."""
+        """The column as an attribute of a ``Stream``: ``name`` is ``field``, ``low`` is at least ``left_out_below``."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property
@@ -106,9 +105,9 @@ class Column:
         return f"{what}{of} in {self.low:.6g} to {self.high:.6g}"
 
     def in_unit(self, unit: str | float, source: object = "") -> tuple[Column, float]:
-        """Return the column with bounds in another unit, and the factor from that unit to :attr:`unit`.
+        """Return the column with bounds in another unit, and the factor that converts from that unit to :attr:`unit`.
 
-        ``unit``: a name in ``units``, or that factor. Raises InputError with the file ``source`` for an unknown unit.
+        ``unit``: a name in ``units``, or the factor. Raises InputError with the file ``source`` if the unit is unknown.
         """
         factor = self.units.get(unit, 0.0) if isinstance(unit, str) else float(unit)
         if not LEAST_UNIT <= abs(factor) <= 1.0 / LEAST_UNIT:
@@ -143,10 +142,10 @@ class Column:
 class Table:
     """Description of a table of a sensor.
 
-    ``stream``: import path of the class of the stream that the table describes, "" for none.
+    ``stream``: import path of the class that contains the parsed table, "" for none.
     ``is_scan``: whether all rows with the same timestamp form one measurement.
-    ``optional``: groups of columns. A file has all columns of such a group or none.
-    ``messages``: by type of ROS message, the path of each column's value in the message.
+    ``optional``: groups of columns. A file must have either all columns of a group or none.
+    ``messages``: for each type of ROS message, the path in the message to the value of each column.
     """
 
     name: str
@@ -203,7 +202,7 @@ SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
 
 
 def unit_since_1970(stamp: float) -> str | None:
-    """Guess the unit of a timestamp since 1970 from its magnitude. Return None if it is too small for any unit."""
+    """Guess the unit of a timestamp since 1970 from its size. Return None if it is too small for any unit."""
     return next((unit for unit, least in SINCE_1970.items() if abs(stamp) > least), None)
 
 

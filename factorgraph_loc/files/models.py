@@ -115,8 +115,8 @@ def read_text(path: Path, limit: int = bounded.DATA) -> str:
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
-    Raises InputError if the file cannot be read or is not TOML. Also if it is nested deeper than :data:`DEEPEST`, or
-    contains more than :data:`MOST_ENTRIES` values, a date, or an integer of more than 64 bits.
+    Raises InputError if the file cannot be read, is not TOML, or is nested deeper than :data:`DEEPEST` levels. The
+    file may not contain more than :data:`MOST_ENTRIES` values, a date, or an integer of more than 64 bits.
     """
     return parse_toml(read_text(path, bounded.SETTINGS), path)
 
@@ -154,8 +154,8 @@ def check_content(content: dict[str, Any], source: object) -> None:
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
-    Raises InputError if the file cannot be read or is not JSON. Also if it is nested deeper than :data:`DEEPEST`, or contains more
-    than :data:`MOST_ENTRIES` values, NaN, infinity, a duplicate key, or an integer of more than :data:`MOST_DIGITS` digits.
+    Raises InputError if the file cannot be read, is not JSON, or is nested deeper than :data:`DEEPEST` levels. The
+    file may not contain more than :data:`MOST_ENTRIES` values, NaN, infinity, or a duplicate key.
     """
     return parse_json(read_text(path, bounded.SETTINGS), path)
 
@@ -229,7 +229,7 @@ def nearest(word: str, known: list[str]) -> str:
 
 
 def similar(word: str, known: list[str]) -> list[str]:
-    """Return a list with the known word that is most similar to ``word``, or an empty list if none is similar."""
+    """Return a list with the word of ``known`` that is most similar to ``word``, or [] if none is similar."""
     short = [name for name in known if len(name) <= NAME][:MOST_NAMES]
     return difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
 
@@ -315,8 +315,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically. Use it for content that a library has written to memory, because libraries report a full
-    disk by exceptions of their own."""
+    """Write a file atomically. Raises OSError if that fails, for example because the disk is full."""
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 

@@ -42,7 +42,7 @@ class Fault:
 
 
 class RowRules(FileModel):
-    """Rules of a reader for invalid rows, and for rows out of order. ``PLACE``: the file that has these keys."""
+    """Settings of a reader for invalid rows, and for rows out of order. ``PLACE``: the file with them, for messages."""
 
     PLACE: ClassVar[str] = "the manifest"
     bad_rows: Literal["refuse", "skip"] = "refuse"
@@ -58,11 +58,11 @@ class RowRules(FileModel):
         warnings: list[Notice],
         unread: Sequence[tuple[int, str]] = (),
     ) -> Integers:
-        """Return the indices of the rows without a fault. Skipped rows add a warning to ``warnings``.
+        """Return the indices of the rows without a fault. If rows are skipped, a warning is appended to ``warnings``.
 
-        ``rows`` (N,): row numbers in the file ``source``. ``faults``: the invalid cells. ``unread``: number and error
-        of further rows that could not be split into cells. Raises InputError at the first fault if ``bad_rows`` is
-        "refuse", or if more than half of all rows are invalid.
+        ``rows`` (N,): row numbers in the file ``source``. ``faults``: the invalid cells. ``unread``: row number and
+        error message of each further row that could not be split into cells. Raises InputError at the first fault if
+        ``bad_rows`` is "refuse", or if more than half of all rows are invalid.
         """
         wrong = np.zeros(len(rows), dtype=bool)
         for fault in faults:
@@ -85,7 +85,8 @@ class RowRules(FileModel):
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
         """Return indices (N,) that sort the rows by timestamp ``t_ns`` (N,), or 0 to N - 1 if ``order`` is "refuse".
-        Sorted rows add a warning to ``warnings``. ``rows`` (N,): row numbers that the warning names."""
+
+        If rows are out of order, a warning is appended to ``warnings``. ``rows`` (N,): row numbers in ``source``."""
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))
@@ -99,24 +100,25 @@ class RowRules(FileModel):
 
     @property
     def refuse(self) -> bool:
-        """True if the rows are neither skipped nor sorted."""
+        """True if both an invalid row and a row out of order are errors."""
         return self.bad_rows == "refuse" and self.order == "refuse"
 
     @property
     def skipping(self) -> str:
-        """The end of an error message that names the key for skipping invalid rows."""
+        """The end of an error message, with the setting that skips invalid rows."""
         return f'; bad_rows = "skip" in {self.PLACE} skips such rows'
 
     @property
     def sorting(self) -> str:
-        """The end of an error message that names the key for sorting rows."""
+        """The end of an error message, with the setting that sorts rows."""
         return f'; order = "sort" in {self.PLACE} sorts the rows'
 
 
 def require_read(unread: Sequence[tuple[int, str]], count: int, rules: RowRules | None) -> None:
-    """Raise InputError with the first error of ``unread``: row number and error of each row that could not be split into cells.
+    """Raise InputError if rows of a file could not be split into cells, unless ``rules.bad_rows`` is "skip".
 
-    No error is raised if ``rules.bad_rows`` is "skip" and at most half of the ``count`` rows of the file are unread.
+    ``unread``: number and error message of each such row. ``count``: number of rows. If more than half of all rows are
+    unread, the error is raised in any case.
     """
     if not unread:
         return

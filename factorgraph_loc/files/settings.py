@@ -28,9 +28,9 @@ class Setting:
 
     ``key``: path of keys, such as ``a.b``. A part ``*`` stands for a name that the user chooses.
     ``kind``: "number", "whole number", "true or false", "text", "choice" or "table", or several of them joined by "or".
-    ``count``: number of values of a list; 0 if any number is valid, 1 if the setting is no list.
-    ``default``: None if the setting is not set. ``low``, ``high``: inclusive bounds, infinite if there is none.
-    ``choices``: the valid texts of a choice.
+    ``count``: 1 if the setting is no list, or else the length of the list; 0 if any length is valid.
+    ``default``: None if there is none. ``low``, ``high``: inclusive bounds, infinite if there is none.
+    ``choices``: the valid texts if ``kind`` is "choice".
     """
 
     key: str
@@ -49,7 +49,8 @@ class Setting:
 class _Part:
     """One alternative of the type annotation of a field, such as ``float`` in ``list[float] | None``.
 
-    ``metadata``: pydantic's bounds and units. ``path``: ".*" for each dict around the type. ``count``: as in :class:`Setting`.
+    ``metadata``: bounds and units, as pydantic objects. ``path``: end of the key, with ".*" for each enclosing dict.
+    ``count``: as in :class:`Setting`.
     """
 
     type: Any
@@ -78,7 +79,9 @@ def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | N
             known = settings.get(setting.key)
             if known is None:
                 settings[setting.key] = setting
-            elif known.choices and setting.choices:  # the field that selects one of several alternative models
+            elif (
+                known.choices and setting.choices
+            ):  # it selects one of several models, and each model allows one choice
                 choices = dict.fromkeys((*known.choices, *setting.choices))
                 settings[setting.key] = replace(known, choices=tuple(choices))
     return list(settings.values())
@@ -144,9 +147,9 @@ def _is_model(kind: Any) -> bool:
 
 
 def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
-    """Return the description of the setting ``key`` itself, without nested settings. Return nothing for an undocumented table.
+    """Yield the description of the setting ``key``, but of a table only if it has a docstring.
 
-    ``parts``: the alternatives of its type. ``setting``: the description so far: key, default and meaning.
+    ``parts``: the alternatives of its type. ``setting``: a description with key, default and meaning, to complete.
     """
     own = [part for part in parts if not _is_model(part.type)]
     if not own:
@@ -175,7 +178,7 @@ def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
 
 
 def _nested(key: str, parts: list[_Part], value: Any) -> Iterator[Setting]:
-    """Return the settings of the models that the field ``key`` may contain. ``value``: the default of the field."""
+    """Yield the settings of the models that the field ``key`` may contain. ``value``: the default of the field."""
     for part in parts:
         if _is_model(part.type):
             yield from settings_in(part.type, f"{key}{part.path}.", value if isinstance(value, part.type) else None)

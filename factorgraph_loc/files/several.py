@@ -13,9 +13,9 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def one_or_several(kind: type[BaseModel]) -> Any:
-    """Return the type annotation of a field that contains a model of class ``kind``, a dict of models by name, or None.
+    """Return the type annotation of a field that contains the settings of one sensor, of several by name, or None.
 
-    In TOML the field is a table with the keys of the model, or a table of named tables with these keys.
+    ``kind``: class of the settings. In TOML, a field ``gps`` is a table ``[gps]``, or tables ``[gps.NAME]``.
     """
     several = TypeAdapter(dict[str, kind])  # type: ignore[valid-type]
 
@@ -45,9 +45,9 @@ def is_name(name: str) -> bool:
 
 
 def by_name(section: str, value: Model | Mapping[str, Model] | None) -> dict[str, Model]:
-    """Return the models in a field of the type :func:`one_or_several`, by table name.
+    """Return the models in a field of the type :func:`one_or_several`, by their keys.
 
-    ``section``: name of the field. A single model is in the table ``section``, one of several in ``section.NAME``.
+    ``section``: name of the field. The key of a single model is ``section``. Several models have keys ``section.NAME``.
     """
     if isinstance(value, Mapping):
         return {f"{section}.{name}": model for name, model in value.items()}

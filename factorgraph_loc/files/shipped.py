@@ -18,9 +18,9 @@ def rigs() -> dict[str, Path]:
 
 
 def readers() -> dict[str, Path]:
-    """Return the installed descriptions of readers: the file by name, sorted by name.
+    """Return the installed reader descriptions: the file by name, sorted by name.
 
-    Such a description is a manifest of the reader ``mapped`` that names no data.
+    A reader description has the settings for reading the tables of a known program.
     """
     return {file.name.removesuffix(".reader.toml"): file for file in sorted(folder().glob("*.reader.toml"))}
 

@@ -46,8 +46,7 @@ def rows_of_length(
     """Collect the rows of a CSV file by column. ``rows``: line number and cells of each row.
 
     Returns the line numbers (N,), the N cells of each column by its name in ``header``, and line number and error of
-    each row with a wrong number of cells. Raises InputError at the first such row, unless ``rules`` skip invalid rows
-    and at most half of the rows are invalid.
+    each row with a wrong number of cells. Raises InputError at the first such row unless ``rules`` skip it.
     """
     numbers: list[int] = []
     table: list[list[str]] = []
@@ -67,8 +66,8 @@ def rows_of_length(
 def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = None) -> tuple[Cells, tuple[Column, ...]]:
     """Read a CSV file that contains one of several possible ``tables``.
 
-    Returns the cells and the columns of the table that the header of the file fits best. Raises InputError with file
-    and row if the content is invalid. ``rules``: what a manifest says about invalid rows, None without a manifest.
+    Returns the cells and the columns of the table that the header of the file fits best. Raises InputError if the
+    content is invalid. ``rules``: whether invalid rows are skipped. None: they are errors.
     """
     lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
     parsed = csv_rows(path, lines)
@@ -167,7 +166,7 @@ class TableRows:
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps
     [ns]. ``numbers``: numbers (N,) of each column in ``Column.unit``, NaN for empty cells. ``names``: N texts of each
     column of names. ``left_out``: columns of the file that are not read.
-    ``rules``: what the manifest says about invalid and late rows, None without a manifest.
+    ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """
 
@@ -208,8 +207,8 @@ class TableRows:
 def read_table(path: Path, tables: Sequence[Table], rules: RowRules, warnings: list[Notice]) -> TableRows:
     """Read a CSV or Parquet file that contains one of several possible ``tables``. Other columns of the file are ignored.
 
-    Raises InputError with file, row and column if a value is missing, is not a number, or is out of bounds, unless
-    ``rules`` skip such rows. Skipped rows and sorted rows add a warning each to ``warnings``.
+    Raises InputError if a value is missing, is not a number, or is out of bounds, unless ``rules`` skip such rows. If
+    rows are skipped or sorted, a warning is appended to ``warnings``.
     """
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
         cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables, rules)

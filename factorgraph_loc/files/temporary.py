@@ -158,4 +158,4 @@ def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:
         raise InputError(f"{out}: is a file, expected a folder for the results")
     existing = [name for name in names if (out / name).exists()]
     if existing and not overwrite:
-        raise InputError(f"{out}: holds results already ({existing[0]}); choose another folder, or --overwrite")
+        raise InputError(f"{out}: holds results already ({existing[0]}); choose another folder, or give --overwrite")

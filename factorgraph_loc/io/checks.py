@@ -93,10 +93,10 @@ def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]
 
 
 def without_false_headings(log: Log) -> Log:
-    """Return the log, with a reference without headings if its headings are evidently meaningless.
+    """Return the log. Mark the headings of its reference as invalid if they never change although the robot turns.
 
-    Headings are meaningless if they never change while the odometry turns by more than :data:`TURNED`. Systems that
-    measure only positions may report an orientation of zero.
+    Systems that measure only positions may report a constant orientation. The robot turns if the odometry turns by
+    more than :data:`TURNED`.
     """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not reference.has_heading or len(reference.t) < 2 or np.ptp(reference.poses[:, 2]) > 1e-9:
@@ -116,7 +116,7 @@ def without_false_headings(log: Log) -> Log:
     return replace(log, reference=replace(reference, has_heading=False), warnings=(*log.warnings, warning))
 
 
-def look_over(log: Log) -> list[Notice]:
+def log_warnings(log: Log) -> list[Notice]:
     """Return warnings about gaps in the odometry, rows before the odometry, and landmarks that the map lacks.
 
     Raises InputError if the log has measurements but no odometry.

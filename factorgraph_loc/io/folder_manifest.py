@@ -51,7 +51,7 @@ APART = 5.0  # s: maximum gap between the time spans of two tables; at a larger 
 
 @dataclass
 class _Roles:
-    """The proposed role of each table, such as ``odometry``. ``tables``: the table by its role. ``remarks``: for the user."""
+    """The proposed roles of tables. ``tables``: by role, such as ``odometry``. ``remarks``: sentences for the user."""
 
     tables: dict[str, Guess] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
@@ -244,7 +244,7 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
     """Add the distance between the wheels, and the distance per encoder count, to the ``settings`` of odometry.
 
     ``table``: the table of odometry. ``sides``: its fields of the wheels. ``roles``: the tables of all roles, and remarks.
-    The two distances are estimated from the reference, or else are examples that a remark asks the user to replace.
+    The two distances are estimated from the reference. Without a reference they are examples, and a remark says so.
     """
     settings["track"] = TRACK
     if sides[0] != "left":
@@ -296,9 +296,10 @@ def _reference(roles: _Roles, path: Path) -> Trajectory | None:
 
 
 def _lengths(t: Array, counted: Array, reference: Trajectory) -> tuple[float, float]:
-    """Return the length of the reference [m], and the total change of the encoder counts, over the time that both have in common.
+    """Return the length of the reference [m], and the sum of the absolute changes of the encoder counts.
 
-    ``t`` (N,): times [s]. ``counted`` (N,): encoder counts. If they have no time in common, each is summed over all its time.
+    ``t`` (N,): times [s]. ``counted`` (N,): encoder counts. Both results are for the time that the counts and the
+    reference have in common, or for all times if there is none.
     """
     during = (t >= reference.t[0]) & (t <= reference.t[-1])
     of_reference = (reference.t >= t[0]) & (reference.t <= t[-1])
@@ -309,7 +310,7 @@ def _lengths(t: Array, counted: Array, reference: Trajectory) -> tuple[float, fl
 
 
 def _each_second(t: Array, values: Array) -> Array:
-    """Return the first of the ``values`` (N, ...) in each interval of :data:`WINDOW`. ``t`` (N,): the times of the values [s]."""
+    """Return the first of ``values`` (N, ...) in each interval of length :data:`WINDOW`. ``t`` (N,): the times [s]."""
     return np.asarray(values[np.unique(np.floor((t - t[0]) / WINDOW), return_index=True)[1]])
 
 
@@ -347,7 +348,7 @@ def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
 def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
     """Add clock offsets to the ``options`` of tables with times that do not overlap the times of most other tables.
 
-    The offset aligns the turns of the robot in two tables. If no alignment is clear, both begin at the same time.
+    An offset aligns the turns of the robot in two tables. If the alignment is unclear, it makes both begin together.
     """
     starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}

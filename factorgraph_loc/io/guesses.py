@@ -75,7 +75,7 @@ ENDS: dict[str, Mapping[str, str]] = {
 }
 TEXTS = ("epc", "antenna", "landmark")  # fields whose values need not be numbers
 FASTEST = 15.0  # m/s above which a speed is assumed to be in another unit
-# by field: possible units, each with the largest value that it explains; the first unit that explains all values is used
+# by field: possible units, each with the largest value that is plausible in it; the first plausible unit is used
 LARGER: dict[str, tuple[tuple[str, float], ...]] = {
     **dict.fromkeys(("heading", "bearing", "facing"), (("rad", 6.4), ("deg", np.inf))),
     "w": (("rad/s", 12.0), ("deg/s", np.inf)),
@@ -115,7 +115,7 @@ class Guess:
         return self.path.name
 
     def numbers(self, name: str) -> Array | None:
-        """Return the numbers (N,) of a column, NaN where it is empty. Returns None if a text is no number, or all are empty."""
+        """Return the numbers (N,) of a column, NaN for empty cells. Return None if a cell is no number or all are empty."""
         texts = self.columns[name]
         with suppress(ValueError):
             values = np.array([float(t.replace(self.decimal, ".")) if t else np.nan for t in texts])
@@ -245,7 +245,8 @@ def _split(name: str) -> tuple[str, str]:
 def _add_time(out: Guess) -> None:
     """Guess the column of the time and its unit.
 
-    Columns with a name of times are tried first, then the first column. The values must be times, or numbers that hardly ever fall.
+    Columns with a name such as "time" are tried first, then the first column. The values must be times, or numbers
+    that increase from row to row with few exceptions.
     """
     names = list(out.columns)
     named = [name for name in names if TIME.match(plain(_split(name)[0]))] if out.header else names[:1]

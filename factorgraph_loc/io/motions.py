@@ -62,9 +62,9 @@ class WheelSizes(FileModel):
     def twists(self, source: object, wheels: Array, warnings: list[Notice]) -> Array:
         """Return the motion (N, 3) of the robot ahead [m], to the left [m] and about the vertical [rad].
 
-        ``wheels`` (N, 2 or 4): the distances [m] of the left and the right wheel, and of the rear left and the rear
-        right wheel. Speeds [m/s] give rates. Wheels that may be mecanum wheels add a warning about the file ``source``
-        to ``warnings``. Formulas: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot".
+        ``wheels`` (N, 2 or 4): the distances [m] of the left, right, rear left and rear right wheels. If they are
+        speeds [m/s], the result is in m/s and rad/s. If the wheels may be mecanum wheels, a warning is appended.
+        Formulas: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot".
         """
         assert self.track is not None
         left, right, rear_left, rear_right = (wheels if wheels.shape[1] == 4 else np.hstack((wheels, wheels))).T
@@ -91,9 +91,8 @@ def between_poses(
 ) -> Array:
     """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
 
-    A reset is a jump to the origin that is faster than any motion before, or a pose of zeros after a pause or after
-    null poses. At a reset, the previous motion is continued, with a warning about the file ``source`` in ``warnings``.
-    ``lost_ns``: the timestamps of null poses, which a device reports while it has lost its pose.
+    Where the odometry is reset to the origin, the previous motion is continued, and a warning is appended to
+    ``warnings``. ``lost_ns``: the timestamps at which the device had lost its pose.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -109,11 +108,11 @@ def between_poses(
 
 
 def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Integers, Array]:
-    """Return timestamps (M,) [ns] and increments (M, 4) of odometry with null poses, reported by a device that is lost.
+    """Return timestamps (M,) [ns] and increments (M, 4) of odometry from a device that sometimes loses its pose.
 
-    ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of null poses.
-    An increment is x, y [m], heading [rad], and the time [s] of unknown motion because of null poses. At
-    null poses the previous motion is continued, for at most :data:`HOLD_TIME`. Without them, increments are (N, 3).
+    ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of lost poses.
+    An increment is x, y [m], heading [rad], and the time [s] with a lost pose. Meanwhile the previous motion is
+    continued for at most :data:`HOLD_TIME`. If no pose is lost, the increments are (N, 3).
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):
@@ -199,7 +198,7 @@ def odometry_stream(
 def wheel_steps(distances: Array, scale: float) -> Array:
     """Return the steps (N - 1,) between the distances (N,) of one wheel. ``scale``: distance per encoder count.
 
-    Counters that wrap are continued. Between rows, a wheel is assumed to move less than half of the counter's range.
+    A step is corrected if the encoder wraps to 0. A step must be less than half of the encoder's range.
     """
     steps: Array = np.diff(distances)
     ticks = distances / scale
@@ -219,7 +218,7 @@ def _durations(t_ns: Integers) -> Array:
 
 
 def _largest_before(rates: Array, least: float) -> Array:
-    """Return, for each of the ``rates`` (N,), the largest rate before it that is not a jump, but at least ``least``."""
+    """Return the running maximum (N,) of ``rates`` (N,) before each rate, without jumps. It is at least ``least``."""
     out, most = np.empty(len(rates)), least
     for i, rate in enumerate(rates.tolist()):
         out[i] = most
@@ -229,9 +228,9 @@ def _largest_before(rates: Array, least: float) -> Array:
 
 
 def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
-    """Return the ``steps`` (N - 1, D), where the steps with indices ``resets`` are replaced by the previous motion.
+    """Return the ``steps`` (N - 1, D). Those with indices ``resets`` are replaced by the motion of the step before.
 
-    Adds a warning about the file ``source`` to ``warnings``."""
+    If there are resets, a warning about the file ``source`` is appended to ``warnings``."""
     durations = _durations(t_ns)
     for i in resets.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])

@@ -37,9 +37,9 @@ def proposal_of(
 ) -> Proposal:
     """Return the manifest of the log at ``path`` with the ``options`` of a reader.
 
-    It is to be saved in ``folder`` if the log is below ``folder``, else in the folder that contains the log. Rig and
-    map are files next to the log, either with the log's name or the only ones. A remark asks for a missing rig or map.
-    If ``with_map`` is false, the options describe the map, and no remark asks for one.
+    It is to be saved in ``folder`` if the log is below ``folder``, else in the folder that contains the log. A rig file
+    and a world file next to the log are named in the manifest. A remark asks for a missing rig or world.
+    ``with_map``: False if ``options`` describe the map, so that no world file is needed.
     """
     root = folder if path.is_relative_to(folder) else path.parent
     kind = "bag" if reader == "rosbag" else "folder"
@@ -76,7 +76,7 @@ def toml_of(content: Mapping[str, Any], name: str = "") -> str:
 
 
 def _sensors(key: str, value: Any) -> dict[str, Any]:
-    """Return ``{key: value}``, or the settings of each sensor by its name if ``value`` has several sensors of the kind ``key``."""
+    """Return ``{key: value}``, or ``{key.NAME: settings}`` if ``value`` has the settings of several sensors by name."""
     if key in several() and all(isinstance(settings, dict) for settings in value.values()):
         return by_name(key, value)
     return {key: value}
@@ -85,8 +85,8 @@ def _sensors(key: str, value: Any) -> dict[str, Any]:
 def distinct(names: Sequence[str]) -> list[str]:
     """Return short distinct names of several sensors.
 
-    ``names``: topics or files. A short name has the words that are not common to all: ``/uwb/left``, ``/uwb/right``
-    give ``left``, ``right``. If a short name is empty or two are equal, all are numbered: ``sensor_1``, ``sensor_2``.
+    ``names``: topics or files. Words that all names contain are omitted: ``/uwb/left``, ``/uwb/right`` give ``left``,
+    ``right``. If that gives an empty name or equal names, the sensors are numbered: ``sensor_1``, ``sensor_2``.
     """
     words = [re.findall(r"[^\W_]+", name) for name in names]
     common = set.intersection(*map(set, words))

@@ -66,7 +66,7 @@ class ResultFiles:
     folder: Path = Path()
 
     def estimates(self) -> dict[str, Estimates]:
-        """Return the estimates of each of :data:`KINDS`. Causal estimates begin with the first one that is localized."""
+        """Return the estimates of each of :data:`KINDS`. Causal estimates before the first localization are omitted."""
         source = self.folder / ESTIMATES
         table = parse_parquet(self.read(ESTIMATES), source, list(COLUMNS))
         with foreign(source, "is no table of estimates"):
@@ -84,7 +84,7 @@ class ResultFiles:
             raise InputError(f"{source}: contains no valid trajectory: {error_text(error)}") from error
 
     def innovations(self) -> dict[str, Array]:
-        """Return the innovations of each sensor: rows (K, 3) of time [s], normalised innovation squared and degrees of freedom."""
+        """Return an array (K, 3) by sensor: time [s], normalised innovation squared and degrees of freedom."""
         table = parse_parquet(self.read(INNOVATIONS), self.folder / INNOVATIONS)
         table = table.select("sensor", (pl.col(STAMP) - (self.t0_ns or 0)) / 1e9, "nis", "dof")
         groups = table.group_by("sensor", maintain_order=True)

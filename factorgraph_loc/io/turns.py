@@ -10,7 +10,7 @@ from factors.se2 import Array
 STEP = 0.05  # s between the times at which turns are compared
 WINDOW = 1.0  # s over which a turn is measured
 ALIKE = 0.9  # minimum correlation of the turns in two tables of one drive
-DISTINCT = 2.0  # minimum ratio of 1 - correlation at any other offset to 1 - correlation at the best offset
+DISTINCT = 2.0  # minimum ratio of 1 - correlation at other offsets to 1 - correlation at the best offset
 NEAR = 5.0  # s: minimum difference of another offset from the best offset
 LONGEST = 86400.0  # s: maximum duration of a table; a longer duration shows that its clock was set meanwhile
 OVERLAP = 0.9  # minimum fraction of the shorter table that must overlap the other table

@@ -91,8 +91,8 @@ class Localizer:
         heading is unknown; the status is then not ``localized`` until measurements determine the heading.
         ``covariance`` (3, 3) of the pose, or (2, 2) of the position if the heading is NaN. The default has standard
         deviations of 0.05 m and 0.05 rad.
-        ``t``: time of the pose [s], by default the time of the first measurement. The last velocity from before ``t``
-        applies at ``t``. Measurements of other sensors than odometry from before ``t`` are ignored.
+        ``t``: time of the pose [s], by default the time of the first measurement. Of the measurements before ``t``,
+        only the last velocity of the odometry is used.
 
         Raises InputError if an argument is invalid or if the estimator does not support an unknown pose, and
         RunFailedError if it cannot start at the pose. The previous state is kept in both cases.
@@ -138,9 +138,9 @@ class Localizer:
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """Return the pose at the newest timestamp of all measurements, or predicted by odometry to a later time ``t`` [s].
 
-        This does not change the state: later measurements from before ``t`` are not late. Before the start, the status
-        is ``unlocalized`` and the pose is NaN. Raises RunFailedError if the estimator has failed, if the estimate is
-        not finite, or if its covariance is not positive. After the last two errors the localizer can still be used.
+        A prediction does not change the state of the estimator. Before the start, the status is ``unlocalized`` and the
+        pose is NaN. Raises RunFailedError if the estimator has failed, if the estimate is not finite, or if its
+        covariance is not positive. After the last two errors the localizer can still be used.
         """
         with self._lock:
             return self._estimate(t)
@@ -185,7 +185,7 @@ class Localizer:
         self._guard = guard
         self._failure: RunFailedError | None = None  # the error after which the estimator is unusable
         self._prior = prior  # its time is NaN until the first measurement if no time was given
-        # ticks start at the time of the prior, or at the first measurement
+        # the times at which the estimator is updated start at the time of the prior, or at the first measurement
         self._ticks = None if prior is None or math.isnan(prior.t) else Ticks(prior.t)
         self._newest = self._tidied = -math.inf
         self._last: PoseEstimate | None = None  # the latest estimate, None after a new measurement
@@ -237,7 +237,7 @@ class Localizer:
                 self._prior = replace(self._prior, t=m.t)
                 with self._guard.computing("the start", m.t):
                     estimator.initialize(self._frame.prior(self._prior))
-        # a tick follows all measurements up to its time, as in a run on a log
+        # the estimator is updated after all measurements up to the time of the tick, as in a run on a log
         for t in self._ticks.advance(m.t):
             self._guard.process(estimator, Tick(t))
         if not m.is_motion and not self._is_under_way(m.t):

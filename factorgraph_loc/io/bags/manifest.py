@@ -159,8 +159,9 @@ def propose(bag: Bag) -> Uses:
 
 
 def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Add the topic of odometry to ``out``. Types of messages in order of preference: Odometry, tf with an odometry frame, Twist,
-    JointState. Topics of commands, plans and ground truth are excluded. ``tree``: the coordinate frames of the bag.
+    """Add the topic of odometry to ``out``. ``tree``: the coordinate frames of the bag.
+
+    Messages of type Odometry are preferred, then tf with an odometry frame, Twist, and JointState.
     """
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
@@ -288,7 +289,7 @@ def _camera(out: Uses, topics: Sequence[Topic]) -> None:
 
 
 def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
-    """Return the topics that ``out`` does not use and whose message types do not come with ROS, and the paths of their fields."""
+    """Return the unused topics with message types that do not come with ROS, and the paths of the fields of each."""
     custom = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(
@@ -303,7 +304,7 @@ def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, l
 
 
 def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
-    """Add the topic of RFID reads to ``out``. Of the topics with a field for the EPC, it is the one with most fields of a read.
+    """Add the topic of RFID reads to ``out``: the topic with a field for the EPC and with most other fields of a read.
 
     ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields.
     """
@@ -335,7 +336,8 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
 def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[str, dict[str, Any]]:
     """Return the proposed topics of ranges to landmarks with their settings, by the name of the topic.
 
-    Such a topic has a field for a distance, and next to it in the message a field for the name of a landmark.
+    Such a topic has a field for a distance, and in the same part of the message a field for the name of a landmark.
+    ``custom``: as in :func:`_rfid`.
     """
     candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
     out.remarks += [

@@ -35,8 +35,8 @@ TWISTS = {  # path of the twist in a message, by message type
     "geometry_msgs/msg/TwistStamped": "twist.",
 }
 IMU = "sensor_msgs/msg/Imu"
-# A function to call after the bag is read. It returns timestamps (N,) [ns] and velocities (N, 2) or increments (N, 3), and appends
-# to the warnings.
+# A function that computes the motion after the bag is read. It returns timestamps (N,) [ns], and velocities (N, 2) or
+# increments (N, 3 or 4). It appends warnings to its argument.
 Motion = Callable[[list[Notice]], tuple[Integers, Array]]
 
 
@@ -210,14 +210,14 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
     """Return the timestamps (N,) [ns] and the velocities (N, 2), forward [m/s] and about the vertical [rad/s].
 
-    ``rows``: two velocities, then optionally a quaternion and the variances of x and y. If these contain null poses,
-    which a device reports while it has lost its pose, a warning is added to ``warnings``, and increments (N, 4) are
-    returned instead of velocities, see :func:`motions.through_losses`.
+    ``rows``: two velocities, and optionally a quaternion and the variances of x and y. A device that has lost its pose
+    reports null quaternions or variances. Then a warning is appended, and increments (N, 4) are returned instead, see
+    :func:`motions.through_losses`.
     """
     values = rows.values
     null = np.zeros(len(rows), dtype=bool)
     if values.shape[1] > 2:
-        # quaternions that are zero from the start show a program without rotations, until the first that is not
+        # null quaternions before the first valid one are no sign of a lost pose: the program may not measure rotations
         has_rotations = np.logical_or.accumulate(values[:, 2:6].any(axis=1))
         null = are_null(values[:, 2:6], values[:, 6:]) & has_rotations
     known = np.flatnonzero(~null)

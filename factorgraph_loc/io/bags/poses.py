@@ -79,8 +79,9 @@ class Start:
             self._found = (t_ns, np.array([seven(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
-        """Return the start, with the time [s] after ``t0_ns``. A tilted robot adds a warning to ``warnings``. Raises
-        InputError if a variance of x, y or heading is not positive."""
+        """Return the start. Its time [s] counts from ``t0_ns`` [ns]. If the robot is tilted, a warning is appended.
+
+        Raises InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
         t_ns, values, variances = self._found
         turns = checked_rotations(self._source, np.ones(1, dtype=np.int64), values)
@@ -181,7 +182,8 @@ class StaticFrames:
 class FrameReference:
     """Collects the transforms of a tf topic, and composes the trajectory of one frame in another.
 
-    The settings ``topic`` name the two frames: ``child`` moves in ``parent``. Raises InputError if one of the two is not set.
+    ``topic``: the settings. The frame ``topic.child`` moves in the frame ``topic.parent``. Raises InputError if one of
+    the two frames is not set.
     """
 
     def __init__(self, bag: Bag, topic: PoseTopic, stamper: Stamper, static: StaticFrames) -> None:
@@ -204,7 +206,8 @@ class FrameReference:
     def path(self, warnings: list[Notice]) -> PosePath:
         """Return the trajectory at the timestamps of the most frequent transform. Other transforms are interpolated.
 
-        Skipped rows add warnings to ``warnings``. Raises InputError if no time has all transforms, or if none changes.
+        If rows are skipped, warnings are appended to ``warnings``. Raises InputError if the transforms have no time in
+        common, or if none of them changes.
         """
         edges = [
             path_of(self._edges[name], warnings) if name in self._edges else self._static.poses[name]
@@ -310,7 +313,7 @@ class Tree:
         return next((name for name in ROBOT if name in self.parents), None)
 
     def above(self, frame: str, names: tuple[str, ...]) -> str | None:
-        """Return the first of ``names`` that is above ``frame`` and that ``frame`` moves in, or None."""
+        """Return the first of ``names`` that is an ancestor of ``frame`` and in which ``frame`` moves, or None."""
         chain = upward(self.parents, frame)
         first = next((i for i, name in enumerate(chain) if name in self.moving), len(chain))
         return next((name for name in names if name in chain[first + 1 :]), None)

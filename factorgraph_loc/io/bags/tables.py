@@ -72,7 +72,7 @@ class RowsOfTopic:
     ``table``: the description of the table's columns.
     ``columns``: the columns to collect, by default all columns except the first, which is the time.
     ``units``: the unit of a column, or a factor that converts its values to the default unit.
-    ``rules``: what the manifest says about invalid and late rows.
+    ``rules``: whether invalid rows are skipped and late rows sorted; otherwise they are errors.
     A missing number becomes NaN. An empty name raises InputError.
     """
 
@@ -124,10 +124,10 @@ class RowsOfTopic:
         raise bad_field(self._rows.source, column.name, text, column.doc, row=row)
 
     def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
-        """Return the M collected rows that the rules keep, and their indices (M,) among all collected rows.
+        """Return the M valid rows, and their indices (M,) among all collected rows.
 
         ``faults``: faults that the caller has detected, in addition to values that are missing or out of bounds.
-        Raises InputError at an invalid row, unless the rules skip it with a warning in ``warnings``.
+        Raises InputError at an invalid row, unless ``rules`` skip it. Then a warning is appended to ``warnings``.
         """
         cells = {**self._names, **dict(zip(self._numbered, self._rows.values.T, strict=True))}
         cells |= {STAMP.name: self._rows.t_ns, INDEX: np.arange(len(self._rows))}
@@ -140,7 +140,7 @@ class RowsOfTopic:
         return TableRows.of(read, self._columns, read.nanoseconds()), np.asarray(read.columns[INDEX])
 
     def stream(self, reading: Reading) -> Stream:
-        """Return the rows as a stream, with times after t = 0. An invalid row raises InputError or adds a warning."""
+        """Return the rows as a stream, with times since ``reading.t0_ns``. Raises InputError as :meth:`rows_of`."""
         channel, _ = native_tables()[self._table.name]
         if channel.assemble:
             rows = {self._table.name: self.rows_of(reading.warnings)[0]}
@@ -177,7 +177,7 @@ class Reads(RowsOfTopic):
             )
         super().__init__(bag, options.topic, options.fields, RFID, READ, options.units, options)
         self._stamp_unit = round(STAMP_OF_READ.in_unit(options.units.get("stamp", "us"), source)[1])
-        self._antenna_of_message = None  # the field of the antenna, which names the antenna of a message without reads
+        self._antenna_of_message = None  # extracts the antenna name of a message without reads
         if options.antenna is None and LIST not in options.fields["antenna"]:
             self._antenna_of_message = Fields(bag, bag.topic(options.topic), {"antenna": options.fields["antenna"]})
         self._number: list[int] = []  # by read: the index of its round
@@ -323,7 +323,7 @@ class Corners(RowsOfTopic):
 def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> RowsOfTopic:
     """Return a collector for the topic of a table. ``options``: the topic and the fields of its messages.
 
-    The table is the first of ``tables`` that has default fields for the message type. If none has, it is ``tables[0]``.
+    The collector fills the first of ``tables`` that has default fields for the message type, or else ``tables[0]``.
     Corners of AprilTags need no fields. Raises InputError if the fields do not fit the table.
     """
     kind = bag.topic(options.topic).type

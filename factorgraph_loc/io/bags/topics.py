@@ -84,7 +84,7 @@ class Fields:
                 f"{self._where}: message {row} has lists of {counts} elements, expected lists of one length"
             )
         columns = (v if is_list else repeat(v) for v, is_list in zip(values, self._are_lists, strict=True))
-        return list(zip(*columns, strict=False))  # ends with the lists, because repeat() is endless
+        return list(zip(*columns, strict=False))  # zip ends with the lists, because repeat() is endless
 
 
 def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
@@ -178,7 +178,7 @@ def _getter(path: str) -> Callable[[Any], Any]:
 
 
 def _getter_of(paths: Sequence[str]) -> Callable[[Any], Any]:
-    """Return a function that gets the values of several fields of a message, or the value of the only field."""
+    """Return a function that gets a tuple of the fields at ``paths`` from a message, or one value for one path."""
     if any(ELEMENT.search(path) for path in paths):
         getters = [_getter(path) for path in paths]
         return lambda message: [get(message) for get in getters]
@@ -190,7 +190,7 @@ class TopicRows:
 
     ``source``: the bag and the topic, for errors. ``width``: how many numbers a row has. ``paths``: the fields that
     form the row of a message. Without paths, the caller appends rows. A value that is not a number becomes NaN.
-    ``rules``: what the manifest says about invalid and late rows.
+    ``rules``: whether invalid rows are skipped and late rows sorted; otherwise they are errors.
     """
 
     def __init__(self, source: str, width: int, paths: Sequence[str] = (), rules: RowRules | None = None) -> None:
@@ -236,10 +236,10 @@ class TopicRows:
         return self.t_ns[keep], self.values[keep]
 
     def kept(self, faults: Sequence[Fault], warnings: list[Notice], among: Integers | None = None) -> Integers:
-        """Return the indices of the rows without ``faults``, in order of time; of rows with equal timestamps, the last.
+        """Return the indices of the rows without ``faults``, in order of time. Of equal timestamps the last is kept.
 
         ``among``: indices of the rows that the faults describe, by default all. Raises InputError at a fault, or at a
-        row that is out of order, unless the rules skip or sort such rows. This adds warnings to ``warnings``.
+        row that is out of order, unless ``rules`` skip or sort such rows. Then warnings are appended to ``warnings``.
         """
         rows, t_ns = self.rows, self.t_ns
         keep = np.arange(len(rows)) if among is None else among
@@ -323,7 +323,7 @@ class Stamper:
         return self.choose(as_nanoseconds(item.message.header.stamp, 1), item.received)
 
     def choose(self, in_header: int, received: int) -> int:
-        """Return ``in_header``, the timestamp of the header, or ``received``, the time of receipt [ns], by the clock setting."""
+        """Return the timestamp [ns] that the clock setting selects: ``in_header`` or ``received``."""
         self._any_set |= in_header != 0
         self._delays.append(received - in_header)
         return in_header if self.uses_header else received

@@ -114,8 +114,9 @@ def _lens(path: Path, name: str, camera: ChainCamera) -> dict[str, Any]:
 
 
 def _on_imu(path: Path, chain: Mapping[str, ChainCamera], name: str) -> Array | None:
-    """Return the pose (4, 4) of the camera ``name`` in the frame of the IMU, also if only a camera before it in the
-    chain has a transform to the IMU. Returns None if no such transform is known."""
+    """Return the pose (4, 4) of the camera ``name`` in the frame of the IMU. Returns None if it is unknown.
+
+    The transform to the IMU may be that of a previous camera of the chain."""
     names = list(chain)
     from_later = np.eye(4)
     for known in reversed(names[: names.index(name) + 1]):

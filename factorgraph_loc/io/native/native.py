@@ -110,8 +110,9 @@ def world_of(run: RunFile, source: Path) -> World:
 
 
 def read_tables(folder: Path, warnings: list[Notice], rules: RowRules) -> dict[str, TableRows]:
-    """Return the non-empty tables in a folder by name, without the rows that ``rules`` skip. Skipped rows, and tables
-    of unknown sensors, add warnings to ``warnings``."""
+    """Return the non-empty tables in a folder by name. Rows that ``rules`` skip are left out.
+
+    Warnings about skipped rows and about tables of unknown sensors are appended to ``warnings``."""
     tables = {}
     stems = sorted(file.stem for file in folder.iterdir() if file.suffix in SUFFIXES)
     for name in dict.fromkeys((*native_tables(), *stems)):

@@ -29,7 +29,7 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 Drive = Literal["differential", "omnidirectional", "none"]
 RADIUS, HEIGHT = 0.25, 1.0  # m: distance of antennas from the robot's centre, height of antennas and camera
 FIELD_OF_VIEW = math.radians(60.0)
-# RFID settings of antennas that are not calibrated: five reads count as one, and few tags behind an antenna are read
+# RFID settings of antennas that are not calibrated: the information of reads is divided by five
 READS = {
     "tempering": 0.2,
     "models": {"default": {"kind": "beam", "behind": 0.05, "prior": {"range_scale": 0.3, "read_rate": 1.0}}},
@@ -113,10 +113,10 @@ def _comment(setting: Setting | None) -> str:
 class RobotOptions:
     """The sensors of a new robot, for :func:`new_rig`. None means that the robot lacks a sensor.
 
-    ``odometry``: the drive, ``none`` without odometry.
+    ``odometry``: the type of drive, "none" for a robot without odometry.
     ``imu``: True if the robot has a gyro.
-    ``landmarks``: standard deviation of a measured range [m]. For several sensors of landmarks: a dict of values by
-    sensor name. ``position``: standard deviation of a measured x or y [m].
+    ``landmarks``: standard deviation of a measured range [m], or a dict of them by name of the sensor.
+    ``position``: standard deviation of a measured x or y [m].
     ``antennas``: names of RFID antennas.
     ``camera``: width and height of the images [px], or a camera chain of Kalibr, as ``FILE`` or ``FILE:NAME``.
     """

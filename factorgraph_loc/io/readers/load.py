@@ -14,7 +14,7 @@ from factorgraph_loc.files.data_root import EXPECTED, RUN_FILE, find_data_root, 
 from factorgraph_loc.files.models import nearest, parse_model, read_toml
 from factorgraph_loc.files.shipped import manifests
 from factorgraph_loc.io.bags.file import is_bag, require_metadata
-from factorgraph_loc.io.checks import look_over, require_bounds, without_false_headings
+from factorgraph_loc.io.checks import log_warnings, require_bounds, without_false_headings
 from factorgraph_loc.io.motions import with_wheels_in, with_wheels_of
 from factorgraph_loc.io.native.rig_file import DEFAULT_RIG, read_rig
 from factorgraph_loc.io.native.world_file import read_world
@@ -92,7 +92,7 @@ def load(
     given = dict(options or {})
     described = source.manifest.options if source.manifest else {}
     choices = {key: _choices(value) for key, value in described.items()}
-    # on the command line, a list is a text with commas
+    # a list from the command line is a text with commas
     choices |= {
         key: [part.strip() for part in value.split(",")] if isinstance(value, str) else _choices(value)
         for key, value in given.items()
@@ -137,7 +137,7 @@ def read_log(
 
 
 def _value(given: T | str | Path | None, read: Callable[[str | Path], T]) -> T | None:
-    """Return ``given``, or the result of ``read`` if ``given`` is the name of a file."""
+    """Return ``given``. If it is the name of a file, return ``read(given)`` instead."""
     return read(given) if isinstance(given, str | Path) else given
 
 
@@ -208,8 +208,8 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
 def _read(source: _Source, rig: Rig | None, world: World | None, options: Mapping[str, Any], naming: list[str]) -> Log:
     """Read and check one log from ``source``.
 
-    ``rig``, ``world``: replace those of the reader if given. ``options``: one value per option. ``naming``: the options
-    that are appended to the name of the log to make it unique.
+    ``rig``, ``world``: if given, they replace the rig and the world of the log. ``options``: one value per option.
+    ``naming``: the options that are appended to the name of the log to make it unique.
     """
     chosen, manifest = reader(source.reader), source.manifest
     options = with_wheels_of(rig, options)
@@ -242,4 +242,4 @@ def _read(source: _Source, rig: Rig | None, world: World | None, options: Mappin
         sentence = "no rig is given: the default rig lacks this robot's noise and the mounting of its sensors"
         warnings.append(notice("default_rig", sentence))
     log = replace(log, rig=with_wheels_in(log.rig, options))
-    return replace(log, warnings=(*warnings, *look_over(log)))
+    return replace(log, warnings=(*warnings, *log_warnings(log)))

@@ -46,9 +46,9 @@ STANDARD = str.maketrans("-_", "+/")  # converts URL-safe base64 to standard bas
 def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as ``rssi_*``.
 
-    Each cell that is not empty is a read. The text in place of ``*`` is the name of the antenna. It is the EPC of the
-    tag instead if ``columns`` maps the antenna, or if ``antenna``, the name of the only antenna, is given. Raises
-    InputError with file, row and column of an invalid value.
+    Each cell that is not empty is a read. The text in place of ``*`` is the EPC of the tag if the antenna is known, or
+    else the name of the antenna. The antenna is known if ``columns`` maps it, or if ``antenna``, the name of the only
+    antenna, is given. Raises InputError at an invalid value.
     """
     pattern = mapping.columns["rssi"]
     fixed = {field: column for field, column in mapping.columns.items() if field != "rssi"}
@@ -202,7 +202,7 @@ def _signal(mapped: Cells, name: str) -> Array:
 
 
 def _columns_of(options: RfidFile) -> dict[str, Column]:
-    """Return the descriptions of the fields of reads. EPCs are not among them, because they may be in one of two columns."""
+    """Return the descriptions of the fields of reads, without the EPC, by field."""
     known = {name: RFID[name] for name in ("antenna", *SIGNALS)}
     return known | {"channel": _channel(options.channels), "last": STAMP, "count": COUNT}
 
@@ -242,8 +242,9 @@ def _from_base64(text: str) -> str:
 
 
 def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
-    """Return the rows of ``mapped`` with a last read that is not before the first one. Raises InputError at other rows,
-    unless the options skip them with a warning in ``warnings``."""
+    """Return the rows of ``mapped``. Raises InputError at a row in which the last read is before the first read.
+
+    If the options skip invalid rows, they are left out instead, and a warning is appended to ``warnings``."""
     if "last" not in mapped.columns:
         return mapped
     wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)
@@ -263,9 +264,9 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 
 
 def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[Notice]) -> TableRows:
-    """Return the table with a second read for each row that summarizes several reads. The second read has a time, but no signal.
+    """Return the table with a second read, without a signal strength, for each row that summarizes several reads.
 
-    Reads between the first and the last one of a row are skipped, with a warning in ``warnings``.
+    The second read is the last of the row. The number of reads that are lost in between is appended to ``warnings``.
     """
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):

@@ -86,7 +86,7 @@ def _read(
     rules: RowRules | None = None,
 ) -> Cells:
     """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the
-    timestamps. ``rules``: what a manifest says about invalid and late rows, None without a manifest.
+    timestamps. ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors.
     """
     numbered = {name: str(i) for i, name in enumerate(columns, start=1)}
     units: dict[str, str | float] = {} if unit is None else {"t": unit}
@@ -100,9 +100,9 @@ def _read(
 def read_pose_file(path: Path, kind: Format | None = None, rules: RowRules | None = None) -> PosePath:
     """Return the poses of a file in TUM, KITTI or EuRoC format.
 
-    ``kind``: the expected format, by default any. The first row determines the format. Of poses with equal timestamps,
-    the last is kept. Null poses, recorded while the pose was lost, are skipped with a warning. ``rules``: what a manifest
-    says about invalid and late rows, None without a manifest. Raises InputError with file and row of an invalid value.
+    ``kind``: the expected format, by default any. ``rules``: whether invalid rows are skipped and late rows sorted.
+    None: both are errors. Of poses with equal timestamps, the last is kept. Null poses, which mean that the pose was
+    lost, are skipped with a warning. Raises InputError with file and row of an invalid value.
     """
     row, first = _first_row(path)
     detected = _format(first)

@@ -28,16 +28,14 @@ from factors import se2
 from factors.se2 import Array, Integers
 
 SUFFIX = ".pyfg"
-# by the first word of a row: its columns; those in capital letters have names of variables, the others have numbers
+# the columns of each kind of row; columns in capital letters contain names of variables, other columns numbers
 ROWS = {
     "VERTEX_SE2": "t POSE x y theta",
     "VERTEX_XY": "LANDMARK x y",
     "EDGE_SE2": "t FROM TO x y theta cxx cxy cxt cyy cyt ctt",
     "EDGE_RANGE": "t POSE LANDMARK range variance",
 }
-DIFFERENT = (
-    1.5  # ratio of the largest to the smallest variance above which a warning says that the rig has their median
-)
+DIFFERENT = 1.5  # maximum ratio of the largest to the smallest variance; above it, the use of their median is a warning
 
 
 class Options(FileModel):
