@@ -29,8 +29,8 @@ from factors.se2 import Array, Integers
 
 @dataclass(frozen=True, eq=False)
 class TagArray:
-    """T tags of a map, or on a robot. ``points`` (T, 3) [m]: positions in the world, or in the robot frame. ``facing`` (T,) [rad]:
-    the direction that each tag faces, NaN if it is unknown."""
+    """T tags in the world, or on a robot. ``points`` (T, 3) [m]: positions in the world, or in the robot frame.
+    ``facing`` (T,) [rad]: the direction that each tag faces, NaN if unknown."""
 
     points: Array
     facing: Array
@@ -45,16 +45,15 @@ class TagArray:
 
 @dataclass(frozen=True, eq=False)
 class TagReadCounts:
-    """The reads of tags in K measurements. A measurement is a number of inventory rounds of one antenna at one robot pose.
+    """The reads of tags in K measurements. A measurement is a number of inventory rounds of one antenna at one pose.
 
-    ``offsets`` (K, 3): the robot's pose at each measurement, in the frame of a reference pose. The likelihood is a
-    function of the reference pose.
-    ``antennas`` (K,): indices of the antennas in the model. ``rounds`` (K,): numbers of inventory rounds. ``hits`` (K,
-    C): the number of rounds that read each of C listed tags. Tags that are not listed were not read. ``odds`` (C,):
-    prior log-odds that a listed tag is weak, moved or dead (:class:`~factors.rfid.tag_states.TagStates`), and not as
-    surveyed. ``-inf``, the default, means certainly as surveyed.
-    ``elsewhere`` (C,): the tempered log-likelihood of a tag's reads and misses if it is not as surveyed, minus that of
-    a tag out of reach that is never read. By default 0, or ``-inf`` if the tag was read, as for a dead tag.
+    ``offsets`` (K, 3): the robot's pose at each measurement, in the frame of a reference pose.
+    ``antennas`` (K,): indices of the antennas in the model. ``rounds`` (K,): numbers of inventory rounds.
+    ``hits`` (K, C): the number of rounds that read each of C listed tags. Tags that are not listed were not read.
+    ``odds`` (C,): the prior log-odds that a listed tag is weak, moved or dead, from
+    :class:`~factors.rfid.tag_states.TagStates`. The default ``-inf`` means that the tag certainly is as in the map.
+    ``elsewhere`` (C,): the tempered log-likelihood of the reads of a tag that is weak, moved or dead. It is relative to
+    that of a tag out of reach without reads. The default is that of a dead tag: 0, or ``-inf`` if the tag was read.
     ``tags`` (C,): indices in the map of the listed tags, ascending. The default is all tags of the map.
     ``unlisted_odds``: the odds of tags that are not listed.
     ``twists`` (K, 3): the robot's body-frame velocity [m/s, m/s, rad/s] at each measurement. The default is zero.
@@ -92,7 +91,7 @@ class TagReadCounts:
         return np.asarray(self.tags[self.hits.any(axis=0)])
 
     def with_states(self, tags: Integers, odds: Array, elsewhere: Array) -> TagReadCounts:
-        """The counts with ``tags`` (U,) added to the listed tags, and with ``odds`` (U,) and ``elsewhere`` (U,) set for these."""
+        """Return the counts with ``tags`` (U,) listed, and with their ``odds`` (U,) and ``elsewhere`` (U,) replaced."""
         both = np.union1d(self.tags, tags)
         hits = np.zeros((len(self.hits), len(both)), dtype=np.int64)
         all_odds, all_elsewhere = np.full(len(both), self.unlisted_odds), np.zeros(len(both))
@@ -104,14 +103,14 @@ class TagReadCounts:
         return replace(self, hits=hits, odds=all_odds, elsewhere=all_elsewhere, tags=both)
 
     def moved(self, offset: Array) -> TagReadCounts:
-        """The counts relative to another reference pose. ``offset`` (3,): the present reference pose in the frame of
-        the new one."""
+        """Return the counts relative to a new reference pose. ``offset`` (3,): the old reference pose in the frame of
+        the new reference pose."""
         return replace(self, offsets=moved(offset, self.offsets))
 
 
 def merged(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Merge several counts with the same reference pose into one. ``parts``: counts in order of time. A tag has the
-    ``odds`` from the first part that lists it. Its ``elsewhere`` is the sum over all parts."""
+    """Merge counts with the same reference pose. ``parts``: counts in order of time. The ``odds`` of a tag are those of
+    the first part that lists the tag. The values ``elsewhere`` of a tag are added."""
     first = parts[0]
     if len(parts) == 1:
         return first
@@ -136,7 +135,6 @@ class Score(NamedTuple):
     ``gradient`` (N, 3): its derivative by the body-frame perturbation of the pose. ``information`` (N, 3, 3): its
     Fisher information.
     ``expected`` (N,), ``variance`` (N,): mean and variance of ``nll`` over all outcomes, if model and pose are correct.
-    The variance is proportional to the tempering, which accounts for correlated reads.
     """
 
     nll: Array
@@ -147,8 +145,7 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """The score of signal strengths or phases, without the mean and variance of ``nll``: ``expected`` is ``nll``,
-        and ``variance`` is zero."""
+        """Make the score of signal strengths or phases. ``expected`` is set to ``nll``, and ``variance`` to zero."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
 
@@ -167,11 +164,11 @@ class ExpectedReads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of read counts as a function of the robot's pose, for given antennas and tags. ``tags``: those of the map. If
-    the antennas of the ``model`` are fixed in the world, those on the robot.
+    """The likelihood of read counts as a function of the robot's pose.
 
-    ``parameters`` (Q,): adjustments of detection models, mounting and clock (:mod:`factors.rfid.parameters`), zero at
-    first. With M detection models and A antennas, Q is 2 M + A + 2.
+    ``model``: the antennas and their detection models. ``tags``: the tags of the map, or the tags on the robot if the
+    antennas of the model are fixed in the world. ``parameters`` (Q,): adjustments of detection models, mounting and
+    clock (:mod:`factors.rfid.parameters`), initially zero. With M detection models and A antennas, Q is 2 M + A + 2.
     """
 
     model: RfidModel
@@ -195,14 +192,13 @@ class RfidLikelihood:
         return out
 
     def tempered(self, tempering: float) -> RfidLikelihood:
-        """The likelihood with another tempering exponent, for reads that are more or less correlated."""
+        """Return the likelihood with another tempering exponent."""
         out = copy.copy(self)
         object.__setattr__(out, "model", replace(self.model, tempering=tempering))
         return out
 
     def prepare(self) -> None:
-        """Compute the tables of the likelihood of particles now. Otherwise the first call of :meth:`log_likelihood` computes
-        them, which delays a running filter."""
+        """Compute the tables of :meth:`log_likelihood` now, to avoid a delay in the first call of that method."""
         for name in ("_tables",) if self.model.fixed else ("_tables", "_places"):
             getattr(self._unadjusted, name)
 
@@ -221,10 +217,11 @@ class RfidLikelihood:
     def joint_score(
         self, pose: Array, parameters: Array, counts: TagReadCounts, estimated: Sequence[int] | None = None
     ) -> Score:
-        """The tempered negative log-likelihood of ``counts`` at one pose (3,) and ``parameters`` (Q,), with derivatives by both.
+        """Return the tempered likelihood of ``counts`` at one pose (3,) and ``parameters`` (Q,), with derivatives.
 
-        ``estimated`` (P,): the indices of the parameters in the derivatives. None means all. The gradient is (1, 3 +
-        P), and the information (1, 3 + P, 3 + P), by the body-frame perturbation of the pose and by these parameters.
+        ``estimated`` (P,): the indices of the parameters that derivatives are computed for. None means all. The
+        gradient (1, 3 + P) and the information (1, 3 + P, 3 + P) are by the body-frame perturbation of the pose and by
+        these parameters.
         """
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
@@ -243,22 +240,21 @@ class RfidLikelihood:
     def displaced(
         self, poses: Array, counts: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
     ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-        """The likelihood of possible states of each tag, such as weak or moved, for :mod:`factors.rfid.tag_states`.
+        """Compute the log-likelihood of possible states of each tag, such as weak or moved. Returns the indices (U,) of
+        the evaluated tags, the log-likelihoods (U, S), and a mask (U,) of the tags that were read.
 
-        ``poses`` (N, 3): possible robot poses. The likelihood is the mean over these.
+        ``poses`` (N, 3): possible robot poses. The likelihood is the mean over all poses.
         ``hypotheses`` (S, 4): the states, from :func:`factors.rfid.tag_states.hypotheses`.
         ``margin`` [m]: tags that are farther than reach plus margin from all poses are left out, unless they were read.
         ``parameters`` (Q,): parameters of the likelihood. ``odds`` (T,): tags with odds ``-inf`` are left out.
 
-        Returns the indices (U,) of the remaining tags, a log-likelihood ratio (U, S), and a mask (U,) of the tags that were read.
-        The ratio is tempered. It compares each state with a tag out of reach that is never read, by the tag's reads and misses.
+        The log-likelihoods are tempered, and relative to that of a tag out of reach that is never read.
         """
         alpha = float(self.model.tempering)
         return tag_states.displaced(*self._tabled, counts.packed, poses, margin, odds, hypotheses, alpha, parameters)
 
     def log_likelihood(self, poses: Array, counts: TagReadCounts, parameters: Array | None = None) -> Array:
-        """The tempered log-likelihood (N,) of ``counts`` for particles at poses (N, 3), from tables
-        (:mod:`factors.rfid.weighing`, :mod:`factors.rfid.places`).
+        """Compute the tempered log-likelihood (N,) of ``counts`` for particles at poses (N, 3), from tables.
 
         ``parameters`` (N, Q): the parameters of each particle, by default :attr:`parameters`. If particles differ in
         their time offset, the velocity of the first measurement is used for all measurements.
@@ -284,8 +280,7 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """An estimate of the computing time of :meth:`log_likelihood` per pose, if the poses are far apart: about the
-        number of tags to evaluate."""
+        """An estimate of the computing time of :meth:`log_likelihood` per pose: about the number of evaluated tags."""
         if self.model.fixed:
             return PLACED + BY_ANTENNA * len(counts.antennas) * len(self.tags.points)
         return self._unadjusted._places.work(counts.packed)
@@ -297,7 +292,7 @@ class RfidLikelihood:
 
     @cached_property
     def reached(self) -> float:
-        """The mean number of tags in reach of a random pose in the area of the map's tags. All tags of a robot are in reach."""
+        """The mean number of tags in reach of a random pose among the tags. Tags on a robot are always in reach."""
         if self.model.fixed:
             return float(len(self.tags.points))
         return in_reach(self.tags.points[:, :2], self._unadjusted.reach)
@@ -312,28 +307,26 @@ class RfidLikelihood:
         return any(self.model.models[a.model].uses_facing for a in self.model.antennas)
 
     def robot_tables(self, finest: int, facings: int) -> RobotTables:
-        """Tables of read probabilities of each antenna by a tag's position in the robot frame. ``finest``: the cell
-        size, as a multiple of the cell size of the finest table that exists. ``facings``: number of facing directions.
-        See :func:`factors.rfid.places.robot_tables`."""
+        """Compute tables of the read probability of each antenna over the tag's position in the robot frame.
+        ``finest``, ``facings``: as of :func:`factors.rfid.places.robot_tables`."""
         antennas = antennas_of(self.packed, self._unadjusted._tables)
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
-        """The likelihood of each tag's reads as a function of the tag's position, at one robot pose (3,).
-
-        ``counts`` must list all tags of the map. Returns the tempered negative log-likelihood (T,) of each tag, its
-        gradient (T, 2) by the tag's position in the world, and its information (T, 2, 2).
-        """
+        """Return the tempered negative log-likelihood (T,) of each tag's reads at one robot pose (3,), its gradient (T,
+        2) by the tag's world position, and its information (T, 2, 2). ``counts`` must list all tags of the map."""
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)
         return alpha * nll, alpha * slope[:, 3:], alpha * curve[:, 3:, 3:]
 
     def expected(self, pose: Array, counts: TagReadCounts, parameters: Array) -> ExpectedReads:
-        """Observed and predicted reads at a pose (3,) with ``parameters`` (Q,), of tags in reach and tags in ``counts``."""
+        """Return the observed and predicted reads of all tags in reach of a ``pose`` (3,) or listed in ``counts``.
+        ``parameters`` (Q,): as of the class."""
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
-        """The probability (N, T), including false reads, that one round of an ``antenna`` (index) reads each tag from each pose."""
+        """Return the probability (N, T), including false reads, that one round of the antenna with index ``antenna``
+        reads each of T tags, with the robot at each of ``poses`` (N, 3)."""
         poses, antennas = np.ascontiguousarray(poses, dtype=float), np.full(len(poses), antenna)
         return kernels.probabilities(self.packed, antennas, poses, self.tags.points, self.tags.normals)[0]

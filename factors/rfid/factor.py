@@ -80,8 +80,8 @@ class RfidFactor:
     ``estimated`` (P,): indices of the parameters (:mod:`factors.rfid.parameters`) that are estimated; read counts only.
 
     Methods with ``values`` take a list of the pose (3,) and, if P > 0, the parameters (P,). For any number of reads
-    there are 4 + P residuals. The sum of their squares has the value, the gradient and the Fisher information of the
-    negative log-likelihood (:func:`factors.graph.compressed`).
+    there are 4 + P residuals. Half the sum of their squares has the value, the gradient and the Fisher information of
+    the negative log-likelihood (:func:`factors.graph.compressed`).
     """
 
     likelihood: TagLikelihood
@@ -107,7 +107,7 @@ class RfidFactor:
         return replace(self, likelihood=self.likelihood.adjusted(self._parameters(values)), estimated=())
 
     def _parameters(self, values: Array) -> Array:
-        """All parameters (..., Q) of the likelihood: ``values`` (..., P) for the estimated ones, zero for the rest."""
+        """Return all parameters (..., Q): ``values`` (..., P) of the estimated ones, and zeros."""
         assert isinstance(self.likelihood, RfidLikelihood)
         out = np.zeros((*values.shape[:-1], len(self.likelihood.parameters)))
         out[..., list(self.estimated)] = values
@@ -158,7 +158,7 @@ class RfidFactor:
         return Correction(delta, posterior, NO_RESIDUAL, nis, dof, *rest)
 
     def _problems(self) -> tuple[TagProblem | None, PhaseProblem | None, StrengthProblem | None]:
-        """The likelihood with its reads, for compiled code: one of read counts, phases and strengths. The other two are None."""
+        """Return the likelihood and reads for compiled code: read counts, phases and strengths, two of them None."""
         match self.likelihood, self.reads:
             case RfidLikelihood() as detection, TagReadCounts() as counts:
                 estimated, alpha = np.array(self.estimated, dtype=np.int64), float(detection.model.tempering)
@@ -211,9 +211,9 @@ class RfidTagFactor:
 def _score(
     tags: Any, phase: Any, strength: Any, pose: Array, values: Array
 ) -> tuple[float, Array, Array, float, float]:
-    """Evaluate the likelihood of one pose (3,) and parameters ``values`` (P,). Exactly one of ``tags``, ``phase`` and
-    ``strength`` is not None. Returns the tempered negative log-likelihood, its gradient (3 + P,) and information (3 +
-    P, 3 + P), and its mean and variance. For phase and strength the mean is the value itself, and the variance is 0."""
+    """Evaluate the likelihood of one pose (3,) and parameters ``values`` (P,). ``tags``, ``phase``, ``strength``: from
+    :meth:`RfidFactor._problems`, two of them None. Returns the tempered negative log-likelihood, its gradient (3 + P,)
+    and information (3 + P, 3 + P), and its mean and variance as in :class:`~factors.rfid.detection.Score`."""
     if tags is not None:
         parameters = tags.parameters.copy()
         for i in range(len(values)):
@@ -278,8 +278,8 @@ def _corrected(
 
 @compiled
 def _difference(pose: Array, values: Array, target: Array, other_values: Array) -> Array:
-    """The step (3 + P,) from ``pose`` (3,) and ``values`` (P,) to ``target`` and ``other_values``. The first three
-    components are the twist between the poses."""
+    """The step (3 + P,) from ``pose`` (3,) and ``values`` (P,) to ``target`` (3,) and ``other_values`` (P,). Its first
+    three components are the twist from ``pose`` to ``target``."""
     out = np.empty(3 + len(values))
     out[0], out[1], out[2] = se2.twist_to(pose, target)
     for i in range(len(values)):
@@ -289,8 +289,9 @@ def _difference(pose: Array, values: Array, target: Array, other_values: Array) 
 
 @compiled
 def _scoring_step(prior_information: Array, information: Array, gradient: Array, moved: Array) -> Array:
-    """One step (D,) of Fisher scoring, shortened to the largest allowed step. ``prior_information`` (D, D): the inverse covariance
-    of the prediction. ``information``, ``gradient``: of the likelihood. ``moved`` (D,): the sum of all steps so far."""
+    """Return one step (D,) of Fisher scoring, shortened to the largest allowed step. ``prior_information`` (D, D): the
+    inverse covariance of the prediction. ``information`` (D, D), ``gradient`` (D,): of the negative log-likelihood.
+    ``moved`` (D,): the sum of all steps so far."""
     size, both, pull = len(gradient), prior_information.copy(), np.empty((len(gradient), 1))
     for i in range(size):
         pull[i, 0] = -gradient[i]
@@ -333,7 +334,7 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
         for j in range(size):
             predicted[i, j] += tempering * information[i, j]
     if covariance[0, 0] + covariance[1, 1] > FAR:
-        # the gradient's variance in one direction may be so large that rounding deletes the rest: scale all to unit variance
+        # scale all components to unit variance, because rounding would delete small variances next to very large ones
         units = np.empty(size)
         for i in range(size):
             units[i] = math.sqrt(predicted[i, i])
@@ -350,8 +351,7 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
 
 @compiled(error_model="numpy")
 def _rank(information: Array) -> int:
-    """The number of eigenvalues above :data:`LEAST_INFORMATION`. By Sylvester's law of inertia, it is the number of
-    positive pivots of the information minus this limit times the identity."""
+    """Count the eigenvalues above :data:`LEAST_INFORMATION`, as positive pivots (Sylvester's law of inertia)."""
     size, left, count = len(information), information.copy(), 0
     for k in range(size):
         left[k, k] -= LEAST_INFORMATION

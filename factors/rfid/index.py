@@ -95,8 +95,8 @@ class MapTags(NamedTuple):
 
 
 class NearTags(NamedTuple):
-    """The data of the C tags that are near some poses or listed in the reads. ``tags`` (C,): their indices in the map, ascending.
-    The other fields are those of :class:`MapTags` and :class:`~factors.rfid.detection.TagReadCounts` for these tags."""
+    """The C tags that are near some poses or listed in the reads. ``tags`` (C,): indices in the map, ascending. The
+    other fields are those of :class:`MapTags` and :class:`~factors.rfid.detection.TagReadCounts` for these tags."""
 
     tags: Integers
     points: Array
@@ -120,8 +120,8 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 
 @compiled
 def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
-    """Select the tags that may change the likelihood of poses (N, 3): all tags within ``reach`` [m] of any pose, other
-    tags in the same cells, and the tags listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
+    """Select the tags that may change the likelihood of poses (N, 3): at least all tags within ``reach`` [m] of any
+    pose, and the tags listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
     _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)
@@ -182,8 +182,9 @@ def union(first: Integers, second: Integers) -> Integers:
 def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """Select for ``tags`` (U,) the columns of hits (K, U), odds (U,) and elsewhere (U,), which are given for the ``listed`` tags.
-    Both arrays of tags are ascending. A tag that is not listed gets 0 hits, ``unlisted_odds``, and 0 for elsewhere."""
+    """Return the hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,). ``hits``, ``odds``, ``elsewhere``: the
+    values of the ``listed`` tags. Both arrays of tags are ascending. The values of a tag that is not listed are 0 hits,
+    ``unlisted_odds`` and 0."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
     new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0

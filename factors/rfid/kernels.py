@@ -80,13 +80,15 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
 def mixture(
     odds: float, elsewhere: float, e: float, mean: float, variance: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """The likelihood of a tag that may be weak, moved or dead instead of as surveyed (:mod:`factors.rfid.tag_states`).
+    """Compute the likelihood of a tag that may be weak, moved or dead (:mod:`factors.rfid.tag_states`).
 
     ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`. ``e``, ``mean``, ``variance``: the
-    untempered negative log-likelihood of a tag as surveyed, and its mean and variance over all outcomes. ``none``: the
-    untempered negative log-likelihood that a tag out of range is never read. Returns a factor for the derivatives of
-    ``e``, and the tempered negative log-likelihood with its mean and variance. An unknown state reduces the information
-    on the pose, which the derivatives neglect (Louis, JRSS B 44(2), 1982, eq. 3.2').
+    untempered negative log-likelihood of a tag that is as in the map, and its mean and variance over all outcomes.
+    ``none``: the untempered negative log-likelihood that a tag out of range is never read.
+
+    Returns four values: the factor that multiplies the derivatives of ``e``, the tempered negative log-likelihood, its
+    mean, and its variance. The loss of information by the unknown state is neglected (Louis, JRSS B 44(2), 1982, eq.
+    3.2').
     """
     if odds == -np.inf or elsewhere == -np.inf:
         return tempering, tempering * e, tempering * mean, tempering * variance
@@ -137,18 +139,18 @@ def _add_tag(
     slope: Array,
     curve: Array,
 ) -> tuple[float, float, float]:
-    """The negative log-likelihood in K measurements of one tag that works and is where the map has it. Also its mean and variance.
+    """Return the negative log-likelihood of a tag that is as in the map, in K measurements, and its mean and variance.
 
-    Writes, for each measurement, the derivative ``slope`` (K,) by the read probability and the Fisher information ``curve`` (K,) on
-    that probability, both 0 out of reach. Writes the derivatives ``by`` (K, 7) of the probability by the antenna's position in the
-    frame of the pose (2), its yaw, the parameters ``a`` and ``b`` of its model, and the tag's position in the world (2). ``at``:
-    the result of :func:`place_measurements`. ``far``: the result of :func:`_unread`.
+    Writes, for each measurement, the derivative ``slope`` (K,) by the read probability and the Fisher information
+    ``curve`` (K,) on that probability, both 0 out of reach. Writes the derivatives ``by`` (K, 7) of the read
+    probability by the antenna's position in the frame of the pose (2), its yaw, the parameters ``a`` and ``b`` of its
+    model, and the tag's position in the world (2). ``at``, ``far``: from :func:`place_measurements`, :func:`_unread`.
     """
     nll = mean = variance = 0.0
     for k in range(len(antennas)):
         x, y, c, s = at[k, 0], at[k, 1], at[k, 2], at[k, 3]
         z, by_p, by_q, by_heading, by_range = of_tag(packed, antennas[k], x, y, c, s, point, normal)
-        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # out of reach and not read, as most are
+        if z == NEGLIGIBLE_LOGIT and hits[k] == 0:  # most tags are out of reach and not read
             nll, mean, variance = nll + far[k, 0], mean + far[k, 1], variance + far[k, 2]
             slope[k] = curve[k] = 0.0
             continue
@@ -306,7 +308,7 @@ def by_tag(
     rounds: Integers,
     hits: Integers,
 ) -> tuple[Array, Array, Array]:
-    """For each of T tags that work and are where the map has them, at one pose (3,): the untempered negative log-likelihood (T,),
+    """Return the untempered negative log-likelihood (T,) of each of T tags that are as in the map, at one pose (3,),
     and its gradient (T, 5) and information (T, 5, 5) by the pose (3) and by the tag's position in the world (2)."""
     scans, tags, size = len(antennas), len(points), 5
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
@@ -348,9 +350,9 @@ def probabilities(
 def predicted(
     packed: Packed, of_map: MapTags, counts: Counts, pose: Array, parameters: Array
 ) -> tuple[Integers, Integers, Array, Array]:
-    """Observed and predicted reads at one pose (3,), of the C tags that are near or listed in ``counts``. ``packed``: models before
-    adjustment by ``parameters`` (Q,). Returns the indices (C,) of the tags in the map, and for each measurement and tag the number
-    of reads, the read probability and the horizontal distance [m] from the antenna, (K, C) each."""
+    """Compute observed and predicted reads at one pose (3,), of the C tags that are near or listed in ``counts``.
+    ``packed``: models before adjustment by ``parameters`` (Q,). Returns the indices (C,) of the tags in the map, and
+    three arrays (K, C): the number of reads, the read probability, and the horizontal distance [m] from the antenna."""
     own, antennas = adjusted(packed, parameters), counts[1]
     offsets = delayed(counts[0], counts[8], own.delay)
     near = near_tags(of_map, counts, pose.copy().reshape(1, 3), reach_of(own, offsets))

@@ -12,8 +12,9 @@ Place = TypeVar("Place", float, Array)
 
 
 def linear(place: Array, count: int) -> tuple[Integers, Array]:
-    """Linear interpolation at ``place`` (N,) among ``count`` knots. Returns the indices (N, 2) of the knots and their
-    weights (N, 2), or (N, 1) for a single knot. Places outside are clipped."""
+    """Compute linear interpolation among the knots 0, 1, ... ``count`` - 1 at the positions ``place`` (N,). Returns the
+    indices (N, 2) of the neighbouring knots and their weights (N, 2), or (N, 1) if ``count`` is 1. Positions outside of
+    the knots are clipped."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -23,8 +24,8 @@ def linear(place: Array, count: int) -> tuple[Integers, Array]:
 
 @register_jitable
 def cubic_weights(f: Place) -> tuple[Place, Place, Place, Place]:
-    """The weights of four consecutive knots in cubic convolution. ``f``: position between the second and third knot, in
-    [0, 1], a number or an array."""
+    """The weights of four consecutive knots in cubic convolution. ``f``: the position between the second knot (0) and
+    the third knot (1), a number or an array."""
     return (
         ((-0.5 * f + 1.0) * f - 0.5) * f,
         (1.5 * f - 2.5) * f * f + 1.0,
@@ -34,8 +35,8 @@ def cubic_weights(f: Place) -> tuple[Place, Place, Place, Place]:
 
 
 def cubic(place: Array, count: int) -> tuple[Integers, Array]:
-    """Cubic convolution at ``place`` (N,) among ``count`` knots (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6). Returns the indices
-    (N, 4) of the knots and their weights (N, 4), or (N, 1) for a single knot. Places outside are clipped."""
+    """Compute cubic convolution, with the arguments of :func:`linear` (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6).
+    Returns the indices (N, 4) of the neighbouring knots and their weights (N, 4), or (N, 1) if ``count`` is 1."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -44,8 +45,8 @@ def cubic(place: Array, count: int) -> tuple[Integers, Array]:
 
 
 def matrix(places: tuple[Integers, Array], count: int) -> Array:
-    """The matrix (N, ``count``) that converts values at the knots to values at N places. ``places``: the result of
-    :func:`linear` or :func:`cubic`."""
+    """Return the matrix (N, ``count``) that interpolates values at ``count`` knots to N positions. ``places``: the
+    result of :func:`linear` or :func:`cubic`."""
     knots, weights = places
     out = np.zeros((len(knots), count))
     np.add.at(out, (np.arange(len(knots))[:, None], knots), weights)

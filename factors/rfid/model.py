@@ -156,9 +156,10 @@ class Antenna:
 
 class Packed(NamedTuple):
     """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw, and of pitch.
-    ``which`` (A,): the model of each antenna. ``kinds`` (M,), ``parameters`` (M, 12): of each model. ``shapes`` (M, 5):
-    H, F, NX, NY of a grid, and its first index in ``knots``, the logits of all grids. ``reach`` (M,) [m]. ``scale``,
-    ``rate`` (M,), ``delay`` (1,) [s]: see :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest probabilities."""
+    ``which`` (A,): the index of each antenna's model. ``kinds`` (M,), ``parameters`` (M, 12), ``reach`` (M,) [m]: of M
+    models. ``knots``: the logits of all grids. ``shapes`` (M, 5): H, F, NX, NY and first index in ``knots`` of a grid.
+    ``scale``, ``rate`` (M,), ``delay`` (1,) [s]: see :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest read
+    probabilities. ``span``: one minus the probabilities of false reads and misses."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -274,7 +275,8 @@ def _logits(
 def logit(
     kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """The logit of a tag at (x, y, z) in the antenna's frame with facing cosine c, and its four derivatives."""
+    """Return the logit of a tag at (x, y, z) in the antenna's frame with facing cosine c, and its four derivatives by
+    x, y, z and c."""
     if kind == BEAM:
         return _beam(parameters, x, y, z, c)
     if kind == LOGISTIC:

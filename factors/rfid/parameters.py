@@ -27,8 +27,8 @@ MOST_CERTAIN = 0.99  # limit of the peak of a model, because a shift of the logi
 
 @compiled
 def rate_of(peak: float, shift: float) -> float:
-    """The multiplier ``rate`` of the read probabilities of a model that changes the logit of the largest probability
-    ``peak`` by ``shift`` (the parameter b)."""
+    """Return the factor ``rate`` of read probabilities for the parameter b of a detection model. It shifts the logit of
+    the model's largest probability ``peak`` by ``shift``, the value of b."""
     certain = min(peak, MOST_CERTAIN)
     return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
 

@@ -70,10 +70,10 @@ class MissTable(NamedTuple):
 class Scan(NamedTuple):
     """The reads of one likelihood evaluation. W tags are exceptional: they were read, or their odds differ from those of most tags.
 
-    ``antennas`` (K,), ``rounds`` (K,): of each measurement. ``hits`` (K, W): the number of reads of each exceptional
-    tag. ``number`` (T,): for each tag, in the order of the index, its number among the exceptional tags, or -1.
-    ``odds`` (W,), ``elsewhere`` (W,): of the exceptional tags. ``unlisted_odds``: of all remaining tags. See
-    :class:`~factors.rfid.detection.TagReadCounts`.
+    ``antennas`` (K,), ``rounds`` (K,): antenna and number of rounds of each measurement. ``hits`` (K, W): the number of
+    reads of each exceptional tag. ``number`` (T,): for each tag, in the order of the spatial index, its number among
+    the exceptional tags, or -1. ``odds`` (W,), ``elsewhere`` (W,), ``unlisted_odds``: as of
+    :class:`~factors.rfid.detection.TagReadCounts`, with the exceptional tags listed.
     """
 
     antennas: Integers
@@ -118,9 +118,9 @@ def in_reach(points: Array, reach: float) -> float:
 def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: int = 0) -> RobotTables:
     """Compute the tables of a model by the tag's position in the robot frame.
 
-    ``heights`` (T,) [m]: heights of the tags. ``facings``: number of facing directions, besides that for an irrelevant
-    facing. ``finest``: the size of cells and of height steps, as a multiple of their size in the tables of
-    ``antennas``. It is increased if the tables would be too large.
+    ``heights`` (T,) [m]: heights of the tags. ``finest``: the size of cells and of height steps, as a multiple of their
+    size in the tables of ``antennas``. It is increased if the tables would be too large. ``facings``: number of facing
+    directions with a table. One more table is for tags with an unknown or irrelevant facing.
     """
     scale, size, (packed, tables, logs, reach) = finest, MOST + 1, antennas
     while size > MOST:
@@ -158,9 +158,9 @@ class Places:
     """The likelihood of reads at poses anywhere in a map.
 
     ``antennas``: the model and its tables. ``tables``: the tables by position in the robot frame, empty if the model
-    depends on the facing of tags.
-    ``index``: the spatial index of the map's tags. ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): the tags'
-    positions, facings and numbers of tables, in the order of the index.
+    depends on the facing of tags. ``index``: the spatial index of the map's tags. In the order of the index,
+    ``points`` (T, 3) are the positions of the tags, ``normals`` (T, 2) their facings, and ``levels`` (A, T) the numbers
+    of their tables in ``antennas``.
     """
 
     antennas: Antennas
@@ -278,11 +278,11 @@ def _log_likelihood(
 def _of_tag(
     model: Antennas, scan: Scan, x: float, y: float, height: float, nx: float, ny: float, levels: Integers, w: int
 ) -> float:
-    """The untempered log-likelihood of one tag that works and is where the map has it, from the tables of each antenna.
-    It is relative to the log-likelihood that a tag out of reach is never read.
+    """Return the untempered log-likelihood of one tag that is as in the map, minus that of a tag out of reach that is
+    never read.
 
     ``x``, ``y``, ``height``, ``nx``, ``ny``: position and facing of the tag in the robot frame. ``levels`` (A,): the
-    tables of the tag. ``w``: its number among the exceptional tags, -1 if it was not read.
+    numbers of the tag's tables. ``w``: the tag's number among the exceptional tags, or -1 if it was not read.
     """
     packed, own = model.packed, 0.0
     for k in range(len(scan.antennas)):

@@ -59,7 +59,7 @@ class TagReads:
     tags: Integers
 
     def moved(self, offset: Array) -> Self:
-        """The reads relative to another reference pose. ``offset`` (3,): the present reference pose in the frame of the new one."""
+        """Return the reads relative to a new reference pose. ``offset`` (3,): the old pose in the frame of the new."""
         return replace(self, offsets=se2.compose(offset, self.offsets))
 
     def chosen(self, which: NDArray[np.bool_] | Integers) -> Self:
@@ -76,8 +76,8 @@ class RssiReads(TagReads):
 
 @dataclass(frozen=True, eq=False)
 class PhaseReads(TagReads):
-    """R reads with phases. ``phase`` (R,) [rad]: as reported. ``frequency`` (R,) [Hz]: of the carrier. ``windows``
-    (R,): the number of each read's time window."""
+    """R reads with phases. ``phase`` (R,) [rad]: the reported phases. ``frequency`` (R,) [Hz]: the carrier frequencies.
+    ``windows`` (R,): the number of each read's time window."""
 
     phase: Array
     frequency: Array
@@ -106,8 +106,8 @@ class PhaseReads(TagReads):
 
 
 class _Ordered(NamedTuple):
-    """Phase reads sorted by group. ``doubled`` (R,) [rad]: twice the phase. ``wavenumber`` (R,) [rad/m]: its change per
-    metre of distance. ``bounds`` (G + 1,): the indices at which the G groups begin and end."""
+    """Phase reads sorted by group. ``doubled`` (R,) [rad]: twice the phase. ``wavenumber`` (R,) [rad/m]: the change of
+    ``doubled`` per metre of distance. ``bounds`` (G + 1,): the indices at which the G groups begin and end."""
 
     offsets: Array
     antennas: Integers
@@ -129,8 +129,8 @@ class PhaseProblem(NamedTuple):
 
 class StrengthProblem(NamedTuple):
     """Signal strengths, map and model for compiled code: ``antennas`` (A, 6) from :func:`mounting`, ``points`` (T, 3)
-    and ``normals`` (T, 2) of the tags, the fields of the model, and the fields of the reads. ``weight``: tempering.
-    ``which`` (R,): antennas."""
+    and ``normals`` (T, 2) of the tags, the fields of the model, and the fields of the reads. ``weight``: the tempering
+    exponent. ``which`` (R,): the antenna of each read."""
 
     antennas: Array
     points: Array
@@ -208,8 +208,8 @@ class PhaseLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of signal strengths as a function of the robot's pose in a map of tags. It is relative to its
-    value for residuals of zero."""
+    """The likelihood of signal strengths as a function of the robot's pose in a map of tags, divided by its value for
+    residuals of zero."""
 
     model: RssiModel
     tags: TagArray
@@ -255,8 +255,7 @@ def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: Rs
 
 @compiled(inline="always")
 def _on_robot(offset: Array, x: float, y: float) -> tuple[float, float]:
-    """Transform a position (x, y) from the robot frame at a read to the frame of the reference pose. ``offset`` (3,):
-    the robot's pose at the read in that frame."""
+    """Transform a position (x, y) from the robot frame to a frame in which the robot is at ``offset`` (3,)."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * x - s * y, offset[1] + s * x + c * y
 
@@ -300,8 +299,8 @@ def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tupl
 
 @compiled
 def _add_group(psi: Array, by: Array, offset: float, gradient: Array, information: Array) -> None:
-    """Add one group of reads to ``gradient`` (3,) and ``information`` (3, 3). The concentration kappa is 1.
-    ``psi``: the phase errors of the reads. ``by`` (..., 3): their derivatives by the pose. ``offset``: their common phase."""
+    """Add one group of R reads to ``gradient`` (3,) and ``information`` (3, 3), for a concentration kappa of 1.
+    ``psi`` (R,): phase errors. ``by`` (R, 3): their derivatives by the pose. ``offset``: the mean phase error."""
     total, mean = 0.0, np.zeros(3)
     for r in range(len(psi)):
         sine, weight = math.sin(psi[r] - offset), max(math.cos(psi[r] - offset), 0.0)
@@ -330,9 +329,9 @@ def _mounted(antenna: Array, offset: Array) -> tuple[float, float, float, float]
 def _features(
     at: tuple[float, float, float, float], height: float, up: float, ex: float, ey: float, nx: float, ny: float
 ) -> tuple[float, float, float, float, float]:
-    """The vector (x, y) from an antenna to a tag, their distance d, and w and c of :data:`FEATURES`. ``at``: from
-    :func:`_mounted`. ``height``: of the tag above the antenna. ``up``: vertical part of the boresight. (``ex``,
-    ``ey``), (``nx``, ``ny``): position and facing of the tag in the frame of the reference pose."""
+    """Return the vector (x, y) from an antenna to a tag, their distance d, and w and c of :data:`FEATURES`.
+    ``at``: from :func:`_mounted`. ``height``: height of the tag above the antenna. ``up``: vertical part of the
+    boresight. (``ex``, ``ey``), (``nx``, ``ny``): position and facing of the tag in the frame of the reference pose."""
     ex, ey = ex - at[0], ey - at[1]
     d = math.sqrt(ex * ex + ey * ey + height * height + NEAR * NEAR)
     return ex, ey, d, 1.0 - (ex * at[2] + ey * at[3] + height * up) / d, -(nx * ex + ny * ey) / d

@@ -36,7 +36,7 @@ COARSE = 8  # number of cells along each side of a block; the largest value of a
 FACINGS = 9  # number of layers, for evenly spaced cosines of the facing from -1 to 1
 NEGLIGIBLE = 15.0  # logarithm of the ratio of two likelihoods above which the smaller one is neglected
 NO_MATTER = 1e-3  # a tag is neglected if its log-likelihood differs by less from the value of a tag out of reach
-SCATTERED = 2.0  # m; if a tag's position relative to an antenna differs by more among particles, blocks are not used to exclude it
+SCATTERED = 2.0  # m; blocks can exclude a tag if its position relative to an antenna differs by less among particles
 STEP, LEVEL = 0.01, 0.04  # resolution of logits in the tables, and the height [m] within which tags have one table
 _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
 
@@ -45,7 +45,7 @@ class Tables(NamedTuple):
     """L tables of detection models, stored one after the other. Table l is an array (F, NX, NX) of facings and cells.
 
     ``sigmoids`` (Z,): the sigmoids of logits that are :data:`STEP` apart, from :data:`NEGLIGIBLE_LOGIT` to its
-    negative. ``rows``: the elements of all tables, as indices into ``sigmoids``. ``chances``: the sigmoids of these.
+    negative. ``rows``: the elements of all tables, as indices into ``sigmoids``. ``chances``: ``sigmoids[rows]``.
     ``start`` (L,): the index of the first element of each table.
     ``half`` (L,): the number of cells from the middle of a table to its edge. ``facings`` (L,): F of each table.
     ``level`` (A, T): the number of the table of each antenna and tag.
@@ -177,8 +177,9 @@ def row_of(
 ) -> int:
     """The index in ``sigmoids`` of :class:`Tables` for the logit of a tag in reach of an antenna.
 
-    ``level``: the number of the table. ``along``, ``across``: the tag's position relative to the antenna's heading, divided by the
-    range scale of the model. ``height`` [m]: of the tag above the floor. ``facing``: the cosine of the tag's facing.
+    ``level``: the number of the table. ``along``, ``across``: the tag's position along and across the antenna's
+    heading, divided by the range scale of the model. ``height`` [m]: the tag's height above the floor. ``facing``: the
+    cosine of the angle between the tag's facing and the direction to the antenna.
     """
     m = packed.which[antenna]
     if packed.kinds[m] == LOGISTIC:
@@ -212,7 +213,7 @@ def relevant(
     near: NDArray[np.bool_],
     tempering: float,
 ) -> NDArray[np.bool_]:
-    """A mask (K, T) of measurements and tags that change the likelihood of any particle noticeably.
+    """Return a mask (K, T), True if a tag in a measurement noticeably changes the likelihood of any particle.
 
     ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models adjusted to
     the first row of ``parameters``. ``near`` (T,): a mask of tags in reach. ``measured``, ``tags``: the reads of K

@@ -44,7 +44,7 @@ KEPT = 200.0  # s; the evidence of scans is stored for this time, and can be rem
 BELIEVED = 0.5  # a tag is reported as dead, weak or moved if the probability exceeds this value
 LIMIT = math.log(BELIEVED / (1.0 - BELIEVED))
 PITCH, FARTHEST = 0.5, 1.5  # m: spacing of the grid of displacements, and the largest displacement
-WORTH = 20.0  # the weight of the prior of the fraction of moved tags: it counts as this number of tags that were read
+WORTH = 20.0  # the prior of the fraction of moved tags has the weight of this number of tags that were read
 # The largest estimate of the fraction of moved tags. If more tags seem to have moved, a wrong pose or model is more likely.
 MOST_MOVED = 0.15
 # The kinds of weak tags. Each row has the changes of the parameters a and b of a detection model (factors.rfid.parameters), which
@@ -77,11 +77,11 @@ def _log(probability: float) -> float:
 
 
 class TagStates:
-    """The filters of the states of T tags.
+    """Bayesian filters that estimate whether each of T tags is as in the map, dead, weak or moved.
 
-    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, together below 1. Attributes:
-    ``odds`` (T,), the log-odds that each tag is not as surveyed; ``prior``, these odds of a tag without evidence;
-    ``hypotheses`` (S, 4), the result of :func:`hypotheses`; ``last_read`` [s], the time of the last read.
+    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, with a sum below 1. Attributes:
+    ``odds`` (T,) are the log-odds that each tag is dead, weak or moved. ``prior`` is the prior value of the log-odds.
+    ``hypotheses`` (S, 4) is the result of :func:`hypotheses`. ``last_read`` [s] is the time of the last read.
     """
 
     def __init__(self, count: int, dead: float, weak: float, moved: float) -> None:
@@ -133,7 +133,8 @@ class TagStates:
             self.last_read = max(self.last_read, t)
 
     def expect(self, tags: Integers, evidence: Array) -> Array:
-        """The log-likelihood (U,) of a scan's reads and misses of ``tags`` (U,) if these are weak, moved or dead (``elsewhere``).
+        """Return the log-likelihood (U,) of a scan for ``tags`` (U,) that are weak, moved or dead. This is the field
+        ``elsewhere`` of :class:`~factors.rfid.detection.TagReadCounts`.
 
         ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative
         to the log-likelihood that a tag out of range is never read.
@@ -149,8 +150,8 @@ class TagStates:
             self._evidence.popleft()
 
     def forget(self, since: float) -> None:
-        """Undo :meth:`learn` for all scans since the time ``since`` [s]. Scans more than :data:`KEPT` seconds old are not undone.
-        Call this if the robot's pose was wrong in these scans, or before they are processed again. :meth:`hear` is not undone."""
+        """Undo :meth:`learn` for all scans since the time ``since`` [s] that are not older than :data:`KEPT`. Call this
+        if the robot's pose was wrong in these scans, or before they are processed again."""
         kept: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         for row in self._evidence:
             if row[0] < since:
@@ -166,7 +167,7 @@ class TagStates:
         self._raise_prior()
 
     def _raise_prior(self) -> None:
-        """Raise the prior of moved tags to their estimated fraction among the tags that were read, at most :data:`MOST_MOVED`."""
+        """Raise the prior probability of moved tags to their estimated fraction, at most :data:`MOST_MOVED`."""
         raised = _raised(self._weights, self.odds, self._moved, self._raised)
         if raised != self._raised:
             self._weights[:, MOVED:] += raised - self._raised
@@ -182,7 +183,7 @@ def sigma_poses(pose: Array, covariance: Array, width: float) -> Array:
     the lower root of the body-frame ``covariance`` (3, 3)."""
     out = np.empty((6, 3))
     root, exists = cholesky(covariance)
-    if not exists:  # because of rounding; correlations are then ignored
+    if not exists:  # rounding made the covariance singular: ignore correlations
         root = np.diag(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     c, s = math.cos(pose[2]), math.sin(pose[2])
     for i in range(6):
@@ -322,10 +323,10 @@ def _all_odds(weights: Array) -> Array:
 
 @compiled
 def _raised(weights: Array, odds: Array, moved: float, raised: float) -> float:
-    """The increase of the log prior of moved tags, from the fraction of moved tags among those that were read.
+    """Return the increase of the log prior of moved tags, from the fraction of moved tags among tags that were read.
 
-    ``weights`` (T, W), ``odds`` (T,): of all tags, with a prior that is already increased by ``raised``. ``moved``: the
-    prior probability before any increase.
+    ``weights`` (T, W): log-probabilities of the states of all tags. ``odds`` (T,): log-odds that they are not as in the
+    map. Both include the present increase ``raised``. ``moved``: the prior probability before any increase.
 
     A higher prior makes more tags count as moved, which makes the prior higher. The result is the smallest fixed point
     of this iteration. It depends on the evidence only, not on the order of its arrival.
@@ -333,7 +334,7 @@ def _raised(weights: Array, odds: Array, moved: float, raised: float) -> float:
     if moved == 0.0:
         return 0.0
     most, read = max(MOST_MOVED, moved), 0
-    # the log-odds of moved, without the increase, of the tags that could count as moved
+    # log-odds of the state moved, without the present increase, of all tags that any prior could make moved
     unraised = np.empty(len(odds))
     candidates = 0
     for t in range(len(odds)):

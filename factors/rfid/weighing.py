@@ -135,11 +135,12 @@ def place_antennas(
 ) -> None:
     """Compute the antennas' poses and the models' adjustments for N robot poses.
 
-    ``poses`` (N, 3), ``parameters`` (N or 1, Q): the robot poses and the parameters of each.
-    ``placed`` (Q,): the parameters to which ``packed`` is adjusted. Other yaws must be within 0.5 rad of its yaws.
+    ``poses`` (N, 3): the robot poses. ``parameters`` (N or 1, Q): the parameters of each pose, or of all poses.
+    ``placed`` (Q,): the parameters to which ``packed`` is adjusted. Their yaws and the yaws in ``parameters`` must not
+    differ by more than 0.5 rad.
     ``at`` (K, 4, N): output, x, y, cosine and sine of the heading of each measurement's antenna in the frame of the
     tags (:mod:`factors.rfid.mounting`).
-    ``models`` (M, 2, N): output, the inverse range scale, and the rate times the span of :class:`~factors.rfid.model.Packed`.
+    ``models`` (M, 2, N): output, the inverse range scale, and rate times span of :class:`~factors.rfid.model.Packed`.
     """
     offsets, antennas, _ = measured
     cosine, sine, yaw = np.empty(len(poses)), np.empty(len(poses)), 2 * len(models)
