@@ -50,8 +50,8 @@ def calibrate(
     log. ``progress``: called with the number of steps done and the number of all steps.
     ``grids``: path prefix of the files of learnt detection grids, required for logs with tag reads.
 
-    Raises InputError if some logs have a reference and others not, or if a log is too short, lacks odometry, or has
-    other sensors than the first log. A log needs exteroceptive measurements, or a reference with headings.
+    Raises InputError if only some logs have a reference, or if a log is too short, lacks odometry, or has other
+    sensors. A log needs exteroceptive measurements, or a reference with headings.
     """
     report = progress or (lambda _done, _total: None)
     blind = bool(logs) and all(log.reference is None for log in logs)

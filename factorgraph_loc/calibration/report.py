@@ -28,7 +28,7 @@ VIEW = 5.0  # standard deviations; larger residuals are drawn at the edge
 
 
 def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = ()) -> Rows:
-    """Return a table with the initial and the learnt value of each constant, its standard deviation and that of the prior.
+    """Return a table of the constants: initial value, learnt value, standard deviation of the learnt value and of the prior.
 
     ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log alone.
     """
@@ -42,7 +42,7 @@ def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = (
 
 
 def accuracy_table(calibration: Calibration) -> Rows:
-    """Return a table of the errors on each held-out log and over all logs, with the input rig and with a learnt rig.
+    """Return a table of errors with the input rig and with a learnt rig, on each held-out log and over all logs.
 
     For each held-out log, the rig is learnt from the other data.
     """

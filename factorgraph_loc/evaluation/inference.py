@@ -66,8 +66,8 @@ class Contrast:
     """The difference between the scores of two methods a and b.
 
     ``difference``: pooled score of a minus that of b. ``low``, ``high``: its 95 % interval. ``p``: two-sided p value of
-    the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1. Interval, p and effect are None if there are
-    too few units.
+    the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1. Interval, ``p`` and ``effect`` may be None
+    (too few units).
     ``units``: "logs" are the independent units, or "seeds" if there is a single log. ``count``: number of units.
     ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of runs. ``left_out``: number of
     runs without a run of the other method on the same log and seed.
@@ -106,8 +106,7 @@ def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) 
 def contrast(
     a: ByLog, b: ByLog, *, rms: bool, interval: bool = True, alike: Mapping[str, str] | None = None
 ) -> Contrast | None:
-    """Compare the scores ``a`` and ``b`` of two methods on common logs and seeds. Return None if they have no pair in
-    common.
+    """Compare the scores ``a`` and ``b`` of two methods on common logs and seeds. Return None without common runs.
 
     If a method ran with a single seed, its run is paired with each seed of the other method. ``rms``, ``alike``: see
     :func:`pooled`. ``interval``: whether to compute the interval, which takes time.
@@ -150,8 +149,8 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     ``rows``: runs with log, estimator, seed and scores. A row of the result is about one log. It has the columns
     :data:`DIFFERENCES`. ``value_a``, ``value_b``: RMSEs over pairs of seeds, None without pairs. ``difference``: a
     minus b. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs without a run of the other
-    estimator. With enough logs there is a row with log "(all)", which alone has the interval ``low``, ``high`` of the
-    difference.
+    estimator.
+    If there are enough logs, a row with log "(all)" has the interval ``low``, ``high`` of the difference.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -263,8 +262,8 @@ def _ranks(differences: Array) -> Array:
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """Return an array (K, C) for each log with scores: C scores of each of K runs. Logs of one group in ``alike`` share
-    an array."""
+    """Return an array (K, C) for each log with scores: C scores of K runs. Logs of one group in ``alike`` share an
+    array."""
     merged: dict[str, list[Array]] = {}
     for log, values in scores.items():
         if len(values):

@@ -41,10 +41,10 @@ class Errors:
     ``t`` (N,): times [s]. ``poses``, ``reference`` (N, 3): the compared poses (x, y, heading).
     ``difference`` (N, 3): estimate minus reference in x, y [m, world frame] and heading [rad, wrapped].
     ``position`` (N,): distance [m]. ``heading`` (N,): absolute difference [rad], NaN if the reference has no heading.
-    ``nees`` (N,): normalised estimation error squared of x, y and heading, or of x and y if the reference has no heading.
+    ``nees`` (N,): normalised estimation error squared of x, y and heading, or of x and y if the reference has no
+    heading.
     ``dof``: number of these components, 3 or 2. ``nees_position`` (N,): normalised estimation error squared of x and y.
-    ``invalid`` (N,): mask of the poses with a covariance that is not positive definite. NEES are NaN if it is invalid or
-    missing.
+    ``invalid`` (N,): mask of the poses with a covariance that is not positive definite. The NEES are NaN there.
     """
 
     t: Array
@@ -99,8 +99,7 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
 def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, Any]:
     """Return all scores of a run by key, in metres and radians. A score that is undefined is None.
 
-    - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Only runs with equal values are
-      comparable.
+    - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Compare only runs with equal values.
     - ``causal.*``, ``final.*``: scores of the online and of the final trajectory, see :func:`accuracy`. They begin when the
       robot is first localized. They are None without a reference, or with fewer than :data:`FEWEST_SCORED` compared poses.
     - ``time_to_localized`` [s]: time from the start of the run until the robot is localized.
@@ -153,19 +152,19 @@ def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap:
 
 
 def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
-    """Return the scores of one trajectory against the reference by name. All are None if there is no reference.
-    ``max_gap`` [s]: see :func:`errors`.
+    """Return the scores of one trajectory against the reference by name. All are None if there is no reference. ``max_gap``
+    [s]: see :func:`errors`.
 
     - ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95`` and ``max`` of the errors, see :func:`errors`.
-    - ``rpe_position_per_m``, ``rpe_heading_per_m``: root mean square of the relative errors over pieces of one metre of path, see
-      :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`. ``rpe_pieces``: number of these pieces.
-    - ``rpe_position_per_s``, ``rpe_heading_per_s``: the same over pieces of one second.
+    - ``rpe_position_per_m``, ``rpe_heading_per_m``: root mean square of the relative errors over pieces of one metre of path,
+      see :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`. ``rpe_pieces``: number of these pieces.
+    - ``rpe_position_per_s``, ``rpe_heading_per_s``: root mean square of the relative errors over pieces of one second.
     - ``anees``: mean NEES, ideally 3, or 2 if the reference has no heading.
     - ``nees_bounds``: 95 % interval of the ANEES of a consistent estimator with independent errors. Errors along a trajectory
       are correlated, so a consistent estimator is outside of the interval in more than 5 % of runs.
     - ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 % ellipse.
-    - ``invalid_covariances``: number of scored poses whose covariance is not positive definite. The three scores above exclude
-      them.
+    - ``invalid_covariances``: number of scored poses with a covariance that is not positive definite. ``anees``,
+      ``nees_bounds`` and ``coverage_95`` exclude them.
     - ``scored``: number of compared poses.
     """
     figures: dict[str, Any] = dict.fromkeys(ACCURACY)

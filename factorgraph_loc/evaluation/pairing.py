@@ -1,15 +1,11 @@
-"""Common steps of all scores of trajectories: pairing of poses with the reference, pieces of paths, and statistics of errors.
+"""Common steps of all scores of trajectories: pairing with the reference, pieces of paths, and statistics of errors.
 
-A trajectory is compared with the reference at timestamps of the reference, at most ten per second. Relative errors are
-computed over pieces of the path.
+A trajectory is compared with the reference at timestamps of the reference, at most ten per second. The estimates are
+interpolated at these timestamps, and nothing is scored in gaps of the reference. An interpolated estimate may use a
+measurement that arrives shortly after the timestamp, because estimates are usually 0.1 s apart.
 
-The estimates are interpolated at these timestamps. The reference is not interpolated: nothing is scored in its gaps.
-Estimates are usually 0.1 s apart, so a scored pose is interpolated between two estimates that are less than 0.1 s away.
-The later one may use a measurement that arrives after the timestamp.
-
-Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights, which is conservative. Let
-``a`` and ``b`` be the errors of the neighbours, and ``f`` the weight of the later one. The covariance of ``(1 - f) a + f b`` is at
-most ``(1 - f) E[a a'] + f E[b b']``, for any correlation. Both are equal for identical errors.
+Poses are interpolated along the arc between neighbours. Covariances are averaged with the same weights. This is
+conservative: the weighted mean of two errors never has a larger covariance, for any correlation of the errors.
 """
 
 import bisect

@@ -32,10 +32,9 @@ _FILES = (
 
 
 def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path) -> list[Path]:
-    """Write the plots of the runs on a log into ``folder``. Return the paths of the PNG files, whose names start with
-    that of the log.
+    """Write the plots of the runs on a log into ``folder``. Return the paths of the PNG files.
 
-    ``tracks``: the plotted data of the run of each estimator by name. The plots are:
+    ``tracks``: by estimator, the plotted data of its run. The names of the files start with the name of the log:
 
     - ``trajectories``: the trajectories of all estimators.
     - ``error-distribution``: the distribution of errors, for several estimators and a log with a reference.
@@ -219,7 +218,7 @@ def _layers(log: Log) -> list[Marks]:
 
 
 def _room(log: Log) -> tuple[Array | None, float]:
-    """Return the corners (2, 2) [m] of the drawn part of the plane, and the height of the figure in units of 100 px.
+    """Return the corners (2, 2) [m] of the drawn part of the plane, and the height of the figure [100 px].
 
     The corners are None for a log without a reference.
     """
@@ -279,7 +278,7 @@ def distribution(axis: Axes, values: Array, **style: Any) -> None:
 
 
 def same_range(axes: Any) -> None:
-    """Give all axes the same x range. The smallest hundredth of the plotted values may be outside of it."""
+    """Give all axes the same x range, which contains at least 99 % of the plotted values."""
     drawn = [line.get_xdata() for axis in axes for line in axis.lines]
     if drawn:
         low = min(float(np.percentile(x, 1.0)) for x in drawn)

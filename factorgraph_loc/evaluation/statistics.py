@@ -64,7 +64,7 @@ def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
     """Return bootstrap draws (DRAWS, C) of C pooled scores. Logs are drawn, and seeds within each log.
 
     ``clusters``: for each log, the scores (K, C) of its K seeds. Scores are pooled over seeds, and then over logs with
-    equal weights, by the root mean square if ``rms`` is set, and otherwise by the mean.
+    equal weights. ``rms``: whether to pool by the root mean square instead of the mean.
     """
     scores = np.concatenate([np.square(cluster) if rms else cluster for cluster in clusters])
     drawn = _weights(tuple(map(len, clusters))) @ scores
@@ -130,12 +130,15 @@ def quantile(values: ArrayLike, share: float) -> float:
 
 
 def median_difference(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Return the median of ``a`` (N,) minus that of ``b`` (N,), in the same N cases, with its interval. Values may be infinite."""
+    """Return the median of ``a`` (N,) minus that of ``b`` (N,), with its interval. Both have values of the same N cases.
+
+    Values may be infinite.
+    """
     return _of_medians(np.subtract, a, b, lowest=-math.inf)
 
 
 def median_ratio(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Return the ratio of the median of ``a`` (N,) to that of ``b`` (N,), in the same N cases, with its interval.
+    """Return the median of ``a`` (N,) divided by that of ``b`` (N,), with its interval. Both have values of the same N cases.
 
     Values must not be negative, and may be infinite.
     """

@@ -18,10 +18,8 @@ EQUIVALENCE = 0.01  # relative difference of errors within which estimators are 
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
-    """Return the keys of the scores of additional tables, by title of the table.
-
-    There is a table of errors after an alignment if the runs have any, and a table of relative errors if ``rpe`` is set.
-    """
+    """Return the keys of the scores of additional tables, by title of the table: errors after an alignment, if the runs
+    have any, and relative errors if ``rpe`` is set."""
     tables: dict[str, tuple[str, ...]] = {}
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
     if aligned:
@@ -36,8 +34,8 @@ def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ..
 
 
 def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of a table that compares estimators. ``shown``: keys of the scores, empty for
-    :data:`TABLE`.
+    """Return the header and the rows of a table that compares estimators. ``shown``: keys of its scores (default
+    :data:`TABLE`).
 
     RMSEs are pooled over seeds by the root mean square, and other scores by the mean. With several seeds a cell has the
     standard deviation after ±. The last rows pool each estimator over the logs with equal weights. The column "runs"

@@ -1,4 +1,4 @@
-"""Execution of runs: single runs, comparisons, and experiments of many runs whose results are stored, resumed and reported."""
+"""Execution of runs: single runs, comparisons, and experiments of many runs, with stored results and reports."""
 
 __all__ = [
     "active",

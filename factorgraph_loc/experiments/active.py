@@ -44,8 +44,7 @@ PLOTS, PICTURE = "plots", "run.png"
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """A planned run of active localization in the simulated world ``simulation``. ``pictured``: whether to plot the
-    run."""
+    """A planned run of active localization in the simulated world ``simulation``. ``pictured``: whether it is plotted."""
 
     simulation: SimulationSettings
     policy: str
@@ -102,17 +101,15 @@ def active(
     """Simulate robots that drive from an unknown start until they are localized, for each policy, estimator and seed.
 
     ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``out``: folder for the
-    results. ``overwrite``: whether existing results in ``out`` may be replaced. ``changes``: nested settings of robot, policy
-    or world, such as ``{"policy": {"horizon": 8}}``. ``jobs``: number of parallel processes, None for one per core.
+    results. ``overwrite``: whether existing results in ``out`` may be replaced. ``changes``: nested settings of robot,
+    policy or world, such as ``{"policy": {"horizon": 8}}``. ``jobs``: number of processes, None for one per core.
     ``progress``: called with the number of finished runs and of all runs.
 
     The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
     :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and
-    ``plots/comparison.png``. For each policy and estimator there is a plot of the run with the first seed. A failed run has a
-    row with the reason. The same call resumes an interrupted experiment.
-
-    Raises InputError for an unknown or repeated name, for results in ``out`` without ``overwrite``, or if every run fails on
-    its input.
+    ``plots/comparison.png``. For each policy and estimator there is a plot of the run with the first seed. A failed run
+    has a row with the reason. The same call resumes an interrupted experiment. Raises InputError for an unknown or
+    repeated name, for results in ``out`` without ``overwrite``, or if every run fails on its input.
     """
     simulation, settings = _settings(world, changes or {})
     seeds, out = list(seeds), Path(out)

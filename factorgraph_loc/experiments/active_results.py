@@ -65,11 +65,11 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
     - ``runs``: number of runs.
     - ``median``, ``p90``: median and 90th percentile of the distance [m] until the robot is localized.
-    - ``failures``, ``failures_low``, ``failures_high``: number of runs that did not end localized, and the 95 % interval of their
-      fraction.
+    - ``failures``: number of runs that did not end localized. ``failures_low``, ``failures_high``: 95 % interval of
+      their fraction.
     - ``claimed_wrong``: number of runs that at any time reported a wrong pose as localized.
-    - ``error_position`` [m], ``error_heading`` [rad], ``seconds``: median errors, and median simulated time, of the runs that
-      ended localized.
+    - ``error_position`` [m], ``error_heading`` [rad], ``seconds`` (simulated): medians over the runs that ended
+      localized.
     - ``planning_ms``: median over runs of the median computing time of a planning step.
     """
     results = []
@@ -102,13 +102,13 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return comparisons of the first policy ``a`` with each further policy ``b``, for each world and estimator, by
-    key:
+    """Return comparisons of the first policy ``a`` with each other policy ``b``, for each world and estimator. The keys
+    are:
 
     - ``difference``, ``low``, ``high`` [m]: median distance of a minus that of b, and its 95 % interval.
     - ``ratio``, ``ratio_low``, ``ratio_high``: median distance of a divided by that of b, and its 95 % interval.
     - ``failed_only_a``, ``failed_only_b``: number of seeds with a failure of a only, and of b only.
-    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of common seeds; others are not
+    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of common seeds, which alone are
       used.
     """
     results = []
@@ -314,7 +314,6 @@ def _belief_sigma(step: PlanningStep) -> float:
 
 
 def _outline(run: ActiveRun) -> Array:
-    """Return points (K, 2) that the plot must show: the ends of all walls, or the robot's positions if there are no
-    walls."""
+    """Return points (K, 2) that the plot must show: the ends of all walls, or without walls the robot's positions."""
     walls = np.array(run.world.walls).reshape(-1, 2)
     return walls if len(walls) else run.truth.poses[:, :2]

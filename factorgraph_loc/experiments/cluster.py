@@ -48,10 +48,9 @@ class _Made:
 class Cluster(Executor):
     """Executes runs on the cluster of a scheduler. ``scheduler``: address of the scheduler.
 
-    This class limits the time of a run, and the cluster limits the memory. On entry of the context, InputError is
-    raised if the package ``distributed`` is not installed, or if the scheduler does not answer or has no workers. It is
-    also raised for a worker with other code or libraries. RunFailedError is raised if the connection to the scheduler
-    is lost.
+    This class limits the time of a run, and the cluster limits the memory. ``with`` raises InputError if the package
+    ``distributed`` is not installed, or if the scheduler does not answer or has no workers. InputError is also raised
+    for a worker with other code or libraries, and RunFailedError if the connection is lost.
     """
 
     def __init__(self, scheduler: str, limits: Limits) -> None:
@@ -128,7 +127,7 @@ class Cluster(Executor):
 def make(run: Planned, version: str, seconds: float) -> _Made:
     """Execute a run on a worker, in at most ``seconds``.
 
-    ``version``: digest of the code and libraries of the experiment. Raises InputError if those of the worker differ.
+    ``version``: digest of the code and libraries of the experiment. Raises InputError if the worker has another digest.
     """
     from distributed import get_worker  # noqa: PLC0415
 

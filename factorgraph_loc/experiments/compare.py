@@ -75,16 +75,15 @@ def compare(
     """Run several estimators on several logs with each seed, and compare them.
 
     ``out``: folder for the results, None for a new folder in ``out/``. ``overwrite``: whether existing results in
-    ``out`` may be replaced. ``settings``: by estimator, its settings by key. ``rig``, ``world``: replace those of the
-    logs.
+    ``out`` may be replaced. ``settings``: by estimator, its settings by key. ``rig``, ``world``: used instead of those
+    of the logs.
     ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
-    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``rpe``: whether ``table.md`` and the report
-    contain relative errors.
-    ``jobs``: number of parallel processes, None for one per core. ``progress``: called with the number of finished runs
-    and of all runs.
+    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``rpe``: whether to write relative errors.
+    ``jobs``: number of processes, None for one per core. ``progress``: called with the number of finished and of all
+    runs.
 
     A failed run does not stop the others, and the table states the reason. Runs with stored results are not repeated.
-    The files in ``out`` are:
+    Files in ``out``:
 
     - ``results.parquet``, ``results.csv``: a row for each run. ``table.md``: the table of the comparison.
     - ``differences.csv``: see :func:`~factorgraph_loc.evaluation.inference.differences`. ``plots/*.png``.
@@ -185,7 +184,7 @@ def _plot(logs: Sequence[Log], prepared: Prepared[PlannedRun], folder: Path) -> 
 
 
 def _table(rows: Sequence[Mapping[str, Any]], *, rpe: bool) -> str:
-    """Return the content of ``table.md``: the table of the comparison, and requested further tables."""
+    """Return the content of ``table.md``: the table of the comparison, and the tables of :func:`further_tables`."""
     text = markdown(*comparison_cells(rows))
     for title, columns in further_tables(rows, rpe=rpe).items():
         text += f"\n{title}\n\n{markdown(*comparison_cells(rows, columns))}"

@@ -37,7 +37,7 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, 
 
 
 def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
-    """Return a warning about the error of a map that was made without a reference, with the median and the maximum
+    """Return a warning about the error of a map that was made without a reference. It states the median and the maximum
     along the trajectory ``final``. ``frame``: has the covariance of this error at each pose."""
     if frame.error is None or not len(final):
         return ()

@@ -190,8 +190,7 @@ def _forget_peak_memory() -> None:
 
 @dataclass(eq=False)
 class _Worker(Worker):
-    """A worker process. ``source``: source of its last run, which is still in memory. ``since``: start of its current
-    run [s]."""
+    """A worker process. ``source``: source of its last run, which is still in memory. ``since``: start of its run [s]."""
 
     source: Hashable = None
     since: float = 0.0

@@ -145,7 +145,7 @@ def prepare(
 ) -> tuple[Experiment, Prepared[PlannedRun]]:
     """Read an experiment file and plan its runs. Return the experiment, and the runs with the states of stored results.
 
-    ``changes``: values by dotted key that replace those of the file, see
+    ``changes``: values that replace values of the file, see
     :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``data_root``: the data folder, None for the
     environment variable FGLOC_DATA. ``out``: folder of the results, None for the folder that the file names.
 

@@ -177,7 +177,7 @@ class ReportSettings(FileModel):
 
 
 class Limits(FileModel):
-    """Limits of one run. ``memory`` [10^6 bytes]: of its process. ``time`` [s]: of its computation.
+    """Limits of one run. ``memory`` [10^6 bytes]: of its process. ``time`` [s]: maximum computing time.
 
     The default of ``memory`` is 90 % of the machine's memory, divided by the number of processes.
     """
@@ -264,8 +264,8 @@ def write_new(file: Path, *, overwrite: bool = False) -> None:
 def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Experiment:
     """Read an experiment from a TOML file.
 
-    ``changes``: by dotted key of the file, a value that replaces that of the file. The key ``LABEL.KEY`` is a setting of an
-    estimator, and ``simulation.KEY`` a setting of all simulated logs. Raises InputError with file and key if a value is invalid.
+    ``changes``: {dotted key: value} to replace values of the file. The key ``LABEL.KEY`` is a setting of an estimator,
+    and ``simulation.KEY`` a setting of all simulated logs. Raises InputError with file and key if a value is invalid.
     """
     content = read_toml(path)
     for key, value in (changes or {}).items():

@@ -106,8 +106,7 @@ class LogFacts:
 
 @dataclass(frozen=True)
 class EstimatorFacts:
-    """Facts about an estimator. ``effective``: its settings, including defaults. ``deterministic``: whether it uses no
-    random numbers."""
+    """Facts about an estimator. ``effective``: all its settings. ``deterministic``: True if it uses no random numbers."""
 
     effective: Mapping[str, Any]
     deterministic: bool
@@ -161,8 +160,7 @@ class Facts:
         return digest
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
-        """Return facts about all logs of a source with the hash ``digest``. Raises InputError if a log cannot be
-        loaded."""
+        """Return facts about all logs of a source with the hash ``digest``. Raises InputError if it cannot be loaded."""
         if digest not in self._known.logs:
             self._known.logs[digest] = [_facts(log) for log in source.load_all()]
         return self._known.logs[digest]

@@ -83,9 +83,10 @@ class LogSource(ABC):
 class RecordedSource(LogSource):
     """A recorded log.
 
-    ``log``: a name or path for :func:`~factorgraph_loc.io.readers.load`. ``number``: index of the log among those it returns.
-    ``reader``: name of the reader, None to find it by the file. ``options``: options of the reader as JSON. ``rig``, ``world``:
-    files that replace those of the log. ``data_root``: the data folder, None for the environment variable FGLOC_DATA.
+    ``log``: a name or path for :func:`~factorgraph_loc.io.readers.load`. ``number``: index of the log if there are
+    several. ``reader``: name of the reader, None to find it by the file. ``options``: options of the reader as JSON.
+    ``rig``, ``world``: files to use instead of those of the log. ``data_root``: the data folder, None for the
+    environment variable FGLOC_DATA.
     """
 
     log: str
@@ -184,8 +185,8 @@ class GivenSource(LogSource):
 def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSource]:
     """Return the sources for a name in an experiment file: a known name, a path relative to ``folder``, or a glob for either.
 
-    ``options``: further fields of the sources. Raises InputError if a glob matches no log, or if a path leads out of
-    ``folder`` and of the data folder.
+    ``options``: values of other fields of :class:`RecordedSource`. Raises InputError if a glob matches no log, or if a path
+    leads out of ``folder`` and of the data folder.
     """
     known = manifests()
     if name in known:

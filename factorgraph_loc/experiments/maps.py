@@ -66,8 +66,8 @@ Progress = Callable[[float], None]
 class MapOptions:
     """How a map is made.
 
-    ``of``: landmarks, tags or points. None: points if the log has images, landmarks if it has sightings of them, else
-    tags. ``estimator``, ``settings``: the estimator of landmarks, and its settings.
+    ``of``: landmarks, tags or points. None: points if the log has images, landmarks if it has measurements of
+    landmarks, else tags. ``estimator``, ``settings``: the estimator of landmarks, and its settings.
     ``points``: settings of a map of points, fields of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`.
     ``extend``: whether to keep the log's map and to add what it lacks.
     ``poses``: source of the robot poses for a map of tags: "reference", or "odometry" to estimate the poses together

@@ -51,23 +51,24 @@ def write_run(
 ) -> dict[str, Any]:
     """Score a run, write its files into the folder ``out``, and return the scores.
 
-    ``align``: see :func:`~factorgraph_loc.evaluation.metrics.score`. The files are written to a temporary folder first. Other files
-    in ``out`` are not changed. Raises InputError if ``out`` contains results and ``overwrite`` is not set. The files are:
+    ``align``: see :func:`~factorgraph_loc.evaluation.metrics.score`. The files are written to a temporary folder first.
+    Other files in ``out`` are not changed. Raises InputError if ``out`` contains results and ``overwrite`` is not set.
+    Files:
 
     - ``final.tum``, ``causal.tum``: trajectories. The latter starts when the robot is localized first.
-    - ``estimates.parquet``: a row for each tick (time of an estimate, every 0.1 s) and ``kind`` (causal, final), with the timestamp
-      ``t_ns``, ``x``, ``y`` [m], ``heading`` [rad] and covariances in the world frame. ``error_position`` [m],
-      ``error_heading`` [rad, absolute] and ``nees`` are those at the timestamp of the reference that is nearest to the tick. They
-      are null if this timestamp is nearer to another tick. ``update_ms`` is the slowest update since the previous tick, null if
-      there was none or for the kind final.
-      ``status`` and ``doubts_model`` (whether measurements contradict the model of their sensor) are those of the causal estimate.
-    - ``learnt.json``: ``constants`` by name with ``value`` and ``sigma``; ``landmarks`` by name with ``x``, ``y`` [m] and
-      ``covariance`` (xx, xy, yy) [m^2] in the world frame.
+    - ``estimates.parquet``: a row for each tick (time of an estimate, every 0.1 s) and ``kind`` of trajectory (causal,
+      final). ``t_ns``: timestamp. ``x``, ``y`` [m], ``heading`` [rad], and covariances, in the world frame.
+      ``error_position`` [m], ``error_heading`` [rad, absolute], ``nees``: at the nearest timestamp of the reference,
+      null if this timestamp is nearer to another tick. ``update_ms``: the slowest update since the previous tick, null
+      without an update. ``status``, ``doubts_model`` (whether measurements contradict the model of their sensor): of
+      the causal estimate.
+    - ``learnt.json``: ``constants`` by name with ``value`` and ``sigma``; ``landmarks`` by name with ``x``, ``y`` [m]
+      and ``covariance`` (xx, xy, yy) [m^2] in the world frame.
     - ``events.csv``: the timestamp ``t_ns``, the time ``t`` [s] since the log's start, and the event.
-    - ``innovations.parquet``: for each update the ``sensor``, the timestamp ``t_ns``, the normalised innovation squared ``nis`` and
-      its degrees of freedom ``dof``.
+    - ``innovations.parquet``: for each update the ``sensor``, the timestamp ``t_ns``, the normalised innovation squared
+      ``nis`` and its degrees of freedom ``dof``.
     - ``metrics.json``: the scores. ``config.toml``: the configuration of the run.
-    - ``map.world.toml`` and a file of points: the map with the points that the run learnt, if there are any; see :func:`map_of`.
+    - ``map.world.toml`` and a file of points: see :func:`map_of`. They are written if the run learnt points.
     """
     require_free(out, FILES, overwrite=overwrite)
     scores = score(result, log, align)
@@ -131,7 +132,7 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
 def map_of(result: RunResult, log: Log) -> World | None:
     """Return the log's map with the points that a run learnt, or None if the run learnt no points.
 
-    The learnt points replace those of the map. If the run extended the map, they are added to its points.
+    If the run extended the map, the points are added to the map's points, which they replace otherwise.
     """
     points, known = result.learnt.points, log.world.points
     if points is None or not len(points):
@@ -253,8 +254,8 @@ def _slowest_update(result: RunResult) -> Array:
 def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:
     """Return the files of a run as {file name: content}, for the store of an experiment.
 
-    The files are those of :func:`write_run`, except that times are in a file of their own and ``update_ms`` is empty.
-    Therefore all other files are reproducible. ``started``: value of ``perf_counter`` at the start of the run.
+    They are the files of :func:`write_run`. Computing times are in a separate file and ``update_ms`` is empty, so that
+    all other files are reproducible. ``started``: value of ``perf_counter`` at the start of the run.
     """
     scores = score(result, log, align)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}
@@ -266,8 +267,7 @@ def run_files(result: RunResult, log: Log, started: float, align: Alignment = "n
 
 
 def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out: Path) -> None:
-    """Write :data:`TABLES` into ``out``: the runs ``table``, the ``differences`` of methods, and ``text`` as
-    table.md."""
+    """Write :data:`TABLES` into ``out``: the runs ``table``, the ``differences`` of methods, and ``text`` (table.md)."""
     write_text(out / "results.csv", plain_lines(table.write_csv()))
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))

@@ -101,7 +101,7 @@ def plan(
 
     ``folder``: paths in the experiment are relative to it. ``cache``: folder for cached facts about logs and
     estimators. ``data_root``: the data folder, None for the environment variable FGLOC_DATA. ``given``: sources of logs
-    that replace those of the experiment.
+    to use instead of the logs of the experiment.
 
     Swept settings of one estimator do not multiply the runs of other estimators. Deterministic estimators run only with
     the first seed.

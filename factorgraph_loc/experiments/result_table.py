@@ -41,10 +41,10 @@ def load_results(path: str | Path) -> pl.DataFrame:
 
     The columns are:
 
-    - ``label``, ``log``, ``estimator``, ``prior``, ``seed``. ``sensors``: separated by commas, null for those of the rig.
+    - ``label``, ``log``, ``estimator``, ``prior``, ``seed``. ``sensors``: separated by commas, null for the rig's sensors.
     - ``sweep.KEY``: value of each swept setting, null if it does not apply to the run.
-    - ``status``: ok or failed. Of a failure, ``kind`` (error, timeout, memory, killed, vanished) and ``reason``.
-    - ``key``: key of the results in the store. ``duration`` [s]: of the log. ``warnings``: one on each line.
+    - ``status``: ok or failed. ``kind`` (error, timeout, memory, killed, vanished), ``reason``: of a failure.
+    - ``key``: key of the results in the store. ``duration`` [s]: of the log. ``warnings``: a text with one warning per line.
     - the scores of :func:`~factorgraph_loc.evaluation.metrics.score`, null for failed runs.
 
     Raises InputError if there are no results.

@@ -134,8 +134,8 @@ class Store:
     def row(self, key: str) -> dict[str, Any]:
         """Return the columns of a run for the table of results.
 
-        They are ``status`` (ok, failed), the ``kind`` and ``reason`` of a failure, scores and times that are single
-        numbers, and ``warnings`` with one warning per line. Raises DamagedError as :meth:`read`.
+        They are ``status`` (ok, failed), ``kind`` and ``reason`` of a failure, and ``warnings`` (one per line). Scores
+        and times that are single numbers are columns too. Raises DamagedError as :meth:`read`.
         """
         return self._row(self._manifest(key))
 
@@ -204,8 +204,7 @@ class Store:
 
     @contextmanager
     def claim(self, key: str) -> Iterator[bool]:
-        """Claim a run in this block against other processes. Yields False if another process has claimed it, else
-        True."""
+        """Claim a run in this block against other processes. Yields True, or False if another process has claimed it."""
         path = self.folder / "claims" / key
         with self._writing():
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)

@@ -21,13 +21,13 @@ class Event(Notice):
 
 @dataclass
 class Diagnostics:
-    """Counts and consistency figures of a run.
+    """Counts and consistency statistics of a run.
 
     ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the
     update. ``nis``: by sensor, rows of (t [s], normalised innovation squared, degrees of freedom).
     ``ignored``, ``rejected``: counts of detections by reason. ``late``: counts of late measurements by sensor.
     ``events``: events of the estimator, for example a rebuilt graph.
-    ``doubted``: by kind of doubt (``moved_tags``), names of map elements, each with the probability that the map is wrong about it.
+    ``doubted``: by kind of doubt (``moved_tags``), {name of a map element: probability that the map is wrong about it}.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -85,7 +85,7 @@ class Diagnostics:
             self.added.append((self.residuals, name, rows))
 
     def event(self, t: float, kind: str, sentence: str, **fields: Any) -> None:
-        """Record an event at time ``t`` [s]. If measurements are processed again, a repeated event is recorded once.
+        """Record an event at time ``t`` [s]. An event that is already recorded is not recorded again.
 
         ``kind``: the type of the event. ``sentence``: its text, with names of ``fields`` in braces.
         """
@@ -102,7 +102,7 @@ class Diagnostics:
         del self.events[:-rows]
 
     def copy(self) -> Diagnostics:
-        """Return a deep copy of the counts, figures and events, without recorded additions."""
+        """Return a deep copy, without recorded additions."""
         return Diagnostics(
             {name: list(rows) for name, rows in self.nis.items()},
             {name: list(values) for name, values in self.residuals.items()},

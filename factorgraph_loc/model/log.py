@@ -19,7 +19,7 @@ from factorgraph_loc.text import Notice, well_formed
 from factors.se2 import Array, Integers
 
 NOT_READ = "not read"  # key of the metadata: columns, files or topics that the reader leaves out
-RIG_NOTES = "robot"  # key of the metadata: notes on the rig that the reader makes itself
+RIG_NOTES = "robot"  # key of the metadata: notes about a rig that the reader derives from the data
 
 
 @dataclass(frozen=True)
@@ -74,17 +74,17 @@ class Log:
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
         """Return the measurements of ``sensors`` in order of arrival. Time offsets in the rig are added to timestamps.
 
-        A measurement that is older than another one before it in its stream arrives directly after that one. Others
-        arrive at their timestamps, and at equal timestamps in order of the ranks of their streams.
+        A measurement arrives at its timestamp. A late measurement, which is older than an earlier row of its stream,
+        arrives with that row. At equal times, the ranks of the streams determine the order.
         """
 
         return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))
 
     def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """Return the measurements as :meth:`measurements` does, but with rows of one stream joined, which is faster to process.
+        """Return the measurements as :meth:`measurements` does, but with rows of one stream joined, for speed.
 
-        Successive rows of a stream become one :class:`~factorgraph_loc.model.measurement.Rows` if the stream allows it
-        (``joins``), no other measurement arrives between them, and each row is newer than the previous one.
+        Rows of a stream with ``joins`` become one :class:`~factorgraph_loc.model.measurement.Rows` up to the next
+        measurement of another stream. Late rows are not joined.
         """
         order = self._in_order(sensors)
         joined = next((rank for rank, name in enumerate(order) if self.streams[name].joins), None)
@@ -147,8 +147,8 @@ def cut(log: Log, start: float, end: float) -> Log:
     """Return the part of a log, and of its reference, with timestamps from ``start`` to before ``end`` [s].
 
     Timestamps do not change. Time offsets of sensors are not considered. The part has no known start pose. Its first
-    odometry increment is still the motion since the previous row of the whole log. Raises InputError if no measurement
-    is left.
+    odometry increment is still the motion since the previous row of the whole log. Raises InputError without
+    measurements.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:

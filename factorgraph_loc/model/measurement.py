@@ -145,8 +145,8 @@ class Stream:
         return (column for name, column in columns_of(self).items() if name != "t")
 
     def begun_anew(self) -> Self:
-        """Return the stream with zero motion in its first row. It is used if a log continues where the robot was
-        carried to. Streams that do not measure motion are returned unchanged."""
+        """Return the stream with zero motion in its first row, for a log in which the robot was carried before that
+        row. Streams that do not measure motion are returned unchanged."""
         return self
 
     def scans(self) -> Iterator[tuple[int, int]]:

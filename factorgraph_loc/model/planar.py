@@ -93,8 +93,8 @@ AS_IT_IS = Turned()
 
 
 def not_unit(quaternions: Array) -> Fault:
-    """Return a :class:`Fault` with a mask of the ``quaternions`` (N, 4) whose length is not 1. Readers make an error
-    message of it."""
+    """Return a :class:`Fault`, for an error message, with a mask of the ``quaternions`` (N, 4) that do not have length
+    1."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")
@@ -103,9 +103,9 @@ def not_unit(quaternions: Array) -> Fault:
 def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.bool_]:
     """Return a mask (N,) of null poses, which programs publish while they have lost track.
 
-    The quaternion (N, 4) of a null pose is zero, or a variance of x or y (N, 2) [m^2] is at least :data:`HUGE` and far
-    above that of the last valid pose. Later poses have no influence, with one exception: if more than half of the
-    quaternions are zero, no quaternion marks a null pose, and a reader of poses refuses the file.
+    A pose with a zero quaternion (N, 4) is null. A pose is also null if its variance of x or y (N, 2) [m^2] rises to
+    :data:`HUGE` or more, far above that of the last valid pose. If more than half of the quaternions are zero, they
+    mark no null poses, so that the reader refuses the file.
     """
     null = np.asarray(~quaternions.any(axis=1))
     if 2 * np.count_nonzero(null) > len(null):
@@ -117,8 +117,8 @@ def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.b
 
 
 def _rise(variances: Array, null: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the ``variances`` (N,) [m^2] that are at least :data:`HUGE` and far above the last one
-    before that is neither masked nor in ``null`` (N,). The first one is not masked."""
+    """Return a mask (N,) of the ``variances`` (N,) [m^2] that are at least :data:`HUGE` and far above the last valid
+    variance. Valid are those that are neither masked nor in ``null`` (N,). The first variance is not masked."""
     out = np.zeros(len(variances), dtype=bool)
     if not (variances >= HUGE).any():
         return out
@@ -188,7 +188,7 @@ def on_floor(
 
 
 def about_z(source: object, rows: Integers, rates: Array, turned: Array) -> Array:
-    """Return the turn rates (N,) about the robot's z axis from the ``rates`` (N, 3) about the axes of a sensor, in the same unit.
+    """Return the turn rates (N,) about the robot's z axis, from the ``rates`` (N, 3) of a sensor about its own axes.
 
     ``turned`` (3, 3): the rotation from the sensor frame to the robot frame. ``source``, ``rows`` (N,): the file and
     the row numbers for errors. Raises InputError if a rate is not finite, unless its axis is perpendicular to z.

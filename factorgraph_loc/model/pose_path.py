@@ -70,7 +70,7 @@ class Exchange:
     @classmethod
     @abstractmethod
     def _of_rows(cls, rows: Array) -> Self:
-        """Return the trajectory with these ``rows``, whose columns are those of :meth:`to_numpy`."""
+        """Return the trajectory with the poses in ``rows``, an array with the columns of :meth:`to_numpy`."""
 
     @abstractmethod
     def _tum(self) -> Iterator[str]:
@@ -91,14 +91,14 @@ def numbers(table: pl.DataFrame, names: Iterable[str]) -> Array:
 
 
 def require_times(name: str, t: Array | Integers) -> None:
-    """Raise InputError at the first pose whose time is not after the time of the pose before.
+    """Raise InputError if the times of poses do not increase.
 
-    ``t`` (N,): times in seconds, or integers in nanoseconds. ``name``: named in the error.
+    ``t`` (N,): times in seconds, or integers in nanoseconds. ``name``: name of the poses in the error.
     """
     if len(stuck := np.flatnonzero(~(np.diff(t) > 0))):
         i = int(stuck[0]) + 1
         unit = "ns" if np.issubdtype(t.dtype, np.integer) else "s"
-        raise InputError(f"{name}: pose {i + 1} has the time {t[i]} {unit}, expected one after that of the pose before")
+        raise InputError(f"{name}: pose {i + 1} has the time {t[i]} {unit}, expected a time after that of pose {i}")
 
 
 @dataclass(frozen=True)

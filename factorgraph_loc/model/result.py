@@ -16,12 +16,12 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """A comparison of observed and predicted detections of one sensor, to judge its model. Measurements are in G groups.
+    """A comparison of the detections that one sensor made with those that its model predicted, in G groups of
+    measurements.
 
     ``what``: the plural name of the detections. ``groups`` (G,): names of the groups.
     ``observed``, ``predicted`` (G,): counts of detections.
-    ``sigma`` (G,): standard deviation of the observed count if the model is correct. It accounts for the correlation of
-    successive measurements.
+    ``sigma`` (G,): standard deviation of ``observed`` if the model is correct, for correlated successive measurements.
     ``overdispersion``: number of correlated measurements that have the information of one independent measurement.
     """
 

@@ -22,10 +22,11 @@ S = TypeVar("S", bound=FileModel)
 
 
 class Rig(FileModel):
-    """A robot and its sensors. The settings of a sensor are an attribute with the name of its section, None if the robot lacks it.
+    """A robot and its sensors. The settings of a sensor are an attribute with the name of its section, None if the
+    robot lacks it.
 
-    If the robot has several sensors of a kind, the attribute is a dict of settings by name, and the full name of a
-    sensor is such as ``bearing_range.front``. In ``sensors``, the name of a kind stands for all sensors of that kind.
+    If the robot has several sensors of a kind, the attribute is a dict of settings by name. The full name of such a
+    sensor is ``bearing_range.front``, for example. In ``sensors``, a kind stands for all sensors of that kind.
     """
 
     name: str = "rig"
@@ -60,7 +61,7 @@ class Rig(FileModel):
         return tuple(by_name(section, getattr(self, section, None)))
 
     def expanded(self, sensors: Iterable[str]) -> tuple[str, ...]:
-        """Return the names ``sensors``, where the name of a kind is replaced by the names of all its sensors in the rig."""
+        """Return the names ``sensors``. The name of a kind is replaced by the names of all sensors of that kind in the rig."""
         return tuple(dict.fromkeys(each for name in sensors for each in self.names(name) or (name,)))
 
     def alone(self, sensor: str) -> Self:
@@ -88,7 +89,8 @@ class Rig(FileModel):
         return settings
 
     def estimated(self, section: str) -> Estimated:
-        """Return the constants of a sensor that estimators estimate. There are none if the rig lacks the sensor."""
+        """Return the calibration constants of the sensor with this section that are estimated, none if the rig lacks
+        it."""
         settings = self.section(section)
         return settings.estimated() if isinstance(settings, SensorSettings) else NOTHING
 
@@ -99,7 +101,7 @@ class Rig(FileModel):
         return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy whose names of files, such as tables of RFID models, are relative to ``folder``."""
+        """Return a copy for a rig file in ``folder``: names of files, such as tables of RFID models, become relative to it."""
         return self.model_copy(update={name: settings.placed(folder) for name, settings in self._of_sensors().items()})
 
     def write_beside(self, folder: Path) -> None:

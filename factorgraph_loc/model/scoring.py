@@ -105,7 +105,7 @@ def parse_seeds(text: str, source: object = "--seeds") -> range:
 
 
 class Ticks:
-    """The ticks of a run, the times of the recorded estimates, generated while measurements arrive.
+    """The ticks of a run: the times at which estimates are recorded. They are computed while measurements arrive.
 
     ``start``: time of the first tick [s]. A tick follows all measurements up to its time. Ticks have a constant
     interval, but there are none in a time of more than ``gap`` [s] without measurements.
@@ -140,7 +140,7 @@ class Ticks:
             yield from self.rest()
             self.skipped.append((self._newest, t))
             self._next = max(self._next, math.floor((t - self._start) * RATE) - 1)
-            for _ in range(3):  # find the first tick that is not before `t`, in spite of rounding
+            for _ in range(3):  # rounding may require several steps to the first tick that is not before `t`
                 self._next += self._start + self._next / RATE < t
         self._newest = max(self._newest, t)
         while (tick := self._start + self._next / RATE) < t:

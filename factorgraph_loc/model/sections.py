@@ -34,10 +34,10 @@ class Layer:
 
     ``kind``: the class of an element, a :class:`~factorgraph_loc.files.models.FileModel`.
     ``table``: the description of a table with many elements.
-    ``read``: a function ``(content, source, folder) -> elements`` that converts the value in a world file, such as the
+    ``read``: a function ``(content, source, folder) -> elements``. It converts the value in a world file, such as the
     name of a table in ``folder``.
     ``write``: a function ``(elements, path of the world file without suffixes) -> content``. It writes a table and
-    returns its name for the world file, or returns None if the world file itself shall contain the elements.
+    returns the name of the table, or None if the elements belong into the world file.
     ``suffix``: the suffix of the tables that ``write`` writes.
     """
 
@@ -73,7 +73,7 @@ def sections() -> dict[str, Section]:
 
 
 def sections_of_channels() -> dict[str, str]:
-    """Return the section of the rig that belongs to each channel, the stream of measurements of a sensor."""
+    """Return {channel: section of the rig}. A channel is the name of a stream of measurements."""
     return {channel.name: channel.section for sensor in registered().values() for channel in sensor.channels}
 
 
@@ -89,7 +89,7 @@ def kind_of(name: str) -> str:
 
 
 def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
-    """Return a dict from new to old names of sensors, in which ``chosen`` is the only sensor of its kind.
+    """Return {new name: old name} of sensors, after ``chosen`` has become the only sensor of its kind.
 
     The new name of ``chosen`` is the name of its kind. Other sensors of that kind in ``names`` are left out.
     """

@@ -76,7 +76,7 @@ class Estimated:
 
     @staticmethod
     def among(names: Sequence[str], sigmas: Array) -> Estimated:
-        """Return the constants among ``names`` (M,) whose ``sigmas`` (M,) are above zero."""
+        """Return the constants among ``names`` (M,) with standard deviations ``sigmas`` (M,) above zero."""
         indices = tuple(np.flatnonzero(sigmas).tolist())
         return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
 
@@ -108,14 +108,14 @@ class SensorSettings(FileModel):
         return Estimated.of(self.constants, getattr(self, "uncertainty", None))
 
     def map_error(self, world: World) -> Callable[[Array], Array] | None:
-        """Return a function from poses (N, 3) to covariances (N, 3, 3) of (x, y, heading), or None if the map is exact.
+        """Return a function from poses (N, 3) to covariances (N, 3, 3) of the map's error. Return None if the map is exact.
 
-        A covariance is the uncertainty of the frame of the sensor's map at that pose.
+        At each pose, the map around it may be displaced and rotated by an error (x, y, heading) with this covariance.
         """
         return None
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy whose names of files are relative to ``folder``, the folder of the rig's file."""
+        """Return a copy for a rig file in ``folder``: names of files become relative to it."""
         return self
 
     def write_beside(self, folder: Path) -> None:

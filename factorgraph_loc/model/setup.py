@@ -42,9 +42,9 @@ Calibration = Literal["all", "particles", "none"]
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Converts estimates between the frame of a map and the world frame, by adding the covariance of the error of the map's frame.
+    """Accounts for the error of a map's frame in the world. The covariance of this error is added to priors and to estimates.
 
-    ``error``: a function from poses (N, 3) to covariances (N, 3, 3) of (x, y, heading) of that error. None if the map is exact.
+    ``error``: a function from poses (N, 3) to covariances (N, 3, 3) of the error (x, y, heading). None if the map is exact.
     """
 
     error: Callable[[Array], Array] | None = None

@@ -131,11 +131,11 @@ class Trajectory(Exchange):
 
 
 def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integers, Array, NDArray[np.bool_]]:
-    """Find the neighbours of the times ``t`` (M,) among sorted timestamps ``stamps`` (N,), N > 0, for interpolation.
+    """Return the neighbours of the times ``t`` (M,) among sorted timestamps ``stamps`` (N,), N > 0, for interpolation.
 
     Returns four arrays (M,): the index of the timestamp before, the index of the timestamp after, the fraction of the
-    time between them, and a mask. The two indices are equal at a timestamp. The mask is True if a time is between the
-    first and the last timestamp, and not in a gap longer than ``max_gap`` [s].
+    time between them, and a mask. The two indices are equal at a timestamp. The mask is False before the first and
+    after the last timestamp, and in gaps longer than ``max_gap`` [s].
     """
     t = np.asarray(t, dtype=float)
     last = np.clip(np.searchsorted(stamps, t, side="left"), 0, len(stamps) - 1)

@@ -23,7 +23,7 @@ L = TypeVar("L", bound=FileModel)
 class World(FileModel):
     """A map. ``points``: points that cameras observe. ``walls``: segments (x1, y1, x2, y2) [m].
 
-    A layer is an attribute with surveyed elements by name, for example ``landmarks`` by name, and RFID ``tags`` by EPC.
+    Further attributes are dicts of surveyed objects (layers), such as ``landmarks`` by name, and RFID ``tags`` by EPC.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -38,7 +38,7 @@ class World(FileModel):
         def __getattr__(self, layer: str) -> Any: ...
 
     def of(self, kind: type[L]) -> dict[str, L]:
-        """Return the elements by name of the layer whose elements have the class ``kind``."""
+        """Return the layer with elements of the class ``kind``, as {name: element}."""
         layer: dict[str, L] = getattr(self, next(name for name, of_layer in _KINDS.items() if of_layer is kind))
         return layer
 

@@ -36,8 +36,8 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 
 @dataclass(frozen=True)
 class ProximityReading:
-    """A reading of a proximity sensor as an observation of the search, which weighs particles by it. ``lengths`` (D,) [m]: the
-    measured free lengths in D directions. The last three fields are constants that the search requires."""
+    """A reading of a proximity sensor, by which the search weights its particles. ``lengths`` (D,) [m]: the measured free
+    lengths in D directions. ``found``, ``work``, ``things``: constants that the search expects of every observation."""
 
     sensor: ProximitySensor
     lengths: Array
@@ -50,8 +50,8 @@ class ProximityReading:
 
 
 class ActiveMcl:
-    """The estimator ActiveMCL: a particle filter in the free ``space`` of a building. The start is unknown.
-    ``particles``: the least number of particles."""
+    """A particle filter for active localization (ActiveMCL). The start is unknown, and particles are drawn in
+    ``space``, the free space of a building. ``particles``: the least number of particles."""
 
     deterministic = False
     supports_unknown_start = True
@@ -81,7 +81,7 @@ class ActiveMcl:
             self._search.look(measurement, self._motion.state(measurement.t))
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
-        """Weigh the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. A reading is ignored
+        """Weight the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. A reading is ignored
         before the particles have processed a measurement of another sensor."""
         self._search.queue(ProximityReading(sensor, lengths), self._motion.state(self._t))
         self._search.advance(self._t)

@@ -41,12 +41,12 @@ NEXT, NEXT_HEADING = 3.0, 1.0  # m, rad: modes with smaller differences are merg
 SHOWN = 300  # number of particles of a belief that are stored in the result
 SAMPLES = 2000  # number of particles that are drawn from a belief without particles
 WRONG = 3.0  # a localized estimate counts as wrong if an error exceeds this multiple of its limit in the settings
-MODES, LIKELY = 3, 0.05  # paths to distant places start at this many modes at most, each with at least this weight
+MODES, LIKELY = 3, 0.05  # policies know at most this many modes, each with at least this weight
 WAYPOINTS = 40  # number of places that are spread over free space
 TAGS, PLACES = 8, 6  # paths are planned to this many nearest tags and nearest waypoints
 READING_DISTANCE = 0.5  # m driven between two readings of the proximity sensor
 PAUSE = 1.0  # s that the robot waits if no path is free
-SLACK = 0.2  # m: particles may be nearer to walls than the robot by this distance, the size of a cell of free space
+SLACK = 0.2  # m, one cell of the grid of free space: particles may be nearer to walls than the robot by this distance
 
 
 @dataclass(frozen=True)
@@ -111,8 +111,8 @@ def run_active(
     """Simulate a robot that drives from an unknown start until it is localized or gives up.
 
     ``policy``, ``estimator``: the names of both. Runs with the same ``seed`` have the same world, start and noise
-    sequences. Raises InputError if policy or estimator is unknown, if the start is not free, or if a sensor has a
-    higher rate than the robot's control. Raises RunFailedError if the estimator fails.
+    sequences. Raises InputError for an unknown name, a start that is not free, or a sensor with a higher rate than the
+    robot's control. Raises RunFailedError if the estimator fails.
     """
     loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()
@@ -136,7 +136,7 @@ def run_active(
 
 
 class _ClosedLoop:
-    """The state of one run, and its loop: propose paths, choose one, drive it, and update the estimate by the measurements."""
+    """One run: a loop in which a policy chooses a path, the robot drives it, and measurements update the estimate."""
 
     def __init__(
         self, simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings
@@ -194,13 +194,13 @@ class _ClosedLoop:
         return float(np.hypot(*error[:2])), float(abs(se2.wrap(error)[2]))
 
     def _take(self, reports: Iterator[Measurement]) -> bool:
-        """Process the measurements ``reports`` of the robot. Stops and returns True as soon as the robot is localized
-        correctly, otherwise returns False at their end."""
+        """Process the measurements ``reports`` of the robot. Return True as soon as the robot is localized correctly,
+        and False after the last measurement."""
         for report in reports:
             self._feed(report)
             if isinstance(self._estimator, ActiveMcl) and self.robot.metres >= self._proximity_at + READING_DISTANCE:
                 self._proximity_at = self.robot.metres
-                # a tick predicts the particles to the current pose: odometry alone does not move them
+                # a tick moves the particles to the current time, because odometry alone does not move them
                 self._feed(Tick(self.robot.t))
                 with self._guard.computing("the walls", self.robot.t):
                     self._estimator.see(self.robot.proximity, self.robot.read_proximity())
@@ -263,8 +263,7 @@ class _ClosedLoop:
         return choice
 
     def _far(self, modes: Sequence[Mode]) -> list[Path]:
-        """Return the shortest paths from each mode to tags and to places in free space. Objects that distinguish the
-        modes may be far away."""
+        """Return the shortest paths from each mode to distant tags and to distant places in free space."""
         out: list[Path] = []
         policy = self._settings.policy
         for mode in modes:
@@ -315,8 +314,8 @@ def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings,
 
 
 def _places(belief: Belief) -> tuple[Mode, ...]:
-    """Return at most :data:`MODES` modes of a belief with a weight of at least :data:`LIKELY`. Neighbouring modes are
-    merged: the pose of the heaviest is used, and the weights are added."""
+    """Return at most :data:`MODES` modes of a belief with a weight of at least :data:`LIKELY`. Neighbouring modes
+    become one, with the pose of the first mode and the sum of the weights."""
     places: list[Mode] = []
     for mode in belief.modes:
         if not np.all(np.isfinite(mode.pose)):
@@ -332,8 +331,8 @@ def _places(belief: Belief) -> tuple[Mode, ...]:
 
 
 def _sampled(belief: Belief, space: FreeSpace, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return particles (M, 3) and weights (M,) of a belief. If it has none, they are drawn from its modes. If it has no
-    modes either, they are drawn from free space."""
+    """Return particles (M, 3) and weights (M,) of a belief. Without particles they are drawn from the modes of the
+    belief, and without modes from free space."""
     if belief.particles is not None and belief.weights is not None and len(belief.particles):
         return belief.particles, belief.weights
     even = np.full(SAMPLES, 1.0 / SAMPLES)

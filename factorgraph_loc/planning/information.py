@@ -40,26 +40,26 @@ from factors.odometry import model as odometry
 from factors.odometry.model import OdometryModel
 from factors.se2 import Array
 
-POSITION, POSE = 2, 3  # number of leading coordinates of a pose (x, y, heading) whose entropy is computed
+POSITION, POSE = 2, 3  # entropies are of this number of leading coordinates of a pose (x, y, heading)
 CELL = np.array((0.5, 0.5, 2.0 * math.pi / 20.0))  # m, m, rad: cells of histograms; a full turn has 20 cells
 FINEST = np.array((0.1, 0.1, 0.05))  # m, m, rad: a standard deviation below these values is not counted as a gain
-# m: distance along a path between two stations. The measurements of a station stand for the whole distance to the next.
+# m: distance along a path between two stations, the poses at which measurements are predicted
 STATION_DISTANCE = 1.5
 MOST_STATIONS = 10  # largest number of stations; on a longer path they are farther apart
-SAMPLES, SCANS = 256, 48  # number of particles that a scan weighs, and number of scans that are simulated
+SAMPLES, SCANS = 256, 48  # number of particles, and number of simulated measurements of a path that weight them
 FEWEST = 10  # least number of particles
-SEVERAL = 0.5  # nats: a belief has several modes if the entropy of a Gaussian of equal covariance is larger by this
+SEVERAL = 0.5  # nats: see :func:`has_several_modes`
 WIDEST_HEADING = 0.8  # rad: with a larger standard deviation, the heading counts as unknown and not as Gaussian
 SPEED = 0.5  # m/s: converts noise of the odometry per second to noise per metre
-METRES_PER_RADIAN = 0.5  # m: a robot with a turn rate of 1 rad/s drives this far in the time of a turn by one radian
+METRES_PER_RADIAN = 0.5  # m: a turn by one radian takes as much time as driving this distance (1 rad/s, 0.5 m/s)
 
 
 @dataclass(frozen=True, eq=False)
 class Sensors:
     """The sensor models of a robot. They predict the information of measurements along a path.
 
-    ``odometry``: the noise of the motion. ``forecasts``: a forecast for each sensor that observes objects in the map.
-    ``metres_per_radian``: the distance [m] that the robot drives in the time of a turn by one radian.
+    ``odometry``: the noise of the motion. ``forecasts``: predict the measurements of each sensor that observes objects
+    in the map. ``metres_per_radian``: the distance [m] that the robot drives in the time of a turn by one radian.
     """
 
     odometry: OdometryModel
@@ -95,8 +95,8 @@ class Sensors:
 def gaussian_entropy(covariance: Array, dims: int = POSE) -> Array:
     """Return the entropy (...) [nats] of Gaussians with ``covariance`` (..., 3, 3) of x, y and heading.
 
-    ``dims``: the number of leading coordinates that are considered. The entropy is ``log(det(2 pi e C)) / 2``, with the
-    covariance C of these coordinates (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1).
+    ``dims``: the number of leading coordinates that are considered. Their covariance C gives the entropy ``log(det(2 pi
+    e C)) / 2`` (Cover, Thomas, "Elements of Information Theory", 2006, theorem 8.4.1).
     """
     part = np.asarray(covariance)[..., :dims, :dims]
     return np.asarray(0.5 * (dims * math.log(2.0 * math.pi * math.e) + np.linalg.slogdet(part)[1]))
@@ -114,10 +114,8 @@ def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
 
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
-    """True if particles ``poses`` (M, 3) with ``weights`` (M,) are poorly described by a Gaussian. This is so if the
-    heading is unknown, or if the entropy of a Gaussian with their covariance exceeds the entropy of their positions by
-    more than :data:`SEVERAL`.
-    """
+    """True if particles ``poses`` (M, 3) with ``weights`` (M,) are poorly described by a Gaussian. Either their heading
+    is unknown, or a Gaussian with their covariance has an entropy that is larger by more than :data:`SEVERAL`."""
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
         return True
@@ -139,13 +137,13 @@ def expected_gain(
     samples: int = SAMPLES,
     scans: int = SCANS,
 ) -> Array:
-    """Return the expected reduction of entropy (C,) [nats] on each of C paths.
+    """Return the expected reduction of entropy (C,) [nats] by the measurements on each of C ``paths``.
 
-    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. The entropy after a path is the entropy of
-    its end pose. ``space``: a particle whose path leads into a wall stops there and makes no further measurements.
-    ``places`` (M,): the index of each particle's mode. If given, the entropy of this index replaces the entropy of the
-    pose. ``noise``: the noise of the odometry on the path; None means no noise.
-    ``samples``: the number of particles that a scan weighs. ``scans``: the number of particles at which measurements are simulated.
+    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. ``space``: a particle stops and measures
+    nothing where its path leads into a wall. ``places`` (M,): the index of each particle's mode. If given, the entropy
+    of this index is returned instead of the entropy of the pose at the end of the path. ``noise``: of the odometry,
+    None for no noise. ``samples``: the number of particles. ``scans``: the number of particles at which measurements
+    are simulated.
     """
     if not paths:
         return np.empty(0)
@@ -179,7 +177,7 @@ def expected_gain(
         # the entropy at the end of the path, or at the last station if the robot stops before
         index = np.where(last[c, :scans] >= steps[-1], len(steps) - 1, stops[:scans])
         if cells is not None or (several and noise is None):
-            # without noise of the odometry, the entropy at the start can be used: a motion changes only which cells are occupied
+            # without noise, a motion does not change the distances between particles: use the entropy at the start
             index = np.zeros_like(index)
         weighed = at if cells is None else cells
         posterior[c] = _entropies(weighed, index, np.exp(log_weights), POSE, several=several)
@@ -200,10 +198,10 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, seve
 
 
 def _stations(passed: Array) -> Places:
-    """Return the indices of stations among the poses of a path: the start, the places of predicted measurements, and the end.
+    """Return the indices of stations among the poses of a path: the start, the poses of predicted measurements, and the end.
 
-    ``passed`` (S,) [m]: the distance up to each pose of the path. The path is divided into equal parts, and the
-    measurements of each part are predicted in its middle.
+    ``passed`` (S,) [m]: the distance up to each pose of the path. The path is divided into equal parts, and the measurements
+    of each part are predicted in its middle.
     """
     count = min(max(1, round(passed[-1] / STATION_DISTANCE)), MOST_STATIONS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count

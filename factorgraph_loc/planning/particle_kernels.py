@@ -113,8 +113,8 @@ def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, d
 
 @compiled
 def _number_cells(poses: Array, cell: Array, dims: int, out: Places) -> None:
-    """Number the histogram cells of particles ``poses`` (M, 3) by a hash table. ``dims``: the number of leading
-    coordinates that are considered. ``out`` (M,): receives a number below M, equal for particles in one cell."""
+    """Write the number of the histogram cell of each of the particles ``poses`` (M, 3) to ``out`` (M,). Numbers are
+    below M. ``cell`` (3,): the size of a cell. ``dims``: the number of leading coordinates that are considered."""
     count = len(poses)
     size = 1
     while size < 4 * count:

@@ -1,5 +1,5 @@
-"""Candidate paths of a robot: arcs, straight lines, and shortest paths in free space; and the part of a path that is
-free of walls."""
+"""Candidate paths of a robot: arcs, straight lines, and shortest paths in free space. Checks which part of a path is
+free."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Path:
         return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
     def until(self, length: float) -> Path:
-        """Return the part of the path up to the last pose whose distance from the start is at most ``length`` [m]."""
+        """Return the part of the path up to the last pose within ``length`` [m] of driving."""
         return Path(self.poses[self.metres <= length + 1e-9], self.kind)
 
 
@@ -75,9 +75,9 @@ def full_turn() -> Path:
 def primitives(length: float) -> list[Path]:
     """Return arcs and straight paths in :data:`DIRECTIONS` directions.
 
-    Each path begins with a turn in place to its direction, except those straight ahead. In each direction there are a
-    straight path and two gentle arcs of ``length`` [m], and a straight path of half this length. Straight ahead there
-    are also two sharper arcs. Raises InputError if ``length`` is not positive.
+    Each path begins with a turn in place to its direction, except those straight ahead. Each direction has two gentle
+    arcs and a straight path of ``length`` [m], and a straight path of half the length. Straight ahead there are also
+    two sharper arcs. Raises InputError if ``length`` is not positive.
     """
     if not (math.isfinite(length) and length > 0.0):
         raise InputError(f"policy.horizon is {length:g} m, expected a length above 0 m")
@@ -138,12 +138,10 @@ def waypoints(space: FreeSpace, count: int) -> Array:
 
 
 def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: int = 1) -> NDArray[np.int64]:
-    """Return how far robots can follow paths in ``space`` without coming too close to walls: the index (C, M) of the
-    last pose that is reached, for each of C paths and M robots.
+    """Return the index (C, M) of the last pose that each of M robots reaches on each of C ``paths`` without collision.
 
     ``poses`` (M, 3): the start poses of the robots in the world frame. A robot that starts too close to a wall may
-    drive away from it.
-    ``between``: the number of collision checks between two poses of a path.
+    drive away from it. ``between``: the number of collision checks between two poses of a path.
     """
     first = np.cumsum([0, *(len(path.poses) for path in paths)])
     along = np.concatenate([path.poses for path in paths]) if paths else np.empty((0, 3))

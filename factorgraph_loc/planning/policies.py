@@ -28,8 +28,8 @@ from factors import se2
 from factors.se2 import Array
 
 NOTHING = 0.3  # nats: a smaller gain is not significant, because the expectation is noisy
-FEW = 0.6  # paths to distant places are evaluated if the few main modes have a larger total weight than this
-EACH, OF_MODES = 48, 96  # number of particles drawn from each mode, and total number that a simulated scan weighs
+FEW = 0.6  # minimum total weight of the significant modes for an evaluation of paths to distant places
+EACH, OF_MODES = 48, 96  # for far paths: number of particles drawn from each mode, and number that are used in total
 COMMITTED = 0.5  # fraction of an arc that is completed before the next choice
 FAR = "waypoint"  # kind of the paths to distant places
 FAR_PER_METRE = 0.02  # nats/m: small penalty, so that the shorter of equally informative paths is chosen
@@ -79,11 +79,11 @@ Policy = Callable[[Situation], Choice]
 
 
 def information(s: Situation, sign: float = 1.0) -> Choice:
-    """Choose the path with the largest expected information. With ``sign`` -1, it prefers the least informative path,
-    for comparison only.
+    """Choose the path with the largest expected information. If ``sign`` is -1, prefer the smallest, for comparison.
 
     Near paths are evaluated first. If no near path gains enough for its length and the belief has few modes, paths to
-    distant places are evaluated. If these are not informative either, or if the pose is unknown, the robot patrols.
+    distant places are evaluated. If these are not informative either, or if the pose is unknown, :func:`patrol`
+    chooses.
     """
     settings = s.settings.policy
     if not s.sensors.forecasts or not s.candidates:
@@ -120,15 +120,16 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Return the expected information (C,) [nats] of long paths about which mode is true, or about the pose if there is one mode.
+    """Return the expected information (C,) [nats] of long paths about which mode is true, or, of a single mode, about
+    the pose.
 
-    With several modes, the entropy of the particles' poses is not used. On a long path particles diverge and run into
-    walls, which the real robot avoids by planning again.
+    With several modes the information about poses is not used. On a long path particles diverge and run into walls,
+    which the real robot avoids by planning again.
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
         return fisher_gain(mode.pose, mode.covariance, paths, s.sensors)
-    # the square root makes the weights more equal, because small differences between modes are random
+    # small differences between the weights of modes are random: the square root makes the weights more equal
     weights = np.repeat(np.sqrt([mode.weight for mode in s.modes]), EACH)
     return expected_gain(
         s.sensors,
@@ -204,7 +205,7 @@ def policy(name: str) -> Policy:
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
-    """Select the paths whose first metre is free. Returns them with their free lengths.
+    """Return the paths that are free in their first metre, and their free lengths.
 
     ``free`` (C,) [m]: the free length of each path. ``sight`` [m]: the range of the proximity sensor. A path that is
     not free up to this range is shortened to its free length.

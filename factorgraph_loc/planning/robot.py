@@ -38,7 +38,7 @@ BETWEEN = 5  # collision checks between two poses of a path
 
 
 class ProximitySensor:
-    """A sensor that measures the free length to the next wall in D directions around the robot, up to its range ``sight`` [m].
+    """A sensor that measures the distance to the next wall in D directions around the robot, up to its range ``sight`` [m].
 
     D is :data:`~factorgraph_loc.planning.paths.DIRECTIONS`. ``space``: the free space between walls.
     """
@@ -62,7 +62,7 @@ class ProximitySensor:
         """Return the log-likelihood (M,) of the measured ``lengths`` (D,) at ``poses`` (M, 3), up to a constant.
 
         The likelihood of a length is a Gaussian plus a constant for outliers (Thrun, Burgard, Fox, "Probabilistic
-        Robotics", 2005, section 6.3.1, but not normalised).
+        Robotics", 2005, section 6.3.1). It is not normalised.
         """
         errors = (self.expected(poses) - lengths) / SIGMA
         return np.asarray(TEMPERING * np.log((1.0 - UNEXPECTED) * np.exp(-0.5 * errors**2) + UNEXPECTED).sum(axis=1))
@@ -162,15 +162,15 @@ class SimulatedRobot:
             yield from self._passed(np.zeros(3))
 
     def _passed(self, reported: Array) -> Iterator[Measurement]:
-        """Advance the time by one control period, and yield its measurements. ``reported`` (3,): the motion that
-        odometry reports."""
+        """Advance the time by one control period, and yield its measurements. ``reported`` (3,): motion reported by
+        odometry."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))
         yield IncrementOdometry(self.t, float(reported[0]), float(reported[1]), float(reported[2]))
         yield from self._measure()
 
     def _measure(self) -> Iterator[Measurement]:
-        """Yield a measurement of each sensor whose next measurement is due."""
+        """Yield the measurements that are due at the current time, of all sensors."""
         for i, (channel, sensor) in enumerate(self._order):
             if self.t * sensor.rate >= self._measured[i] - 1e-6:
                 self._measured[i] += 1
@@ -193,7 +193,7 @@ class SimulatedRobot:
         return se2.between(at[:-1], at[1:])
 
     def _is_free(self, target: Array) -> bool:
-        """True if the robot may move to ``target`` (3,): the cell there is free. From a cell that is not free, the
-        robot may move to any cell that is not nearer to a wall."""
+        """True if the robot may move to ``target`` (3,), because the cell there is free. From a cell that is not free,
+        the robot may move to any cell that is at least as far from walls."""
         ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, target))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

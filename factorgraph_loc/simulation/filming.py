@@ -24,7 +24,7 @@ from factors import se2
 from factors.camera import model as reprojection
 from factors.se2 import Array
 
-# JPEG, because PNG is ten times as slow, and without subsampled colours, because colour features use them.
+# JPEG, because PNG is ten times as slow. Colours keep their full resolution, because colour features use colours.
 JPEG = (
     cv2.IMWRITE_JPEG_QUALITY,
     95,
@@ -143,7 +143,7 @@ def _write_in_parallel(
     progress: Callable[[float, float], None],
 ) -> None:
     """Render ``count`` images by ``workers`` processes, and write them into ``folder``. Each process creates the scene
-    and renders every n-th image, where n is the number of processes. ``progress``: as of :func:`with_images`."""
+    and renders every n-th image, where n is the number of processes. ``progress``: see :func:`with_images`."""
     write = partial(_write, settings, seed, folder)
     parts = [range(i, count, workers) for i in range(workers)]
     for _, outcome in run_each(

@@ -39,9 +39,10 @@ Place = tuple[float, float, float, float, float, float]
 class Surroundings(NamedTuple):
     """The M faces of a building that are visible from a camera position, prepared for ray casting.
 
-    ``origin`` (3,) [m]: the camera position. ``table`` (M, 13): the faces, sorted by distance; its columns are the constants of
-    this module. ``starts`` (BINS + 1,), ``items``: a ray whose horizontal direction is in bin b may hit the rows of the table in
-    ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth, height of the building, inverses of width and depth.
+    ``origin`` (3,) [m]: the camera position. ``table`` (M, 13): the faces, sorted by distance; its columns are the
+    constants of this module. ``starts`` (BINS + 1,), ``items``: a ray in the horizontal bin b can hit only the rows of
+    the table in ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth and height of the building, 1 /
+    width, 1 / depth.
     """
 
     origin: Array
@@ -144,8 +145,7 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
 
 @compiled(error_model="numpy")
 def cast_all(around: Surroundings, rays: Array) -> Array:
-    """Return the distances (K,) of the hit points of ``rays`` (K, 3), in units of the lengths of the rays; infinite
-    without a hit."""
+    """Return the distances (K,) of the hit points of ``rays`` (K, 3), in units of the lengths of the rays, or infinity."""
     distance = np.empty(len(rays))
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
@@ -217,8 +217,8 @@ def _shade(
     rotation: Array,
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
-    """Return the index of the face that the ray along (x, y, 1) in the camera frame hits, and the colour (blue, green,
-    red) of the hit point. The other arguments are those of :func:`cast` and :func:`expose`."""
+    """Return the index of the face that the ray (x, y, 1) in the camera frame hits, and the BGR colour there. The other
+    arguments are those of :func:`cast` and :func:`expose`."""
     x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]

@@ -187,8 +187,8 @@ class Renderer:
         return np.asarray(raycasting.develop(light, brightness, noise, NORMAL, read, shot))
 
     def hits(self, pixels: Array, position: Array, rotation: Array) -> Array:
-        """Return the points (K, 3) of the scene, in the world frame, that are visible at ``pixels`` (K, 2). NaN if
-        nothing is visible."""
+        """Return the points (K, 3) of the scene that are visible at ``pixels`` (K, 2), in the world frame. NaN without
+        a hit."""
         directions = reprojection.undistorted(self.model, np.asarray(pixels, dtype=float).reshape(-1, 2))
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
         distance: Array = raycasting.cast_all(self._surroundings(position), rays)

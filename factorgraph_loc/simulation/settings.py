@@ -81,7 +81,7 @@ class DriveSettings(FileModel):
 
 
 class ImageSettings(FileModel):
-    """Settings of the simulated images. A pixel of value v (0 to 255) has noise of the variance ``read_noise``^2 +
+    """Settings of the simulated images. A pixel of value v (0 to 255) has the variance ``read_noise``^2 +
     ``shot_noise`` v."""
 
     rate: Hertz = 5.0
@@ -187,9 +187,9 @@ RACKHAM_RIG: Mapping[str, Any] = {
 _OFFICE: Mapping[str, Any] = {"world": {"plan": "office", "tags": 40}, "rig": RACKHAM_RIG}
 # During a fade a tag is not read. Fades take the fraction f of the time and have the mean duration d. Outside of fades a round
 # reads the tag with probability p. Fades increase the variance of the number of reads in rounds at intervals dt, by the factor
-# 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p) with rho = exp(-dt / (d (1 - f))). It is 1.9 at p = 0.5. Its inverse would be too
-# small as tempering exponent, because the robot moves. With the exponent 0.7 the causal ANEES of the smoother is 3.0 over six runs
-# of 300 s, which is the ideal value. With 0.6 it is 2.8.
+# 1 + 2 rho / (1 - rho) f p / (1 - (1 - f) p) with rho = exp(-dt / (d (1 - f))). The factor is 1.9 at p = 0.5. For a robot at
+# rest, its inverse is the tempering exponent. For a moving robot, 0.7 gives the smoother the ideal causal ANEES of 3.0 over six
+# runs of 300 s, and 0.6 gives 2.8.
 _BURSTY: Mapping[str, Any] = {
     "faults": {"fading": {"duration": 2.0, "share": 0.2}},
     "rig": {"rfid": {"miss": 0.2, "tempering": 0.7}},
@@ -200,8 +200,8 @@ EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # pairs of keys: a ch
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the nested table ``base`` with the values of ``changes``. If a table in ``changes`` has another value of
-    the key ``kind`` than the table in ``base``, it replaces the whole table."""
+    """Return the nested table ``base`` with the values of ``changes``. A table in ``changes`` with another value of its
+    key ``kind`` replaces the table in ``base``, instead of changing it."""
     if "kind" in changes and changes["kind"] != base.get("kind"):
         return dict(changes)
     out = dict(base)

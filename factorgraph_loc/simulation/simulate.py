@@ -52,8 +52,8 @@ START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations of t
 def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.random.Generator:
     """Return the random generator called ``name``. Generators with different names are independent.
 
-    ``seed``: a number, or the seed sequence of another generator. The generator is seeded by ``seed`` and by the index
-    of ``name`` in ``names``, or by the hash of ``name`` if it is not in ``names``.
+    ``seed``: a number, or the seed sequence of another generator. The index of ``name`` in ``names`` is part of the
+    seed, or the hash of ``name`` if it is not in ``names``.
     """
     digest = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8])
     key = names.index(name) if name in names else digest
@@ -115,8 +115,8 @@ def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
 def simulate(settings: SimulationSettings, seed: int) -> Log:
     """Simulate a log. The same ``settings`` and ``seed`` give exactly the same log.
 
-    The log has the streams odometry and rfid, bearing_range if the world has landmarks, sightings if it has points, and
-    streams of sensors from plugins. Its reference is the true trajectory. Its start pose has a random error with the
+    The log has odometry, RFID reads, and measurements of landmarks and points if the world has such objects. Sensors
+    from plugins add their streams. The reference is the true trajectory. The start pose has a random error with the
     standard deviations :data:`START_SIGMAS`. Raises InputError if the world has no room for the tags or for the robot.
     """
     of_world = seed if settings.world_seed is None else settings.world_seed

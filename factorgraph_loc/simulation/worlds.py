@@ -114,7 +114,7 @@ def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.ra
 
 
 def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.random.Generator) -> list[Segment]:
-    """Return a cupboard for each outer corner of a room, as boxes. Returns none if the room is too small to drive past them.
+    """Return a cupboard for each outer corner of a room, as boxes. The list is empty if the robot could not drive past them.
 
     ``span``: the x range of the room. ``inner``, ``outer``: the y coordinates of its walls at the corridor and at the outline.
     """
@@ -172,8 +172,8 @@ def _sides(box: Segment) -> list[Segment]:
 
 
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
-    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Sides of furniture and
-    shelves count as walls.
+    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Sides of boxes count as
+    walls.
 
     A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no facing.
     Raises InputError if the plan has too few places for the tags.
@@ -213,8 +213,8 @@ def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
 
 
 def _antennas(plan: Plan, walls: Array, settings: WorldSettings, rng: np.random.Generator) -> dict[str, FixedAntenna]:
-    """Return the fixed antennas by name. The first ones are in the middle of the doors, half of them facing to each side of their
-    door. The rest are on walls. Their height is that of the tags."""
+    """Return the fixed antennas by name, at the height of the tags. The first ones are in the middle of the doors, half
+    of them facing to each side of the door. The rest are on walls."""
     doors = np.array([both_sides(door)[side] for side in (0, 1) for door in plan.doors]).reshape(-1, 4)
     at_doors = _places(doors[: settings.antennas], np.full(min(len(doors), settings.antennas), 0.5))
     places = np.concatenate((at_doors, _distribute(plan, walls, settings.antennas - len(at_doors), rng))).round(4)
@@ -264,7 +264,7 @@ def _even(settings: WorldSettings, count: int) -> Array:
 
 
 def _places(faces: Array, along: Array) -> Array:
-    """Return a place on each of N faces, as x, y and the direction [rad] to the left of the face (N, 3).
+    """Return one place on each of N faces as (N, 3): x, y and the direction [rad] to the left of the face.
 
     ``faces`` (N, 4): segments. ``along`` (N,): the position of the place, as a fraction of the face's length.
     """

@@ -30,7 +30,7 @@ from factors.se2 import Array
 
 RATIO, GLOBAL_RATIO = 0.85, 0.8  # ratio tests with and without a prediction
 NEAREST, FARTHEST = 0.2, 50.0  # m: depths of points that are searched
-# two viewpoints of a point are similar if the angle between them and the ratio of their distances to the point are smaller
+# limits of the angle between two viewpoints of a point, and of the ratio of their distances to the point, if they are similar
 LARGEST_ANGLE, LARGEST_RATIO = math.radians(50.0), 2.0
 GATE = float(chi_squared.quantile(0.99, 2))
 CELL = 20.0  # px, cells for sorting features
@@ -39,8 +39,8 @@ SMALLEST_GATE, LARGEST_GATE = 3.0, 150.0
 MARGIN = 20.0  # px: points that are predicted this far outside the image are still searched
 SAME_PIXEL = 4.0  # px: points or features with closer pixels may show the same point
 SAME_POINT = 0.15  # m: closer points of the map may be the same point
-CHANCE = 0.02  # a match must be so similar that only this fraction of pairs of different map points is more similar
-MANY = 5000  # views of a map: with more, only the most similar keyframes are compared with an image
+CHANCE = 0.02  # a match must be more similar than all but this fraction of the pairs of different map points
+MANY = 5000  # if a map has more views, only its most similar keyframes are compared with an image
 # least number of matches, and least fraction of the visible points that must match. In an office that the map does not contain,
 # up to 2 % of the features match by chance
 FEWEST, LEAST_SHARE = 3, 0.05
@@ -92,10 +92,10 @@ class Associator:
     def guided(
         self, frame: CameraFrame, camera: CameraPose, model: CameraModel | None = None, focal: float = 0.0
     ) -> Associations:
-        """Match an image to the map with a predicted pose of the camera.
+        """Return the matches between the features of an image and the points of the map, by a predicted pose of the camera.
 
-        ``model``: the current estimate of the camera's calibration, if it differs from the rig's. ``focal``: the
-        standard deviation of the logarithm of the focal length.
+        ``frame``: the features. ``camera``: the predicted pose. ``model``: the current estimate of the camera's calibration,
+        if it differs from the rig's. ``focal``: the standard deviation of the logarithm of the focal length.
         """
         model = self._model if model is None else model
         position, rotation = camera.position, camera.rotation
@@ -134,9 +134,9 @@ class Associator:
         return Associations(ahead[rows[right]], matched_features[right], expected, int(np.count_nonzero(~right)))
 
     def _similar_views(self, points: Integers, place: Array) -> tuple[Integers, Integers]:
-        """Select the views of ``points`` (C,) whose viewpoints are similar to the camera position ``place`` (3,).
+        """Return those views of ``points`` (C,) that were seen from viewpoints similar to the camera position ``place`` (3,).
 
-        Returns the indices of these views, sorted by point, and the start of each point's views in this array (C+1,).
+        The result are the indices of these views, sorted by point, and the start of each point's views in this array (C+1,).
         """
         is_wanted = np.zeros(len(self._positions), dtype=bool)
         is_wanted[points] = True
@@ -174,7 +174,7 @@ class Associator:
     def _alike(self, frame: CameraFrame) -> tuple[Integers, Integers]:
         """Match features to points by their descriptors alone. Returns indices of points and of features.
 
-        A match passes the ratio test against all other points and is mutual: each is the most similar one of the other.
+        The point and the feature of a match are mutually most similar, and pass the ratio test against all other points.
         """
         owners, descriptors = self._owners, self._descriptors
         if len(owners) > MANY:
@@ -229,7 +229,7 @@ def _gates(covariances: Array) -> tuple[Array, Array]:
 
 @compiled
 def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
-    """Return the pairs (N, 2) of a point and a feature, as indices, where the feature is inside the gate of the point.
+    """Return the pairs (N, 2) of a point and a feature, as indices. The feature lies in the gate of the point.
 
     ``predicted`` (C, 2) [px]: the predicted pixels of the points. ``inverses`` (C, 2, 2): the matrices A of the
     elliptic gates x'Ax = 1. ``reaches`` (C,) [px]: the largest radii of the gates. ``features`` (K, 2) [px]: the pixels
@@ -280,8 +280,8 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
 @compiled(fastmath=True)
 def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any) -> Array:
-    """Return for each pair of point and feature the squared distance (N,) between the feature's descriptor and the most
-    similar view of the point. For descriptors of bits this is the Hamming distance.
+    """Return the squared distances (N,) of N pairs between the descriptor of a feature and the most similar view of a
+    point. For binary descriptors these are Hamming distances.
 
     ``pairs`` (N, 2): indices of point and feature. ``views[begins[i]:begins[i + 1]]``: indices of the views of point i.
     ``known`` (V, D): the descriptors of the map's views. ``frame_descriptors`` (K, D): the descriptors of the features.
@@ -307,9 +307,9 @@ def clear_pairs(
     """Return the indices of the pairs that are mutually best and pass the ratio test.
 
     ``pairs`` (N, 2): indices of point and feature. ``costs`` (N,): distances of their descriptors. ``predicted`` (C,
-    2), ``features`` (K, 2) [px]: the pixels of points and features. A pair passes the ratio test if its cost is below
-    ``ratio`` times the costs of the other pairs with the same point or feature. Other pairs less than ``apart`` [px]
-    away are not compared, because they may show the same point.
+    2), ``features`` (K, 2) [px]: the pixels of points and features. The cost of a pair must be below ``ratio`` times
+    the cost of every other pair with the same point or feature. Other pairs less than ``apart`` [px] away are not
+    compared, because they may show the same point.
     """
     every = np.arange(len(pairs))
     kept = np.ones(len(pairs), dtype=bool)

@@ -28,8 +28,8 @@ class Weights:
     """A linear map from the 35 values of a colour feature to its descriptor, learnt from points observed in two images.
 
     ``map`` (35, 35) multiplies the values minus their ``mean`` (35,). After the map, the difference between two views
-    of a point has unit covariance. The Euclidean distance of two results is then the Mahalanobis distance of the values
-    (within-class whitening, Fukunaga, "Introduction to Statistical Pattern Recognition", 1990, section 10.2).
+    of a point has unit covariance. This is within-class whitening (Fukunaga, "Introduction to Statistical Pattern
+    Recognition", 1990, section 10.2).
     """
 
     mean: Float
@@ -57,9 +57,9 @@ class ColourExtractor:
     """Extractor of colour features (see :class:`~factorgraph_loc.vision.keypoints.Extractor`).
 
     The descriptors (N, 35) are ``float32`` and of unit length. ``count``: the largest number of features per image.
-    ``everywhere``: choose features in all parts of an image, not only the strongest. ``paper_literal``: compute descriptors exactly
-    as Raoui et al. 2011, for comparison (see :func:`~factorgraph_loc.vision.descriptor.records`).
-    An extractor must be used by one thread only, because the memory for an image is reused for the next image of the same size.
+    ``everywhere``: choose features in all parts of an image, not only the strongest. ``paper_literal``: compute
+    descriptors exactly as Raoui et al. 2011, for comparison (see :func:`~factorgraph_loc.vision.descriptor.records`).
+    An extractor is not thread-safe, because it reuses the memory of the previous image.
     """
 
     def __init__(self, count: int, *, everywhere: bool = False, paper_literal: bool = False) -> None:

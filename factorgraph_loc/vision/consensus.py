@@ -31,7 +31,7 @@ REACH = 10.0  # for corrections by samples, the standard deviations of the predi
 FARTHEST = 3.0  # largest step of a correction, in the standard deviations that are enlarged by REACH
 ROUNDING = 1e-12  # relative to the largest eigenvalue of a covariance: smaller ones count as zero
 RIDGE = 1e-9  # regularisation of the information, for points very close to the camera
-SAMPLE_GATE, GATE = 25.0, 13.8  # squared residuals of inliers of a sample, and of the final pose (99.9 %)
+SAMPLE_GATE, GATE = 25.0, 13.8  # limits of the squared residuals of inliers, of a sample and of the final pose (99.9 %)
 JOINT = 0.99  # probability of the joint compatibility test
 
 
@@ -87,10 +87,11 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
 def _best_of_samples(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, whiteners: Array, root: Array
 ) -> tuple[Array, Array, Array]:
-    """Correct the predicted pose by random samples of points, and return the correction with most inliers: position (1,
-    3), rotation (1, 3, 3), and the squared whitened residuals (K,) of all points at this pose.
+    """Return the camera pose with most inliers among corrections of the predicted pose by random samples of points.
 
-    ``whiteners`` (K, 2, 2): whiten the pixel errors. ``root`` (6, 6): a square root of the covariance of the allowed corrections.
+    Returns the position (1, 3), the rotation (1, 3, 3), and the squared whitened residuals (K,) of all points.
+    ``whiteners`` (K, 2, 2): whiten the pixel errors. ``root`` (6, 6): a square root of the covariance of allowed
+    corrections.
     """
     rng, count = np.random.default_rng(0), len(points)
     best: tuple[float, Array, Array, Array] | None = None
@@ -101,7 +102,7 @@ def _best_of_samples(
         rotation = np.repeat(camera.rotation[None], ROUND, axis=0)
         total = np.zeros((ROUND, 6))
         for _ in range(3):
-            # Gauss-Newton in the whitened perturbation, which has a unit Gaussian as prior
+            # Gauss-Newton in units in which the prior of the perturbation is a unit Gaussian
             residual, jacobian = _whitened(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
             flat = jacobian @ root
             normal = flat.transpose(0, 2, 1) @ flat
@@ -129,8 +130,8 @@ def _best_of_samples(
 def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, covariances: Array
 ) -> float:
-    """Return the normalised squared innovation of K ``points`` (K, 3), observed at ``pixels`` (K, 2) with noise
-    ``covariances`` (K, 2, 2). ``covariance`` (6, 6): that of the camera's perturbation."""
+    """Return the squared Mahalanobis distance of ``pixels`` (K, 2) from the predicted pixels of ``points`` (K, 3).
+    ``covariances`` (K, 2, 2): the noise of the pixels. ``covariance`` (6, 6): of the camera's perturbation."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
     for i in range(len(points)):
@@ -171,10 +172,10 @@ def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]
 def _whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """Return the whitened residuals (H, 2S), predicted minus measured, of H cameras with S points each, and their
-    Jacobians (H, 2S, 6) by the perturbation of the camera.
+    """Return whitened residuals (H, 2S), predicted minus measured, of H cameras, and Jacobians (H, 2S, 6) by their
+    poses.
 
-    ``points`` (H, S, 3), ``pixels`` (H, S, 2), ``whiteners`` (H, S, 2, 2): the points of each camera.
+    ``points`` (H, S, 3), ``pixels`` (H, S, 2), ``whiteners`` (H, S, 2, 2): S points of each camera.
     """
     count = len(position)
     local = (points - position[:, None]) @ rotation

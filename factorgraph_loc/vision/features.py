@@ -48,8 +48,8 @@ class OpenCvExtractor:
         return keypoints[order], np.asarray(descriptors)[order]
 
     def _chosen(self, keypoints: Keypoints) -> Integers:
-        """Return the indices of the selected keypoints, by descending response. OpenCV returns more than ``nfeatures``
-        if responses are equal."""
+        """Return the indices of the selected keypoints, by descending response, because OpenCV may return more than
+        ``count``."""
         order = np.argsort(-keypoints.responses, kind="stable").astype(np.int64)
         if self._everywhere:
             return order[spread_out(keypoints.points[order], self._count, cells=PARTS)]

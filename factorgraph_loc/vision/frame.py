@@ -31,7 +31,7 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """This object. Measurements of named points have None here, because they have no features."""
+        """This object. The property exists because other kinds of camera measurements have no features, and return None."""
         return self
 
     @property

@@ -82,10 +82,10 @@ def refined_peaks(
     """Select the local maxima of the corner strength that are also maxima over scale, and refine them. Returns their number.
 
     ``strength`` (H, W): the corner strength. ``pixels`` (N, 2): x and y of its local maxima. ``planes`` (3, H, W): the
-    intensity at three consecutive scales with ``variances`` (3,) [px^2]. A pixel is selected if its strength is above
-    ``threshold`` and if the normalised Laplacian near it is largest in the middle plane.
-    ``peaks`` (N, 5): receives a row for each selected pixel. Its values are x and y, refined by a paraboloid through 3x3 strengths;
-    the scale, refined by a parabola, in steps from the middle plane; the strength; the absolute Laplacian.
+    intensity at three consecutive scales with ``variances`` (3,) [px^2]. A selected pixel has a strength above ``threshold``,
+    and the largest normalised Laplacian near it is in the middle plane.
+    ``peaks`` (N, 5): receives a row for each selected pixel. Its values are x and y, refined by a paraboloid through 3x3
+    strengths; the scale, refined by a parabola, in steps from the middle plane; the strength; the absolute Laplacian.
     """
     count = 0
     for n in range(len(pixels)):
@@ -122,8 +122,8 @@ def refined_peaks(
 def locally_strongest(points: Float, scales: Float, reach: float, alike: float, most: int) -> Truths:
     """Return a mask (N,) of the points that have no stronger point nearby. At most the first ``most`` such points are True.
 
-    ``points`` (N, 2) [px]: sorted by descending strength. ``scales`` (N,) [px]: their scales. A stronger point is nearby if its
-    distance is less than ``reach`` times the point's scale and the ratio of both scales is at most ``alike``.
+    ``points`` (N, 2) [px]: sorted by descending strength. ``scales`` (N,) [px]: their scales. Nearby means: the distance is
+    less than ``reach`` times the point's scale, and the ratio of both scales is at most ``alike``.
     """
     alone, count = np.zeros(len(points), np.bool_), 0
     for n in range(len(points)):
@@ -146,10 +146,10 @@ def locally_strongest(points: Float, scales: Float, reach: float, alike: float, 
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
     """Sample rotated and scaled patches around N points by bilinear interpolation. Each point has its own plane of a pyramid.
 
-    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's
-    plane. ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4): x and y of the point in its plane [px],
-    and the vector (a, b) [px] of the x axis of its frame. ``offsets`` (M, 2): the sampled places in the frame.
-    ``patches`` (N, M): receives the samples. Outside the plane the nearest pixel is used.
+    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's plane.
+    ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4) [px]: x and y of the point in its plane, and the x axis
+    (a, b) of the patch's frame. ``offsets`` (M, 2): the sampled places in this frame. ``patches`` (N, M): receives the
+    samples. Outside the plane the nearest pixel is used.
     """
     for n in range(len(frames)):
         start, height, width = starts[n], shapes[n, 0], shapes[n, 1]

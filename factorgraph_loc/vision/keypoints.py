@@ -23,8 +23,8 @@ class Keypoints:
     """N points of an image, as arrays.
 
     ``points`` (N, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel.
-    ``sizes`` (N,) [px]: proportional to the size of the described region. For SIFT and the colour features this is
-    twice the standard deviation of the point's Gaussian scale, for ORB the side of its patch.
+    ``sizes`` (N,) [px]: proportional to the size of the described region. For SIFT and colour features the size is
+    twice the point's Gaussian scale, for ORB the side of its patch.
     ``angles`` (N,) [rad]: the direction ``atan2(dy, dx)`` with y down, NaN if a point has none.
     ``responses`` (N,): the strength, comparable within one image and one extractor.
     """
@@ -82,9 +82,9 @@ PARTS = 12  # grid cells for features in all parts of an image: with more cells,
 def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None, cells: int | None = None) -> Integers:
     """Select at most ``count`` pixels that are spread over the image. Returns their indices in ascending order.
 
-    ``pixels`` (K, 2). One pixel after the other is taken from each cell of a grid in turn. ``cells``: the approximate
-    number of cells, ``count`` if None. ``priority`` (K,): in each cell the pixels with the highest priority are taken
-    first. If it is None, the first pixels are taken first.
+    ``pixels`` (K, 2). The pixels are divided into the cells of a grid. One pixel is taken from each cell in turn, until
+    there are enough. ``cells``: the approximate number of cells, ``count`` if None. ``priority`` (K,): pixels with a
+    higher priority are taken first in their cell. None means the order of ``pixels``.
     """
     if len(pixels) <= count:
         return np.arange(len(pixels))

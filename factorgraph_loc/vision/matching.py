@@ -72,12 +72,12 @@ def match(
 
 
 def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
-    """Return a mask (N, M) of the pairs of prediction and pixel where the pixel is in the gate of the prediction. It
-    can be passed to :func:`match` as ``allowed``.
+    """Return a mask (N, M) of the measured pixels that lie in the gate of each predicted pixel. It can be passed to
+    :func:`match` as ``allowed``.
 
     ``predicted`` (N, 2) [px]: predicted pixels. ``covariances`` (N, 2, 2) [px^2]: of prediction and measurement together.
-    ``points`` (M, 2) [px]: measured pixels. A gate is the ellipse that contains the pixel with the probability :data:`GATE`. The
-    gate of a prediction that is NaN is empty. Raises InputError if a covariance is not positive definite.
+    ``points`` (M, 2) [px]: measured pixels. A gate is the ellipse that contains the pixel with the probability :data:`GATE`.
+    The gate of a prediction that is NaN is empty. Raises InputError if a covariance is not positive definite.
     """
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     determinant = a * c - b * b
@@ -91,8 +91,8 @@ def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
 
 
 def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
-    """Return for each row of ``distances`` (N, M), M > 0, the index of the smallest distance (N,), the smallest
-    distance (N,), and the second smallest distance (N,). The latter is infinite if M is 1."""
+    """Return three arrays (N,) for the rows of ``distances`` (N, M), M > 0: the index of the smallest distance, the
+    smallest distance, and the second smallest distance, which is infinite if M is 1."""
     rows = np.arange(len(distances))
     index = distances.argmin(axis=1)
     best = distances[rows, index]
@@ -103,7 +103,7 @@ def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
 
 
 def _is_clear(best: Array, second: Array) -> Truths:
-    """Return a mask of the neighbours whose distance ``best`` is smaller than ``second`` by more than rounding errors."""
+    """Return a mask of the neighbours that are nearer (``best``) than the ``second`` ones by more than rounding errors."""
     return np.asarray(second > (1.0 + ROUNDING) * best)
 
 

@@ -29,7 +29,7 @@ from factors.camera.model import CameraModel
 from factors.robust import huber_weight
 from factors.se2 import Array
 
-REACH = 3.0  # a pixel is an inlier of a sample within so many standard deviations
+REACH = 3.0  # a pixel is an inlier of a sample if its error is below this number of standard deviations
 CONFIDENCE, MOST_SAMPLES = 0.9999, 5000
 REFINEMENTS = 10  # largest number of iterations
 CONVERGED = 1e-6  # m, rad: step below which the refinement ends
@@ -91,10 +91,10 @@ def located(model: CameraModel, points: Array, pixels: Array, covariances: Array
 def on_floor(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
-    """Compute the planar pose of a robot on the floor, starting at the pose ``camera`` of its camera.
+    """Compute the planar pose of a robot on the floor by least squares. ``camera``: the initial pose of its camera.
 
     ``points`` (K, 3), ``pixels`` (K, 2), ``covariances`` (K, 3, 3): see :func:`located`. Returns None if the robot with
-    this camera pose is tilted or not on the floor, or if the points do not determine the planar pose.
+    this camera pose is tilted or not on the floor. Also returns None if the points do not determine the planar pose.
     """
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
@@ -132,7 +132,7 @@ def _refined(
         whitener = positive.whitener(noise)
         residual = np.einsum("kij,kj->ki", whitener, residual)
         squared = np.sum(residual**2, axis=1)
-        # outliers far away get no weight: under the Huber loss alone they would still have an effect
+        # gross outliers get no weight, because the Huber loss alone would not remove their effect
         weight = np.where(squared < (2.0 * GATE if i < 3 else GATE), huber_weight(squared, model.robust), 0.0)
         by_camera = whitener @ by_camera
         information = np.einsum("k,kri,krj->ij", weight, by_camera, by_camera)
@@ -192,7 +192,7 @@ class KeyframeIndex:
         return len(self._descriptions)
 
     def views(self, descriptors: Descriptors) -> Integers:
-        """Return the indices of the views of the :data:`NEAREST` keyframes that are most similar to an image with
+        """Return the indices of the views of the :data:`NEAREST` keyframes most similar to an image with
         ``descriptors`` (N, D)."""
         (description,) = self._described(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)

@@ -79,8 +79,8 @@ class ScaleSpace:
                 blur(octave.planes[i - 1], octave.planes[i], more_blur(SIGMAS[i - 1], SIGMAS[i]))
 
     def levels(self, sigmas: Array) -> Integers:
-        """Return for each scale of ``sigmas`` (N,) [px] the index (N,) of the nearest characteristic scale, counted
-        over all octaves."""
+        """Return the index (N,) of the characteristic scale nearest to each of ``sigmas`` (N,) [px], counted over all
+        octaves."""
         nearest = np.rint(SCALES * np.log2(sigmas / FINEST))
         return np.asarray(np.clip(nearest, 0, len(self._steps) - 1), dtype=np.int64)
 

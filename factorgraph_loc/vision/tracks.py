@@ -21,12 +21,12 @@ RADIUS = 0.25  # largest displacement of a feature, as a fraction of the longer 
 EPIPOLAR = 1.5  # px: largest distance of an inlier from its epipolar line
 CONFIDENCE, DRAWS = 0.99, 300  # of USAC: confidence, and largest number of samples of five pairs
 FEWEST = 16  # with fewer pairs, no outliers are rejected
-OTHER_BODY = 0.5  # if more of the rejected pairs fit a second essential matrix, they show another moving body
+OTHER_BODY = 0.5  # pairs of a second essential matrix are kept if they exceed this fraction of the rejected pairs
 
 
 class _TrackedImage(NamedTuple):
-    """The K features of one image. ``directions`` (K, 2): x and y at depth 1. ``descriptors`` (K, D). ``numbers`` (K,):
-    their track numbers."""
+    """The K features of one image. ``directions`` (K, 2): x and y at depth 1. ``numbers`` (K,): the numbers of their
+    tracks."""
 
     directions: Array
     descriptors: Descriptors
@@ -75,10 +75,10 @@ class FeatureTracker:
 
 
 def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel) -> Integers:
-    """Match the features of two images. Returns pairs (M, 2) of indices.
+    """Match the features of two images. Returns pairs (M, 2) of indices of a feature of the first and of the second image.
 
-    ``first``, ``second``: the features of an image, as directions (K, 2), which are x and y at depth 1, and descriptors
-    (K, D). ``camera``: its calibration.
+    ``first``, ``second``: the features of an image, as directions (K, 2), which are x and y at depth 1, and descriptors (K,
+    D). ``camera``: its calibration.
     """
     if len(first[0]) == 0 or len(second[0]) == 0:
         return np.empty((0, 2), dtype=np.int64)

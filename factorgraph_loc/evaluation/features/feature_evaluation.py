@@ -55,10 +55,12 @@ def evaluate(
     """Yield a dictionary of scores for each pair of the first image and a later image of a sequence.
 
     The keys are the fields of :class:`MatchScores` and of
-    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`, and also: ``feature``, ``sequence``
-    (names), ``image`` (number of the later image), ``change`` and ``amount`` (of the sequence), ``features`` (number in
-    the later image), and ``milliseconds`` (time to detect and describe these features, on one thread). ``progress`` is
-    called after each image.
+    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`, and also:
+
+    - ``feature``, ``sequence``: names. ``image``: number of the later image. ``change``, ``amount``: of the sequence.
+    - ``features``: number of features in the later image. ``milliseconds``: time to compute them on one thread.
+
+    ``progress`` is called after each image.
     """
     with _one_thread():
         what.find(sequence.first)  # the first call takes longer, and is not measured

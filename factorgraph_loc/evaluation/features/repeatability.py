@@ -49,8 +49,8 @@ class Repeatability(NamedTuple):
 class Candidates:
     """M pairs of regions that may correspond. ``first``, ``second`` (M,): indices of the regions in each image.
 
-    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region, mapped to the first image, divided by the
-    size of the first region.
+    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region in the first image, divided by that of the
+    first.
     """
 
     first: Integers
@@ -59,8 +59,7 @@ class Candidates:
     ratio: Array
 
     def best(self, chosen: Truths) -> Candidates:
-        """Return one-to-one pairs. They are selected in the order of increasing error from the pairs in the mask
-        ``chosen`` (M,)."""
+        """Select one-to-one pairs from the pairs in the mask ``chosen`` (M,), in the order of increasing error."""
         taken_first: set[int] = set()
         taken_second: set[int] = set()
         rows = []

@@ -190,8 +190,7 @@ def read_sequence(folder: Path) -> Sequence:
 
 
 def warped(photograph: Image, source: Path) -> list[Sequence]:
-    """Make two sequences from a photograph: reduced by the factors :data:`ZOOMS`, and rotated by the angles
-    :data:`ROTATIONS`.
+    """Make two sequences from a photograph: reduced by :data:`ZOOMS`, and rotated by :data:`ROTATIONS`.
 
     The background of a reduced photograph is its mirror image at full size. All images of the rotated sequence are
     cropped to the largest square without empty corners. ``source``: file of the photograph, for the names of the

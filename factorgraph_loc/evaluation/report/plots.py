@@ -34,7 +34,7 @@ _NAME = 40  # maximum length of a name at an axis
 class _Row:
     """A row of a chart of dots: a variant, its ``values`` on each log, and a ``mark`` at their median or mean.
 
-    ``band``: the expected interval of the mark, None for none.
+    ``band``: the expected interval of the mark, or None.
     """
 
     name: str
@@ -45,7 +45,7 @@ class _Row:
 
 
 def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture | None:
-    """Plot the ratio of the score of each variant to that of the reference variant on each log. A panel for each metric.
+    """Plot the score of each variant divided by that of the reference variant, on each log. Each metric has a panel.
 
     Return None if there are no ratios.
     """
@@ -95,9 +95,10 @@ def times(results: Results, metric: Metric) -> Picture | None:
 
 
 def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Array]]) -> Picture | None:
-    """Plot the distribution of position errors of causal and final poses, over the logs with errors of all variants.
+    """Plot the distribution of position errors of causal and final poses, over the logs on which every variant has
+    errors.
 
-    ``errors``: by kind of trajectory, variant and log, quantiles of the position error [m]. Return None if there are no errors.
+    ``errors``: by kind of trajectory, variant and log, quantiles of the position error [m]. Return None without errors.
     """
     figure, axes = grid(1, len(KINDS), 5.5)
     for axis, kind in zip(axes[0], KINDS, strict=True):
@@ -171,7 +172,7 @@ def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: s
 
 
 def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure and its ``count`` axes, in two columns if there are several. ``height``: of each, in units of 100 px."""
+    """Return a figure and its ``count`` axes, in two columns if there are several. ``height``: of one panel [100 px]."""
     columns = min(count, 2)
     figure, axes = grid(math.ceil(count / columns), columns, height * math.ceil(count / columns))
     for axis in axes.flat[count:]:

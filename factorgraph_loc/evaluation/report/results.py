@@ -160,8 +160,8 @@ class MetricComparison:
 class Results:
     """The runs of an experiment by variant and log. A variant is an estimator with certain settings and sensors.
 
-    ``variants``: the label of each variant, by its name on the page. ``logs``: the name of each log, by its name on the page.
-    If a setting of the simulation is swept, the page lists a log once for each value, but tests count these logs as one.
+    ``variants``: the label of each variant, by its name on the page. ``logs``: the name of each log, by its name on the
+    page. A log with a swept setting of the simulation has several names on the page, but counts as one log in tests.
     ``rows``: all runs as dictionaries. ``sweeps``: columns of the swept settings that vary.
     """
 
@@ -216,7 +216,7 @@ class Results:
         return MetricComparison(metric, figures, best, against, contrasts, dict(zip(contrasts, corrected, strict=True)))
 
     def unscored(self) -> list[str]:
-        """Return the logs with a run that has some poses to compare with the reference, but too few for error figures."""
+        """Return the logs with a run that has some poses to compare with the reference, but too few for scores."""
         kinds = [f"{kind}.scored" for kind in KINDS]
         return [
             log
@@ -277,8 +277,8 @@ def score(row: Row, metric: str) -> float | None:
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
-    """Return the best variant, or None if there is none. Only variants that have a score on every log with scores are
-    compared."""
+    """Return the best variant, or None if there is none. A variant without scores on some of the logs is not
+    considered."""
     if metric.better is None or not figures:
         return None
     complete = {

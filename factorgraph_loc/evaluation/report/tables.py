@@ -98,7 +98,7 @@ def failures(results: Results) -> Table:
 
 
 def warnings(results: Results) -> Table:
-    """Return the table of warnings, with the runs that have each of them."""
+    """Return the table of warnings. A row has a warning and the runs that have it."""
     rows: list[list[str | int]] = []
     for text, concerned in by_text(results.rows).items():
         where = dict.fromkeys(f"{row['log']}, {label_of(row)}" for row in concerned)
@@ -136,7 +136,8 @@ def p_value(p: float | None) -> str:
 
 
 def uncertainty(metric: Metric, figure: Pooled) -> str:
-    """Return the interval of a pooled score, such as ``[0.1, 0.2]``, or else its range ``0.1 … 0.2``. "" for a single value."""
+    """Return the interval of a pooled score, such as ``[0.1, 0.2]``. Without an interval, return its range ``0.1 …
+    0.2``, or "" for a single value."""
     if figure.low is not None and figure.high is not None:
         return f"[{metric.text(figure.low)}, {metric.text(figure.high)}]"
     return metric.range(figure.least, figure.most) if figure.count > 1 else ""
@@ -173,8 +174,8 @@ def _difference_cell(c: MetricComparison, variant: str) -> Cell:
 
 
 def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float | None) -> Cell:
-    """Return a cell with a score on one log. ``known``: scores of the runs. ``planned``: number of all runs. ``best``:
-    best score of the row."""
+    """Return a cell with a score on one log. ``known``: the scores of its runs. ``planned``: number of all runs.
+    ``best``: best score in the row."""
     if not known:
         return Cell(_NONE)
     value = float(average(known, rms=metric.rms))
@@ -190,7 +191,7 @@ def _first(names: Sequence[str]) -> str:
 
 
 def _poses(runs: Sequence[Row]) -> Cell:
-    """Return a cell with the number of scored poses of the runs, such as "840", or "800 to 840" if it differs between runs."""
+    """Return a cell with the number of scored poses, such as "840", or "800 to 840" if it differs between the runs."""
     return Cell(counted(runs) or _NONE)
 
 

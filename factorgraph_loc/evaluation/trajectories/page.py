@@ -168,8 +168,8 @@ def _alignment(score: TrajectoryScore) -> str:
 def write_score(score: TrajectoryScore, out: Path) -> None:
     """Write the report of a comparison into the folder ``out``. Files of a previous report are replaced.
 
-    The files are ``errors.csv`` (a row for each pair of poses), ``report.html`` (tables and plots), the plots as PNG in
-    ``plots``, and ``score.json`` (see :meth:`TrajectoryScore.document`).
+    The files are ``errors.csv`` (a row for each pair of poses), ``report.html``, the plots as PNG in ``plots``, and
+    ``score.json`` (see :meth:`TrajectoryScore.document`).
     """
     with writing(out):
         (out / "plots").mkdir(parents=True, exist_ok=True)
@@ -185,8 +185,8 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
 def errors_of(score: TrajectoryScore) -> pl.DataFrame:
     """Return the table of ``errors.csv``, with a row for each pair of poses.
 
-    The columns are the timestamps [ns] of both trajectories (empty if missing), the positions [m] of both after the
-    alignment, and the errors of position [m] and rotation [rad].
+    The columns are the timestamps [ns] and the aligned positions [m] of both trajectories, and the errors of position
+    [m] and rotation [rad]. Missing timestamps are empty.
     """
     rotation = score.ape.rotation
     columns = [

@@ -60,8 +60,8 @@ class PoseErrors:
 class TrajectoryScore:
     """The result of the comparison of an estimated trajectory with a reference.
 
-    ``estimate``, ``reference``: the N paired poses of both; those of the estimate are aligned.
-    ``transform``: the alignment, from the frame of the estimate to that of the reference. ``ape``: N absolute errors.
+    ``estimate``, ``reference``: the N paired poses of both, after the alignment. ``transform``: the alignment, from the
+    frame of the estimate to the frame of the reference. ``ape``: N absolute errors.
     ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a second, None without rotations or
     timestamps. ``rpe``: relative errors over other distances and durations, by a text such as "5m".
     ``lengths`` [m], ``poses``: length and number of poses of the whole estimate and of the whole reference.
@@ -252,8 +252,8 @@ def _relative(
 
 
 def _motions(path: PosePath, begins: Integers, ends: Integers) -> tuple[Array, Array]:
-    """Return rotations (K, 3, 3) and translations (K, 3) from poses ``begins`` to ``ends``, in the frames of
-    ``begins``."""
+    """Return rotations (K, 3, 3) and translations (K, 3) from the poses ``begins`` to the poses ``ends``, in the frames
+    of the first."""
     back = path.rotations[begins].transpose(0, 2, 1)
     shifts = path.positions[ends] - path.positions[begins]
     return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, shifts)
