@@ -10,7 +10,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 
 
 class _Every:
-    """Contains every modality."""
+    """A container that contains every string."""
 
     def __contains__(self, modality: object) -> bool:
         return True
@@ -51,10 +51,10 @@ class Estimator(Protocol):
         modes, and particles if the estimator uses them."""
 
     def learnt(self) -> Learnt:
-        """The estimates of sensor constants and landmarks from all measurements, consistent with :meth:`trajectory`."""
+        """Return the estimates of sensor constants and landmarks from all measurements."""
 
     def trajectory(self) -> Trajectory:
-        """The best estimate of all past poses, with covariances, at the ticks, the times at which a run records the pose."""
+        """Return the best estimate of all past poses with covariances, at the times at which a run records the pose."""
 
 
 @runtime_checkable

@@ -23,9 +23,10 @@ NOWHERE = np.zeros(3)  # a motion of zero
 NO_ODOMETRY = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 MODES = 5  # maximum number of modes
 REACH = np.array((1.0, 1.0, 0.6))  # m, m, rad: largest distance of a particle from the centre of its mode
-# Number of bisections to find the exponent of a step of a correction; minimum exponent as a fraction of the remaining exponent.
+# of the exponent of a step of :func:`corrected`: the number of bisections to find it, and its minimum as a fraction of
+# the remaining exponent
 BISECTIONS, SMALLEST = 8, 0.01
-LEAST = 1e-3  # minimum exponent of a step, so that a correction ends even if no particle explains the measurement
+LEAST = 1e-3  # absolute minimum of the exponent, so that a correction ends even if no particle explains the measurement
 CELL = np.array((0.5, 0.5, 0.3))  # m, m, rad: size of grid cells. The heaviest cell is the first guess of a mode.
 
 T = TypeVar("T")
@@ -70,7 +71,10 @@ class Cloud:
         return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
-        """The cloud with one more block ``name`` of constants, drawn from a Gaussian with this mean (d,) and covariance (d, d)."""
+        """Return the cloud with a block ``name`` of constants added, drawn from a Gaussian.
+
+        ``mean`` (d,), ``covariance`` (d, d): of the Gaussian.
+        """
         first = self.constants.shape[1]
         drawn = mean + positive.draws(covariance, len(self.poses), rng)
         parts = {**self.parts, name: slice(first, first + len(mean))}
@@ -181,8 +185,8 @@ def corrected(
 
     ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a resampled cloud.
     ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the time of the measurement.
-    ``below``: after the last step, the particles are resampled only if the effective number is below this fraction of N.
-    ``left``: the sum of the exponents to apply. ``to_end``: if False, the step that completes this sum is left out.
+    ``below``: after the last step, particles are resampled only if the effective number is below this fraction of N.
+    ``left``: the sum of the exponents to apply. ``to_end``: False to omit the last step.
 
     Raises RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """

@@ -35,7 +35,7 @@ class DeadReckoning(Filter):
     _state: tuple[Array, Array]  # pose (3,), and its body-frame covariance (3, 3)
 
     def trajectory(self) -> Trajectory:
-        """The trajectory of the causal estimates. There is no smoothing, because no measurement corrects the odometry."""
+        """Return the trajectory of the causal estimates, which no later measurement can improve."""
         records: list[_PoseRecord] = self._records
         return at_ticks(
             self._ticks,

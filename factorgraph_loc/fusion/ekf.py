@@ -32,11 +32,11 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 NOWHERE = slice(POSE, POSE)  # the slice of a block that does not exist
-# Size of the error state above which uncertain landmarks are no longer estimated: their covariances are added to the noise.
+# Size of the error state above which uncertain landmarks of the map are not added. Their covariances are then noise.
 MOST = 150
-# At an unknown heading, a search with particles finds the heading. The filter then starts with this heading as its prior, with the
-# standard deviation multiplied by this factor, and processes the measurements of the search again. So 1/16 of their information
-# counts twice. Without this prior the filter would be linearised far from the true heading.
+# A search with particles finds an unknown start heading. The filter then starts with this heading, and processes the
+# measurements of the search again. The standard deviation of the heading is first multiplied by this factor, so that
+# only 1/16 of the information of the measurements counts twice.
 HEADING_WIDENED = 4.0
 
 
@@ -63,11 +63,11 @@ class _State(NamedTuple):
     layout: Layout
 
     def plus(self, delta: Array, covariance: Array) -> _State:
-        """The state after a correction ``delta`` (3+R,). ``covariance`` (3+R, 3+R): the covariance after the correction."""
+        """Return the state after a correction ``delta`` (3+R,), with the new ``covariance`` (3+R, 3+R)."""
         return _State(se2.moved(self.pose, delta), self.rest + delta[POSE:], covariance, self.layout)
 
     def first(self, size: int) -> _State:
-        """The state with only the first ``size`` components of the error state, without blocks that were added later."""
+        """Return the state without the blocks after the first ``size`` components of the error state."""
         if size == len(self.covariance):
             return self
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
@@ -80,7 +80,7 @@ class _State(NamedTuple):
         return observation.on_pose({name: values[name] for name in spreads}, spreads)
 
     def with_block(self, new: NewVariable) -> _State:
-        """The state with one more variable ``new``, such as a landmark, and its correlation with the rest of the state."""
+        """Return the state with the variable ``new``, such as a landmark, added with its correlations."""
         size, columns = len(self.covariance), self.layout.columns
         cross, own = new.joint(self.covariance, columns)
         end = size + len(new.mean)
@@ -134,7 +134,7 @@ class _View(FilterView):
 
 
 class Ekf(Filter):
-    """Extended Kalman filter on SE(2), with a Rauch-Tung-Striebel smoother at the end. See the module."""
+    """Extended Kalman filter on SE(2), with a Rauch-Tung-Striebel smoother at the end. See the module docstring."""
 
     _state: _State
 
@@ -185,7 +185,7 @@ class Ekf(Filter):
         )
 
     def trajectory(self) -> Trajectory:
-        """The smoothed estimates (Rauch, Tung, Striebel, 1965), or the causal ones if the setting ``smooth`` is false."""
+        """Return the smoothed poses (Rauch, Tung, Striebel, 1965), or the causal poses if ``smooth`` is false."""
         records: list[_Record] = self._records
         if not records:  # the unknown start pose was never found
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
@@ -199,8 +199,8 @@ class Ekf(Filter):
         return at_ticks(self._ticks, times, np.array(poses[::-1]), np.array(covariances[::-1]))
 
     def _smoothed(self, state: _State, step: _Step, later: _State) -> _State:
-        """One backward step of the smoother. ``step``: the prediction from ``state`` to the next record. ``later``: the
-        smoothed state of the next record. Returns the smoothed ``state``."""
+        """Return ``state`` smoothed with the next record. ``step``: the prediction from ``state`` to the next record.
+        ``later``: the smoothed state of the next record."""
         later = later.first(len(state.covariance))
         change = np.concatenate((se2.twist_to(step.pose, later.pose), later.rest - state.rest))
         return state.plus(*positive.smoothed(state.covariance, step.transition, step.noise, change, later.covariance))
@@ -304,5 +304,6 @@ class Ekf(Filter):
 
 
 def _at_its_time(observation: Observation, state: _State) -> Observation | None:
-    """The observation on the robot's pose at the time of the measurement, with all else fixed at ``state``, or None."""
+    """Return an observation as a function of the pose at its own time, None if it has no such form. Constants and
+    landmarks are fixed at ``state``."""
     return state.on_pose(observation).at_its_time()

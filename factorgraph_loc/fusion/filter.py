@@ -51,8 +51,7 @@ class _Checkpoint(NamedTuple):
 
 
 class FilterView:
-    """Gives sensors read access to a filter's present state. ``offset`` is None and ``newest`` True, because a
-    measurement always belongs to the present pose."""
+    """Gives sensors read access to a filter's present state (see :class:`~factorgraph_loc.sensors.base.View`)."""
 
     offset = None
     newest = True
@@ -146,7 +145,7 @@ class Filter(Timeline):
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
-        """Return the best estimate of all past poses, at the ticks, the times at which a run records the pose."""
+        """Return the best estimate of all past poses, at the times at which a run records the pose."""
 
     @abstractmethod
     def _start(self, prior: PosePrior) -> Any:
@@ -161,7 +160,7 @@ class Filter(Timeline):
         """Update the state by a measurement. The state is already predicted to the measurement's time."""
 
     def _pass(self, tick: Tick) -> None:
-        """Continue the search for the pose, if one is running. Called at each tick (a time at which a run records the pose)."""
+        """Continue a running search for the pose. Called at each ``tick`` (a time at which a run records the pose)."""
         return
 
     @abstractmethod
@@ -170,7 +169,7 @@ class Filter(Timeline):
 
     @abstractmethod
     def _record(self) -> Any:
-        """The data of the present state that :meth:`trajectory` needs. The result has an attribute ``t``, the time [s]."""
+        """Return the data of the present state that :meth:`trajectory` needs, with an attribute ``t``, the time [s]."""
 
     def _seek(self, m: Any) -> Any:
         """Use a measurement to find the unknown start pose. Returns the first state, or None if the pose is not yet determined."""
@@ -180,7 +179,7 @@ class Filter(Timeline):
         return self._at(t)._estimate()
 
     def _at(self, t: float | None) -> Self:
-        """The filter itself, or a copy predicted to ``t`` [s] if ``t`` is later than the filter. Only read from the copy."""
+        """Return the filter, or a copy predicted to ``t`` [s] if ``t`` is later. The copy must not be changed."""
         if t is None or t <= self._t or self._state is None:
             return self
         self._ahead = None

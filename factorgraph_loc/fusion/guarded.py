@@ -146,8 +146,8 @@ def _positive(covariance: Array, where: str = "") -> Array:
 
 
 def nearest_positive(covariance: Array) -> Array | None:
-    """Return a covariance (D, D) unchanged if it is symmetric and positive definite. If only rounding prevents that,
-    return the nearest covariance that is. Otherwise return None."""
+    """Return a symmetric and positive definite covariance (D, D) unchanged. If it is so except for rounding errors,
+    return the nearest symmetric and positive definite matrix. Otherwise return None."""
     sigmas = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(covariance)) and np.all(sigmas > 0.0)):
         return None
@@ -170,6 +170,6 @@ def _named(measurement: Measurement) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of an error's message that is not empty, or the name of the error's type if there is none."""
+    """Return the first line of an error's message that is not empty, or else the name of the error's type."""
     lines = (" ".join(line.split()) for line in str(error).splitlines())
     return plain(next((line for line in lines if line), type(error).__name__))

@@ -109,7 +109,7 @@ class _CloudView(FilterView):
 
 
 class ParticleFilter(Filter):
-    """Monte-Carlo localization, with resampling from a kernel density and backward simulation. See the module."""
+    """Monte-Carlo localization. It resamples from a kernel density and smooths by backward simulation."""
 
     deterministic = False
     supports_unknown_start = True
@@ -134,7 +134,7 @@ class ParticleFilter(Filter):
         self._changes: list[tuple[float, Change]] = []
 
     def belief(self, t: float | None = None) -> Belief:
-        """The particles with weights, and the Gaussians of their modes, or one Gaussian of all particles if localized."""
+        """Return the weighted particles and the Gaussians of their modes (one Gaussian if the robot is localized)."""
         if self._state is None:
             return Belief(())
         predicted = self._at(t)
@@ -206,9 +206,11 @@ class ParticleFilter(Filter):
         return self._sampled_cloud(self._t) if self._search.look(m, self._odometry) else None
 
     def _sampled_cloud(self, since: float) -> Cloud | None:
-        """Draw particles from the posterior of the search, or return None if it has none yet. If the search has found
-        one clear pose, the filter is localized, and sensors restart at the time ``since`` [s]. If the filter was
-        localized before ``since``, the particles keep their sensor constants from then."""
+        """Draw particles from the result of the search. Returns None if there is no result yet.
+
+        If the search has found one clear pose, the filter is then localized, and sensors restart at the time ``since``
+        [s]. If the filter was localized before ``since``, the sensor constants from that time are used again.
+        """
         clouds = (r.cloud for r in reversed(self._records) if r.cloud is not None and r.t < since)
         previous = next((cloud for cloud in clouds if cloud.localized), None)
         sample = self._search.sample(self._drawn_by, self._settings.particles, self._odometry)
@@ -323,7 +325,7 @@ class ParticleFilter(Filter):
         view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:
-            # the final trajectory has to know the records since the estimated pose became wrong
+            # mark the records since the estimated pose became wrong, so that smoothing does not use them
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, "lost", LOST, why=refuted.why, since=refuted.since)
             self._lost = True
@@ -354,7 +356,9 @@ class ParticleFilter(Filter):
 
         evidence, left = 0.0, 1.0
         if count > FEW and observation.work * count > HEAVY:
-            doubted = self._search.doubts  # while a sensor doubts the estimated pose, a few particles are enough
+            doubted = (
+                self._search.doubts
+            )  # while sensors contradict the pose, the search may soon replace all particles
             few, evidence, left = correct(cloud.thinned(FEW), FEW, enough, left, to_end=doubted)
             if doubted:
                 self._state = few

@@ -28,7 +28,7 @@ from factors.compiled import compiled
 from factors.motion import ChainState, Increment
 from factors.se2 import Array, Integers
 
-BREAK = 100.0  # squared Mahalanobis distance from its ancestor above which a particle cannot come from there
+BREAK = 100.0  # squared Mahalanobis distance of a particle from a possible ancestor, above which it is not the ancestor
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Record:
     cloud: Cloud | None
 
     def lost(self) -> Record:
-        """The record with ``localized`` false in its cloud. This marks particles that turned out to be at a wrong pose."""
+        """Return the record with ``localized`` false in its cloud, because its particles are at a wrong pose."""
         return self if self.cloud is None else replace(self, cloud=replace(self.cloud, localized=False))
 
 
@@ -104,9 +104,8 @@ class BackwardSimulation:
         """Draw an ancestor from ``cloud`` for each of the M later states ``later``. ``increment``: the odometry in
         between. Returns the ancestors, and the noise (M, 3) of the odometry that they imply."""
         smooth, kernel = cloud.density()
-        later = replace(
-            later, constants=later.constants[:, : cloud.constants.shape[1]]
-        )  # without blocks that came later
+        # without constants that were added later
+        later = replace(later, constants=later.constants[:, : cloud.constants.shape[1]])
         predicted, by_state = self._moved(smooth, increment)
         transition = np.eye(len(kernel))
         transition[:3] = by_state

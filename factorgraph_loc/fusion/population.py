@@ -84,7 +84,7 @@ class WeighedObservation(NamedTuple):
 
 
 class Population:
-    """The particles of a global search. See the module.
+    """The particles of a global search. See the module docstring.
 
     ``motion``: the odometry. ``bounds`` (2, 2) [m]: the lower and upper corner of the area that contains the robot.
     ``start``: a known start position, or None. ``space``: the free space that contains the robot, or None.
@@ -222,7 +222,7 @@ class Population:
         ]
 
     def _weight_of_best(self) -> float:
-        """The probability that the robot is near the mode with the largest weight, or 0 if there are too few observations."""
+        """Return the probability that the robot is near the most likely mode, 0 if there are too few observations."""
         if self._informative < CLEAR_OBSERVATIONS or len(self._things) < CLEAR_THINGS or self._cloud is None:
             return 0.0
         error = self._cloud.poses - self.hypotheses[0].pose
@@ -264,8 +264,11 @@ class Population:
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:
-        """Draw ``count`` poses (N, 3) without any information from observations: around the known start position, moved by odometry
-        to ``now``; if there is none, uniform over free space; otherwise uniform over the bounds as a Latin hypercube."""
+        """Draw ``count`` poses (N, 3) that no observation influences.
+
+        If the start position is known, they are drawn around it and moved by odometry to ``now``. Otherwise they are
+        uniform over the free space or, if that is unknown, over the bounds (as a Latin hypercube).
+        """
         if self._start is not None:
             return self._start.drawn(self._rng, count, now)
         if self._space is not None:
@@ -282,7 +285,7 @@ def _cloud(poses: Array, log_weights: Array) -> Cloud:
 
 
 def _likelihood(observation: Evidence, cloud: Cloud) -> Steps[Array]:
-    """The log-likelihood (N,) of an observation at the particles of ``cloud``, in steps of about equal duration."""
+    """Return the log-likelihood (N,) of an observation at the particles of ``cloud``, in steps of about equal cost."""
     each = PARTICLE + observation.work
     count = max(1, CHUNK // each)
     parts = []

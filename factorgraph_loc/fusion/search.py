@@ -32,7 +32,7 @@ PAUSE = 0.05  # s: minimum time between two slices, so that a measurement and a 
 
 
 class Search:
-    """A global search for the robot's pose. See the module.
+    """A global search for the robot's pose. See the module docstring.
 
     ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space; None means the
     bounds of the sensors' maps. ``fewest``: the minimum number of particles. ``work``: the computing cost of one slice.
@@ -136,7 +136,8 @@ class Search:
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """True if the particles reject ``place``, a pose by one sensor, or have not yet processed its measurement."""
+        """True if the particles reject ``place``, a pose from one sensor, or have not processed all measurements
+        yet."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
@@ -152,7 +153,8 @@ class Search:
         ]
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
-        """The particles' poses (N, 3) at time ``t`` [s] and weights (N,). None if the present result is not from particles."""
+        """Return the particles' poses (N, 3) at time ``t`` [s] and weights (N,), None if the result has another
+        source."""
         leading = self._leading
         if not isinstance(leading, Population) or leading.newest is None:
             return None
@@ -177,8 +179,10 @@ class Search:
 
     @property
     def _leading(self) -> Finder | Population | None:
-        """The source of the present result: a finder (which uses one sensor alone) that needs only one measurement,
-        otherwise the particles, otherwise any finder. None if no source is informative yet."""
+        """The source of the present result, None if no source has a result. A finder uses one sensor alone.
+
+        The order of preference is: a finder that needs only one measurement, the particles, any other finder.
+        """
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):

@@ -39,7 +39,7 @@ from factors.update import Correction
 
 REFUTING = 8.0  # the estimated track is rejected above these log-odds, which are high because robots are rarely carried
 BEFORE = 2.0  # s: the robot left the track at most this long before a sensor's first doubt or the first observation against it
-# a time is a possible departure from the track if its log-likelihood differs by less from the highest one
+# the robot may have left the track at any time with a log-likelihood that is less than this below the maximum
 UNSURE = 5.0
 NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
 CERTAIN = NEAR**2 / (-2.0 * math.log(1.0 - SURE))  # m^2: a pose is known if its variances of x and y have a smaller sum
@@ -48,7 +48,7 @@ PROBATION = 5.0  # s; for this time after a rejection the new track is not yet r
 FOUND = np.diag((1.0, 1.0, 0.5)) ** 2
 APART = 16.0  # squared Mahalanobis distance above which a pose of the search differs from the track
 WINDOW = 3.0  # s: the observations of the last WINDOW seconds are compared with the odometry
-ONSETS = (0.75, 1.5, 3.0)  # s: possible times since the begin or end of wheel slip
+ONSETS = (0.75, 1.5, 3.0)  # s: possible times since the beginning or end of wheel slip
 SHARES = (0.0, 0.33, 0.67, 1.5)  # alternatives for the fraction of the reported distance that the robot has moved
 SURPRISING = 2.0  # a comparison starts if the mean of `surprise` over K observations exceeds this divided by sqrt(K)
 ENOUGH = 2  # a comparison needs more than this number of observations
@@ -68,7 +68,7 @@ SPARE = 1e-3  # s: a gap exceeds MAX_GAP by at least this much
 
 
 def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
-    """A mask (N,) of the times ``t`` (N,) [s] at which the pose is known: False in ``changes``, when the robot was carried."""
+    """Return a mask (N,) of the times ``t`` (N,) [s] outside of ``changes``, the intervals with a carried robot."""
     known = np.ones(len(t), dtype=bool)
     for last, first in changes:
         more = 0.5 * max(MAX_GAP + SPARE - (first - last), 0.0)
@@ -105,7 +105,7 @@ class Refuted(NamedTuple):
 
 
 class Tracking(Search):
-    """A search that also compares a track with its observations. See the module. ``sensors``: the sensors by name."""
+    """A search that also tests whether observations contradict the track (the estimated poses of the robot)."""
 
     def __init__(
         self, sensors: Mapping[str, Sensor], motion: Motion, rng: np.random.Generator, diagnostics: Diagnostics
@@ -125,7 +125,7 @@ class Tracking(Search):
         """
         if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True
-        # cheap test first: a circular Gaussian with the same sum of variances has at least this probability of a larger error
+        # cheap test first: if the sum of variances is small, the probability is small for any shape of the covariance
         return bool(covariance[0, 0] + covariance[1, 1] > CERTAIN and beyond(covariance, NEAR) > 1.0 - SURE)
 
     @property
@@ -336,7 +336,7 @@ class SlipMonitor:
         by_share = np.array([observations[i].log_likelihood(poses[:, i], {}) for i in range(1, len(rows))])
         holds, slips = by_share[:, :1], by_share[:, 1:]
         odds = np.minimum(slips - holds, MOST).sum(axis=0)
-        # during a slip the track follows the observations anyway
+        # the track must also be less likely than the alternative, except during a slip, when it follows the observations
         if odds.max() > RARE and not self._motion.is_slipping:
             track = np.array([rows[i].fit(observations[i]) for i in range(1, len(rows))])
             odds = np.minimum(odds, np.minimum(slips - track[:, None], MOST).sum(axis=0))
@@ -351,7 +351,7 @@ def surprise(correction: Correction) -> float:
 
 
 def is_doubted(sensors: Iterable[Sensor]) -> bool:
-    """True if the measurements of one of the sensors contradict the track, or if it detects nothing although it should."""
+    """True if the measurements of a sensor contradict the track, or if a sensor detects nothing where it should."""
     return any(sensor.suspicious_since is not None or sensor.silent for sensor in sensors)
 
 

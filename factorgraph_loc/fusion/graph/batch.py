@@ -42,8 +42,8 @@ def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> 
 
 
 def convex_width(graph: Graph, values: Values) -> float:
-    """Return the smallest factor, at least 1, that makes the losses of all links (such as loop closures) convex at
-    ``values`` when it multiplies their scales."""
+    """Return the smallest factor on the scales of losses, at least 1, that makes the losses of all links convex at
+    ``values``. A link is a factor between two poses, such as a loop closure."""
     linked = {name: sensor for name, sensor in graph.sensors.items() if sensor.links}
     nodes = (node for k in graph.keyframes.values() for node in k.nodes if linked and node.sensor in linked)
     return max(
@@ -53,9 +53,11 @@ def convex_width(graph: Graph, values: Values) -> float:
 
 
 def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, Solution]:
-    """Optimise a graph from the values ``start``, directly and by graduated non-convexity. Returns the problem and the
-    better optimum. ``widest``: the initial factor on the scales of the losses. If it is 1 and the graph has no loop
-    closures, only the direct optimum is computed."""
+    """Optimise a graph directly and by graduated non-convexity. Returns the problem and the better optimum.
+
+    ``start``: initial values. ``widest``: the initial factor on the scales of the losses. If it is 1 and the losses of
+    loop closures are convex, only the direct optimum is computed.
+    """
     problem = whole_problem(graph)
     best = problem.solve(start)
     width = max(widest, convex_width(graph, start))
@@ -96,8 +98,7 @@ def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, 
 
 
 class AtTheEnd:
-    """A backend that solves the graph only at the end of the run. During the run it has only rough estimates, as an EKF
-    has. They become the initial values of the solution."""
+    """A backend that solves the graph only at the end of a run. Rough estimates of the run are the initial values."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph

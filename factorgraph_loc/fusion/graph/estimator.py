@@ -62,7 +62,7 @@ class _Conclusion:
 
 
 class Smoother(Timeline):
-    """An incremental factor graph (iSAM2) over a window of time or over the full history. The setting ``lag`` chooses."""
+    """An incremental factor graph (iSAM2) over the last ``lag`` seconds, or over the whole run if ``lag`` is "all"."""
 
     # True because the setting `landmarks` can make this class estimate points that the map lacks
     estimates_points = True
@@ -247,7 +247,7 @@ class Smoother(Timeline):
 
 
 class Batch(Smoother):
-    """An estimator that computes the robust optimum over the whole log, once at the end of the log. See the module."""
+    """An estimator that computes the robust optimum over the whole log, once at its end. See the module docstring."""
 
     causal = False
 

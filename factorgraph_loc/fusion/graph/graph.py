@@ -44,8 +44,8 @@ NOTHING_KNOWN = np.zeros(0)  # the empty array of the odometry's estimated const
 @dataclass(frozen=True)
 class Node:
     """A factor of the graph. ``keys``: the keys of its variables. ``factor``: the factor, with ``rows`` residuals.
-    ``native``: an equivalent factor of GTSAM, which solvers prefer. At least one of these two is set. ``sensor``: the
-    name of the sensor."""
+    ``native``: an equivalent factor of GTSAM, which solvers prefer. One of ``factor`` and ``native`` may be None.
+    ``sensor``: the name of the sensor."""
 
     keys: tuple[int, ...]
     factor: Factor | None = None
@@ -114,7 +114,7 @@ def jumps(guess: Guess, pose: Array) -> bool:
 
 
 class Mapper:
-    """Adds points that a sensor observes and the map lacks to the graph, as variables. This base class adds nothing.
+    """Adds observed points that the map lacks to the graph, as variables. This base class adds nothing.
 
     ``sensor``: the name of the sensor, "" for none. ``fewest``: the minimum number of observations of a point in the graph.
     ``horizon``: the number of recent keyframes that the mapper needs. ``rejected``: the message for rejected observations.
@@ -153,8 +153,8 @@ class Mapper:
         """Discard all points except those with these ``keys``."""
 
     def forget(self, first: Keyframe) -> Sequence[int]:
-        """Delete the data of keyframes before ``first``, and of points that have left the graph and were not observed
-        since. Returns the keys of these points."""
+        """Delete the data of keyframes before ``first``, and of points that have left the graph without an observation
+        from ``first`` or later. Returns the keys of these points."""
         return ()
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
@@ -220,14 +220,14 @@ class Graph:
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
-        """Remove the keyframes from number ``first`` on, the ticks after the first of them, and the ticks from ``t`` [s] on."""
+        """Remove the keyframes from number ``first`` on, and the trajectory after them or after the time ``t`` [s]."""
         for index in range(first, self.newest.index + 1):
             del self.keyframes[index]
         self.newest = self.keyframes[first - 1]
         self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
 
     def forget(self, first: int) -> None:
-        """Delete the keyframes before number ``first``, the ticks between them, and the points that no later keyframe observes."""
+        """Delete the keyframes before number ``first``, the trajectory before it, and points not observed since."""
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
@@ -266,7 +266,7 @@ class Graph:
         return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def between(self, first: Keyframe, last: Keyframe) -> Increment:
-        """The motion from the keyframe ``first`` to the keyframe ``last``, with the estimated constants of the odometry."""
+        """Return the motion from the keyframe ``first`` to ``last``, with the estimated constants of the odometry."""
         return self.recalibrated(self.motion.relative(first.odometry, last.odometry))
 
     @property
@@ -275,7 +275,7 @@ class Graph:
         return self.keys.get(self.mapper.sensor)
 
     def recalibrated(self, increment: Increment) -> Increment:
-        """Correct an increment for the estimated constants of the odometry."""
+        """Return an odometry increment, corrected with the estimated constants of the odometry."""
         key = self.keys.get(MOTION)
         return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
@@ -372,7 +372,7 @@ class Graph:
             self.diagnostics.event(self.t, "damped", DAMPED, damping=damping)
 
     def unsolved(self, error: Exception) -> RunFailedError:
-        """Make the error of a graph that cannot be solved. It names the time, and the variable that is not determined."""
+        """Return the error of a graph that cannot be solved, with a message. ``error``: the solver's exception."""
         return RunFailedError(f"the graph cannot be solved at {self.t:.3f} s: {self.reason(error)}")
 
     def reason(self, error: Exception) -> str:

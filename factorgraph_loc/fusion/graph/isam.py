@@ -26,15 +26,14 @@ from factors.se2 import Array
 
 ITERATIONS_AFTER_FAILURE = 10  # maximum number of batch iterations to initialise a new solver after a failure
 LAG = 10.0  # s: default length of the window for causal estimates
-# A variable is linearised again if it has changed by this much, in m, rad, or the unit of a constant. The limit is smaller in a
-# window with points, because the linearisation of its oldest points soon becomes permanent. The last value is the number of updates
-# between checks of the limit.
+# A variable is linearised again if it has changed by this much [m, rad, or the unit of a constant]: in general, and in
+# windows with points, where linearisations soon become permanent. Last: the number of updates between two checks.
 MOVED, NEAR_POINTS, CHECKED_EVERY = 0.05, 0.02, 10
 ROUNDING = 1e-6  # s: rounding error of differences of times
 
 
 class Incremental:
-    """The backend of the smoother, which solves the graph incrementally during the run. See the module."""
+    """The backend of the smoother, which solves the graph incrementally during the run. See the module docstring."""
 
     def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
@@ -333,8 +332,7 @@ class Incremental:
             return FullHistory(parameters, MOVED, self._failed.append)
         parameters.findUnusedFactorSlots = True
         threshold = NEAR_POINTS if self._maps else MOVED
-        # With points, the oldest pose leaves at almost every update. In a rebuilt window, poses are then soon marginalised, and the
-        # linearisation points next to them become fixed.
+        # with points, a pose leaves at almost every update; without points, `_leave` sets the lag when poses must leave
         return Window(parameters, threshold, self._failed.append, self._lag + self._margin if self._maps else math.inf)
 
 

@@ -86,7 +86,7 @@ class _KeyframeView:
 
 
 class Builder:
-    """Builds a graph from measurements during a run. See the module."""
+    """Builds a graph from measurements during a run. See the module docstring."""
 
     def __init__(self, graph: Graph, backend: Backend, search: Tracking, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings

@@ -79,7 +79,7 @@ def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys
 
 
 def blamed(error: Exception) -> int | None:
-    """The key of the undetermined variable that an IndeterminateError or an error of GTSAM names. None if it names none."""
+    """Return the key of the undetermined variable that an error of GTSAM or IndeterminateError names, or None."""
     if isinstance(error, IndeterminateError):
         return error.key
     near = _NEAR.search(str(error))
@@ -228,7 +228,7 @@ class Chained:
 
 
 def _kind(factor: Factor, keys: tuple[int, ...]) -> Hashable:
-    """A key for grouping: factors with equal keys are linearised by one call. None for a factor that is linearised separately."""
+    """Return a key of a factor. Factors with equal keys are linearised together, a factor with the key None alone."""
     kind = cast(Stackable, factor).kind if _is_stackable(type(factor)) else None
     return None if kind is None else (type(factor), kind, *[key for key in keys if not is_pose(key)])
 

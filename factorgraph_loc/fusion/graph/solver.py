@@ -55,9 +55,8 @@ class FullHistory:
     ``threshold``: the change of a variable, in m, rad or the units of constants, after which it is linearised again.
     ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
 
-    Sensor constants are in all branches of iSAM2's elimination tree. To read an estimate, iSAM2 would therefore solve the whole
-    tree. The variables of the last update are at the root of the tree. Without points they are solved separately, which is faster.
-    An update with points has many variables. One solution of the whole tree then takes less time.
+    To read an estimate, iSAM2 solves its whole elimination tree. The variables of the last update are therefore solved
+    separately at the root of the tree, except with points, because their updates have many variables.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
@@ -110,7 +109,7 @@ class FullHistory:
         return np.asarray(self._solver.marginalCovariance(key))
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
-        """All factors, linearised at the solver's linearisation points, and the number of components of each variable by key."""
+        """Return all factors, linearised, and the number of components of each variable by key."""
         isam = self._solver if isinstance(self._solver, gtsam.ISAM2) else self._solver.getISAM2()
         at = isam.getLinearizationPoint()
         sizes = {key: 3 if is_pose(key) else len(at.atVector(key)) for key in at.keys()}  # noqa: SIM118
@@ -240,7 +239,7 @@ class LinearFactors:
         self._threshold, self._skip, self._on_failure = threshold, skip, on_failure
         self._updates = 0
         self.at: Values = {}  # the linearisation point of each variable
-        # the linearisation points that iSAM2 does not move, all shifted by the common translation of the estimates
+        # the linearisation points that iSAM2 does not move, shifted by the mean translation of the estimates
         self._held: Values = {}
         # the factors on each variable, by their identity
         self._on: defaultdict[int, dict[int, _Linear]] = defaultdict(dict)
@@ -322,7 +321,8 @@ class LinearFactors:
         return frozenset(self._slots)
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
-        """The factors that the next update of ``solver`` must replace, because a linearisation point of their variables changes."""
+        """Return the factors that the next update of ``solver`` must replace, because their linearisation points
+        change."""
         keys, ends = list(self.at), np.cumsum([len(value) for value in self.at.values()])
         change = np.maximum.reduceat(np.abs(solver.getDelta().vector(keys)), np.append(0, ends[:-1]))
         moved = [keys[i] for i in np.flatnonzero(change >= self._threshold).tolist()]

@@ -25,9 +25,10 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class MarginalSummary:
-    """The information of marginalised variables and priors on the variables of a window, without the measurements in
-    it. ``factors``: marginal factors and priors. ``keys``: the keys of all variables of the window. ``at``: their
-    linearisation points."""
+    """The information on the variables of a window from marginalised variables and priors, without measurements.
+
+    ``factors``: marginal factors and priors. ``keys``, ``at``: the keys and linearisation points of all variables.
+    """
 
     factors: tuple[gtsam.NonlinearFactor, ...]
     keys: frozenset[int]
@@ -62,12 +63,12 @@ class MarginalSummary:
         return oldest_pose(self.keys)
 
     def before_pose(self, pose: int) -> MarginalSummary:
-        """The summary without the poses from index ``pose`` on. Call this before new poses get the keys of removed poses."""
+        """Return the summary without poses from index ``pose`` on. Call this before new poses get the keys of these."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
-        """The factors of the summary on the variables with the keys ``present``. All other variables are marginalised out."""
+        """Return the factors of the summary on the variables ``present`` (keys), with all others marginalised out."""
         kept: list[gtsam.NonlinearFactor] = []
         linear, gone, at = gtsam.GaussianFactorGraph(), set[int](), to_gtsam(self.at)
         for factor in self.factors:
