@@ -64,7 +64,7 @@ def test_a_trajectory_comes_back_from_an_array_and_a_table(trajectory):
         fgloc.InputError, match=r"the array has the shape \(30, 2\), expected \(N, [48]\): a row for each"
     ):
         kind.from_numpy(trajectory.to_numpy()[:, :2])
-    with pytest.raises(fgloc.InputError, match=r"the array: pose 2 has the time .* s, expected one after that"):
+    with pytest.raises(fgloc.InputError, match=r"the array: pose 2 has the time .* s, expected a time after that"):
         kind.from_numpy(trajectory.to_numpy()[::-1])
     with pytest.raises(fgloc.InputError, match="the table has no column x, expected t, x, y"):
         kind.from_polars(table.drop("x"))
