@@ -98,12 +98,12 @@ def is_constant(key: int) -> bool:
 
 
 def index_of(key: int) -> int:
-    """The number of the pose, tilt, landmark or point with this key."""
+    """Return the ``index`` that the key of a pose, tilt, landmark or point was made from."""
     return key & ((1 << _CHARACTER) - 1)
 
 
 class Factor(Protocol):
-    """A factor that :func:`jacobian_factors` accepts."""
+    """The interface of factors for :func:`jacobian_factors`."""
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (m,) and one Jacobian (m, d) for each variable, at the ``values`` of the
@@ -125,8 +125,8 @@ class Stack(Protocol):
         """The index (M,) of the first pose that each of the M residuals depends on."""
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Linearise at ``poses`` (N, 3) and ``parameters`` (P,). Writes into ``residual`` (M,) and ``jacobian`` (M, 6 +
-        P): the derivatives with respect to the first pose, the next pose, and the parameters."""
+        """Linearise at ``poses`` (N, 3) and ``parameters`` (P,). Writes the whitened ``residual`` (M,), and its
+        ``jacobian`` (M, 6 + P) with respect to the first pose, the next pose, and the parameters."""
 
     def cost(self, poses: Array, parameters: Array) -> float:
         """Return the sum of the costs of all factors at ``poses`` (N, 3) and ``parameters`` (P,)."""
@@ -271,8 +271,7 @@ def _zeros(size: int) -> Array:
 
 
 def retract(key: int, value: Array, step: Array) -> Array:
-    """Return ``value`` moved by ``step``. If ``key`` is the key of a pose, the step is a twist in the body frame.
-    Otherwise it is added."""
+    """Return ``value`` moved by ``step``, which is a twist in the body frame if ``key`` is the key of a pose."""
     return se2.moved(value, step) if is_pose(key) else value + step
 
 
@@ -280,7 +279,8 @@ def frame_motions(values: Values) -> tuple[Array, list[int]]:
     """Return how all variables change when the whole solution moves in the world frame (the gauge freedom).
 
     The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to a
-    shift in x, a shift in y, and a rotation about the origin. The second result has the end row of each variable.
+    shift in x, a shift in y, and a rotation about the origin. The second result is the end row (exclusive) of each
+    variable.
     """
     parts = []
     for key, value in values.items():

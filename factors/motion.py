@@ -17,7 +17,7 @@ class Increment:
     """The relative motion of the robot between two times.
 
     ``delta`` (3,): the pose at the end in the frame of the pose at the start. ``covariance`` (3, 3): the covariance of
-    ``delta`` in the frame of the end. ``duration`` [s]: end minus start. ``still`` [s]: the part of it at rest.
+    ``delta`` in the frame of the end. ``duration`` [s]: end minus start. ``still`` [s]: the time at rest.
     """
 
     delta: Array
@@ -75,7 +75,7 @@ def poses_between(
     its body-frame covariance, and its duration.
     ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: the same from each estimated pose to
     the next one.
-    ``elsewhere`` (M-1,): True if a person carried the robot to the next estimated pose. It is then not used.
+    ``elsewhere`` (M-1,): True if a person carried the robot to the next pose, which is then not used before its time.
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
 
     The error of the odometry between two estimated poses is distributed in proportion to time.

@@ -105,12 +105,8 @@ def squared(errors: Array, covariances: Array) -> Array:
 
 
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
-    """One backward step of the smoother of Rauch, Tung and Striebel (1965), also for nearly singular covariances.
-
-    The arguments are those of :func:`factors.gaussian.smoothed`. If that function fails, the covariance is computed in
-    Joseph's form, a sum of positive semi-definite terms for any gain. Returns the correction (S,) of the filtered state
-    and its smoothed covariance (S, S).
-    """
+    """Compute :func:`factors.gaussian.smoothed` also for nearly singular covariances. If that function fails, the
+    smoothed covariance is computed in Joseph's form, which is positive semi-definite for any gain."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (covariance, transition, noise, change, later))
     try:
         correction, smoothed_covariance = gaussian.smoothed(*arrays)

@@ -208,11 +208,9 @@ def corrected(
 
 @compiled(error_model="numpy")
 def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
-    """The normalised innovation squared (K,) of each of K sightings.
-
-    ``residual`` (K, g): whitened. ``jacobian`` (K, g, D): by the components ``columns`` (D,) of the error state.
-    ``covariance`` (S, S): covariance of the error state.
-    """
+    """The normalised innovation squared (K,) of each of K sightings. ``residual`` (K, g): the whitened residuals.
+    ``jacobian`` (K, g, D): their Jacobian by the components ``columns`` (D,) of the error state. ``covariance`` (S, S):
+    the covariance of the error state."""
     size, wide = residual.shape[1], len(columns)
     out, left, whitened = np.zeros(len(residual)), np.empty((size, size)), np.empty(size)
     for k in range(len(residual)):

@@ -42,8 +42,8 @@ class Parameter:
 
 class LikelihoodTerms(NamedTuple):
     """A likelihood and its derivatives at given values of P parameters. ``cost``: the negative log-likelihood of all
-    measurements. ``scores`` (B, P): the gradient of the cost, as one summand for each of B time intervals.
-    ``information`` (P, P): the Fisher information of all measurements."""
+    measurements. ``scores`` (B, P): its gradient for the measurements in each of B time intervals, which add up to the
+    gradient of the cost. ``information`` (P, P): the Fisher information of all measurements."""
 
     cost: float
     scores: Array
@@ -111,11 +111,12 @@ def maximise(
     start: Mapping[str, float] | None = None,
     covariance: Array | None = None,
 ) -> Posterior:
-    """Estimate parameters by the maximum of their posterior density.
+    """Return the maximum a posteriori estimate of parameters.
 
     ``parameters``: P parameters with priors. ``likelihood``: returns the likelihood at parameter values (P,).
-    ``start``: initial values by name; the default is the mean of the prior.
-    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas of the parameters.
+    ``start``: initial values by name. The default is the mean of the prior.
+    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas of the
+    parameters.
     """
     mean, sigma, low, high = (
         np.array([getattr(p, name) for p in parameters], dtype=float) for name in ("mean", "sigma", "low", "high")
@@ -153,11 +154,10 @@ def independent_share(scores: Array, information: Array, precision: Array | floa
 
 
 def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Parameter], block: Integers) -> Likelihood:
-    """Make a likelihood of ``parameters`` from a function of residuals, with numerical derivatives and the soft-L1 loss.
+    """Make a likelihood of ``parameters`` from a function of residuals, by numerical derivatives and the soft-L1 loss.
 
     ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``block`` (M,):
-    the number of the time interval of each row of the residuals, from :func:`blocks`. Residuals of different intervals
-    count as independent.
+    the time interval of each row of the residuals, from :func:`blocks`. Different intervals count as independent.
     """
     steps = STEP * np.diag([p.sigma for p in parameters])
 
@@ -174,16 +174,16 @@ def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Param
 
 
 def by_block(scores: Array, block: Integers) -> Array:
-    """Sum the rows of ``scores`` (M, P) by their numbers ``block`` (M,). Row b of the result (B, P) is the sum of all
-    rows with number b."""
+    """Sum the rows of ``scores`` (M, P) that have equal numbers ``block`` (M,). Returns an array (B, P) with the sum of
+    the rows with number b in row b."""
     out = np.zeros((int(block.max(initial=0)) + 1, scores.shape[1]))
     np.add.at(out, block, scores)
     return out
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """Number time intervals of ``length`` seconds consecutively through several logs. ``times``: an array of times [s]
-    for each log. Returns the interval number of each time, concatenated over the logs."""
+    """Divide several logs into time intervals of ``length`` seconds, numbered consecutively. ``times``: an array of
+    times [s] for each log. Returns the interval number of each time, for all logs in one array."""
     out: list[Integers] = []
     first = 0
     for t in times:

@@ -92,7 +92,8 @@ def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float,
 def pixel(
     k: Lens, p0: float, p1: float, p2: float
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
-    """Project a point in the camera frame by the lens ``k``. Returns the pixel (u, v), and the gradients of u and v."""
+    """Project the point (p0, p1, p2) in the camera frame by the lens ``k``. Returns u and v of the pixel, and the
+    gradients of u and of v by the point."""
     near = 1.0 / max(p2, NEAREST)
     x, y = p0 * near, p1 * near
     xd, yd, xx, xy, yx, yy = _distorted(k, x, y)

@@ -79,7 +79,7 @@ def _log(probability: float) -> float:
 class TagStates:
     """Bayesian filters that estimate whether each of T tags is as in the map, dead, weak or moved.
 
-    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, with a sum below 1. Attributes:
+    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, below 1 in sum. Attributes:
     ``odds`` (T,) are the log-odds that each tag is dead, weak or moved. ``prior`` is the prior value of the log-odds.
     ``hypotheses`` (S, 4) is the result of :func:`hypotheses`. ``last_read`` [s] is the time of the last read.
     """
