@@ -1,5 +1,5 @@
-"""Common parts of the factors of landmarks, positions and image points: an offset between pose variable and
-measurement, and the marginalisation of all values except the pose."""
+"""Common parts of the factors of landmarks, positions and image points: the motion from the estimated pose to the pose
+at the time of the measurement, and the marginalisation of all variables except the pose."""
 
 from __future__ import annotations
 

@@ -3,11 +3,12 @@
 The cost is the negative log-likelihood of all logs, plus that of Gaussian priors. Damped Gauss-Newton steps minimise the cost over
 all parameters together, because parameters with similar effects, such as two kinds of drift, may be correlated.
 
-Measurements that are close in time have correlated errors. Time is therefore divided into blocks, which count as independent. The
-likelihood is multiplied by the fraction of independent information (Pauli, Racugno, Ventura, "Bayesian composite marginal
-likelihoods", Statistica Sinica 21, 2011). The covariance is computed from the scores (gradients of the log-likelihood) of the
-blocks (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986). Residuals have the soft-L1 loss
-(Charbonnier et al., "Two deterministic half-quadratic regularization algorithms for computed imaging", 1994).
+Measurements that are close in time have correlated errors. Time is therefore divided into intervals, which count as
+independent. The log-likelihood is multiplied by a factor of at most 1 (Pauli, Racugno, Ventura, "Bayesian composite
+marginal likelihoods", Statistica Sinica 21, 2011). The covariance is computed from the scores (gradients of the
+log-likelihood) of the intervals (Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+Residuals have the soft-L1 loss (Charbonnier et al., "Two deterministic half-quadratic regularization algorithms for
+computed imaging", 1994).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -115,7 +116,7 @@ def maximise(
 
     ``parameters``: P parameters with priors. ``likelihood``: returns the likelihood at parameter values (P,).
     ``start``: initial values by name. The default is the mean of the prior.
-    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas of the
+    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas in the
     parameters.
     """
     mean, sigma, low, high = (

@@ -53,7 +53,7 @@ class BearingRangeFactor:
     ``point_covariances`` (K, 2, 2): covariances of the landmarks of an inexact map. They are added to the noise.
     ``estimated``: indices in :data:`PARAMETERS` of the P sensor constants that are estimated.
     ``free``: True if the position of the landmark is estimated. Then K is 1, and the estimate replaces ``points``.
-    ``biased``: True if a bias of the ranges is estimated.
+    ``biased``: True if a bias in the ranges is estimated.
     ``twist`` (3,): the robot's body-frame velocity at the time of the measurement. Required if the time offset is
     estimated.
     ``simultaneous``: the number of all landmarks measured at this time, also by other factors. None means K. The
@@ -287,7 +287,7 @@ def landmark_update(
 
     ``pose`` (3,): the predicted pose. ``covariance`` (S, S): the covariance of the error state. Its first three
     components are the pose. ``constants`` (P,): corrections of the estimated sensor constants, which are the components
-    of the error state from index ``first`` on. ``iterations``, ``converged``: as of ``update_state``. Returns None if
+    of the error state from index ``first`` on. ``iterations``, ``converged``: as in ``update_state``. Returns None if
     ``update_state`` must be used: for a free landmark, a bias, or a numerically singular information form.
     """
     if factor.free or factor.biased:

@@ -94,7 +94,7 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
 def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
     """Return the whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH).
     ``poses`` (N, 3), ``points`` (N, 2) or (N, 3), ``ranges`` (N,), ``bearings`` (N,): the pose, the landmark and the
-    values of each measurement. ``model``: as of :func:`linearize`."""
+    values of each measurement. ``model``: as in :func:`linearize`."""
     error, jacobian = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, WIDTH))
     mounted, depth = (model[0], model[1], model[TURN]), model[DEPTH] > 0.0
     noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]

@@ -67,7 +67,7 @@ def append(
     """Append velocities to the ``count`` existing rows, integrate them into ``knots`` (the state at each row), and delete old rows.
 
     ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the
-    times. ``constants``: the model as an array. ``horizon`` [s]: as of :func:`without_old`. Returns the new count. If
+    times. ``constants``: the model as an array. ``horizon`` [s]: as in :func:`without_old`. Returns the new count. If
     the first new row is older than the last existing row, returns -1 and changes nothing.
     """
     if count and t[0] + delay < knots[count - 1, T]:

@@ -219,7 +219,7 @@ def linearize_all(
     the first pose, the second pose and the parameters of the graph into ``jacobian`` (3 K, 6 + P).
 
     ``poses`` (N, 3), ``first`` (K,): increment k is between the poses ``first[k]`` and ``first[k] + 1``.
-    ``constants``, ``indices``: as of :func:`factors.odometry.kernels.changed`.
+    ``constants``, ``indices``: as in :func:`factors.odometry.kernels.changed`.
     ``column``: the first column of the constants in the Jacobian.
     """
     deltas, twists, moving, whiteners = steps

@@ -2,8 +2,8 @@
 
 For Gaussian states and graphs the likelihood is exact and has derivatives (:mod:`factors.rfid.kernels`). For particles
 it comes from tables, without derivatives. The log-likelihood is tempered: it is multiplied by an exponent below 1,
-because reads are correlated. A tag is "as surveyed" if it works and is where the map has it. The likelihood of a tag
-that may be dead, weak or moved is a mixture (:mod:`factors.rfid.tag_states`).
+because reads are correlated. The likelihood of a tag that may be dead, weak or moved is a mixture
+(:mod:`factors.rfid.tag_states`).
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class RfidLikelihood:
     """The likelihood of read counts as a function of the robot's pose.
 
     ``model``: the antennas and their detection models. ``tags``: the tags of the map, or the tags on the robot if the
-    antennas of the model are fixed in the world. ``parameters`` (Q,): adjustments of detection models, mounting and
+    antennas in the model are fixed in the world. ``parameters`` (Q,): adjustments of detection models, mounting and
     clock (:mod:`factors.rfid.parameters`), initially zero. With M detection models and A antennas, Q is 2 M + A + 2.
     """
 
@@ -308,7 +308,7 @@ class RfidLikelihood:
 
     def robot_tables(self, finest: int, facings: int) -> RobotTables:
         """Compute tables of the read probability of each antenna over the tag's position in the robot frame.
-        ``finest``, ``facings``: as of :func:`factors.rfid.places.robot_tables`."""
+        ``finest``, ``facings``: as in :func:`factors.rfid.places.robot_tables`."""
         antennas = antennas_of(self.packed, self._unadjusted._tables)
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
@@ -322,7 +322,7 @@ class RfidLikelihood:
 
     def expected(self, pose: Array, counts: TagReadCounts, parameters: Array) -> ExpectedReads:
         """Return the observed and predicted reads of all tags in reach of a ``pose`` (3,) or listed in ``counts``.
-        ``parameters`` (Q,): as of the class."""
+        ``parameters`` (Q,): see the class."""
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:

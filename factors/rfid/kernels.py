@@ -87,8 +87,7 @@ def mixture(
     ``none``: the untempered negative log-likelihood that a tag out of range is never read.
 
     Returns four values: the factor that multiplies the derivatives of ``e``, the tempered negative log-likelihood, its
-    mean, and its variance. The loss of information by the unknown state is neglected (Louis, JRSS B 44(2), 1982, eq.
-    3.2').
+    mean, and its variance. The loss of information by the unknown state (Louis, JRSS B 44(2), 1982) is neglected.
     """
     if odds == -np.inf or elsewhere == -np.inf:
         return tempering, tempering * e, tempering * mean, tempering * variance
@@ -181,11 +180,12 @@ def _add_measurement(
     gradient: Array,
     information: Array,
 ) -> None:
-    """Convert the derivatives of one measurement to pose and parameters, and add them to ``gradient`` (D,), ``information`` (D, D).
+    """Convert the derivatives of one measurement, and add them to ``gradient`` (D,) and ``information`` (D, D).
 
-    ``pull`` (5,) and the lower triangle of ``curve`` (5, 5): gradient and information by the first five variables of
-    :func:`_add_tag`. ``at`` (8,): the antenna. ``offset`` (3,), ``twist`` (3,): the robot's pose in the frame of the reference
-    pose, and its velocity. ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated.
+    ``pull`` (5,), ``curve`` (5, 5): gradient and lower triangle of the information by the antenna's position (2) and
+    yaw, and by the parameters ``a`` and ``b`` of its model. ``at`` (8,): from :func:`place_measurements`. ``offset``
+    (3,), ``twist`` (3,): the robot's pose in the reference frame, and its velocity. ``columns`` (Q,): the component of
+    each parameter in the gradient, -1 if it is not estimated.
     """
     own, by, count = np.empty(MOST_COLUMNS, np.int64), np.zeros((MOST_COLUMNS, OF_READ)), 3
     own[0], own[1], own[2] = 0, 1, 2

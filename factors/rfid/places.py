@@ -56,7 +56,7 @@ class MissTable(NamedTuple):
     """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is
     relative to the log-likelihood that they miss a tag out of reach.
 
-    ``surveyed`` (H, S, S): untempered values of a tag at one of H heights that works and is where the map has it.
+    ``surveyed`` (H, S, S): untempered values of a tag at one of H heights that is as in the map.
     ``folded`` (H, S, S): tempered values of a tag that may be weak, moved or dead.
     ``cell`` [m]: the size of a cell. ``reach`` [m]: the distance beyond which both are zero.
     """
@@ -68,11 +68,11 @@ class MissTable(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """The reads of one likelihood evaluation. W tags are exceptional: they were read, or their odds differ from those of most tags.
+    """The reads for one evaluation of the likelihood. W tags are exceptional: they were read or have unusual odds.
 
     ``antennas`` (K,), ``rounds`` (K,): antenna and number of rounds of each measurement. ``hits`` (K, W): the number of
     reads of each exceptional tag. ``number`` (T,): for each tag, in the order of the spatial index, its number among
-    the exceptional tags, or -1. ``odds`` (W,), ``elsewhere`` (W,), ``unlisted_odds``: as of
+    the exceptional tags, or -1. ``odds`` (W,), ``elsewhere`` (W,), ``unlisted_odds``: as in
     :class:`~factors.rfid.detection.TagReadCounts`, with the exceptional tags listed.
     """
 

@@ -299,7 +299,7 @@ def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tupl
 
 @compiled
 def _add_group(psi: Array, by: Array, offset: float, gradient: Array, information: Array) -> None:
-    """Add one group of R reads to ``gradient`` (3,) and ``information`` (3, 3), for a concentration kappa of 1.
+    """Add the derivatives of R reads in a group to ``gradient`` (3,) and ``information`` (3, 3), for a kappa of 1.
     ``psi`` (R,): phase errors. ``by`` (R, 3): their derivatives by the pose. ``offset``: the mean phase error."""
     total, mean = 0.0, np.zeros(3)
     for r in range(len(psi)):
@@ -384,7 +384,7 @@ def strength_scores(problem: StrengthProblem, poses: Array, derivatives: bool) -
             if not derivatives:
                 continue
             for i in range(3):
-                # x, y: a motion of the antenna changes the vector by the opposite; heading: vector and facing rotate backwards
+                # a motion of the robot moves the vector to the tag, and the tag's facing, in the opposite direction
                 dx, dy, dnx, dny = -1.0 if i == 0 else 0.0, -1.0 if i == 1 else 0.0, 0.0, 0.0
                 if i == 2:
                     dx, dy, dnx, dny = ey + at[1], -ex - at[0], ny, -nx

@@ -35,7 +35,7 @@ CELL = 0.05  # m; size of a cell of a table
 COARSE = 8  # number of cells along each side of a block; the largest value of a block is stored
 FACINGS = 9  # number of layers, for evenly spaced cosines of the facing from -1 to 1
 NEGLIGIBLE = 15.0  # logarithm of the ratio of two likelihoods above which the smaller one is neglected
-NO_MATTER = 1e-3  # a tag is neglected if its log-likelihood differs by less from the value of a tag out of reach
+NO_MATTER = 1e-3  # a tag is neglected if its log-likelihood is closer to that of a tag out of reach
 SCATTERED = 2.0  # m; blocks can exclude a tag if its position relative to an antenna differs by less among particles
 STEP, LEVEL = 0.01, 0.04  # resolution of logits in the tables, and the height [m] within which tags have one table
 _LOGITS = np.arange(round(-2.0 * NEGLIGIBLE_LOGIT / STEP) + 1) * STEP + NEGLIGIBLE_LOGIT
@@ -220,7 +220,7 @@ def relevant(
     measurements and the data of T tags.
 
     The mask is True for near tags that were read, and for near tags with a relevant read probability in the blocks of
-    the tables. In a dense map this excludes most tags. All tags on a robot are relevant.
+    the tables. All tags on a robot are relevant.
     """
     offsets, antennas, rounds = measured
     points, _, levels, hits = tags

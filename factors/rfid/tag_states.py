@@ -50,7 +50,7 @@ MOST_MOVED = 0.15
 # The kinds of weak tags. Each row has the changes of the parameters a and b of a detection model (factors.rfid.parameters), which
 # are the logarithm of the range and the logit of the read rate, and the fraction of weak tags of this kind.
 WEAKNESSES = np.array(((0.0, -2.4, 0.5), (0.0, -3.7, 0.1), (-0.5, 0.0, 0.2), (-0.5, -1.0, 0.2)))
-# Columns of the weights: as surveyed, dead, each kind of weak from WEAK on, and each displacement from MOVED on.
+# Columns of the weights: as in the map, dead, each kind of weak from WEAK on, and each displacement from MOVED on.
 DEAD, WEAK, MOVED = 1, 2, 2 + len(WEAKNESSES)
 COLUMNS = {"dead": slice(DEAD, WEAK), "weak": slice(WEAK, MOVED), "moved": slice(MOVED, None)}
 
@@ -64,8 +64,8 @@ def displacements() -> Array:
 
 
 def hypotheses() -> Array:
-    """The S states of a tag that is not dead: as surveyed, each kind of weak, each displacement. A row (4,) has the displacement
-    (2) [m], and the changes of the parameters a and b of the detection model (:mod:`factors.rfid.parameters`)."""
+    """Return the S states (S, 4) of a tag that is not dead: as in the map, each kind of weak, each displacement. A row
+    has the displacement (2) [m], and the changes of the parameters a and b of :mod:`factors.rfid.parameters`."""
     weak, moves = WEAKNESSES[:, :2], displacements()
     still, usual = np.zeros_like(weak), np.zeros_like(moves)
     return np.concatenate((np.zeros((1, 4)), np.hstack((still, weak)), np.hstack((moves, usual))))

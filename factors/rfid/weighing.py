@@ -202,7 +202,7 @@ def weigh_tag(
 ) -> None:
     """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
 
-    ``at``, ``models``, ``measured``: as of :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of
+    ``at``, ``models``, ``measured``: as in :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of
     measurements to evaluate. ``product`` (N,), ``room`` (N,): working memory.
     """
     points, normals, levels, hits = tags
