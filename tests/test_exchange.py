@@ -128,7 +128,7 @@ def test_every_kind_of_message_has_a_pose():
     with pytest.raises(fgloc.InputError, match="message 2 is of type SimpleNamespace, expected PoseStamped"):
         fgloc.from_ros([messages[0], stamped(2)])
     with pytest.raises(
-        fgloc.InputError, match="the messages: pose 2 has the time 1700000001000000005 ns, expected one"
+        fgloc.InputError, match="the messages: pose 2 has the time 1700000001000000005 ns, expected a time"
     ):
         fgloc.Trajectory.of(fgloc.from_ros([messages[0], messages[0]]))
     with pytest.raises(fgloc.InputError, match="contains no poses"):

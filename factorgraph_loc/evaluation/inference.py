@@ -27,7 +27,7 @@ from factorgraph_loc.evaluation.warned import Row
 from factors import chi_squared
 from factors.se2 import Array
 
-SIGNIFICANT = 1.0 - CONFIDENCE  # p values below are significant
+SIGNIFICANT = 1.0 - CONFIDENCE  # a p value below this is significant
 _EXACT = 60  # maximum number of pairs for which the signed-rank distribution is computed exactly
 
 # columns of the table of differences and their types; the types are needed if the table is empty
@@ -47,8 +47,8 @@ class Pooled:
     """A score of a method, pooled over the seeds and logs of many runs.
 
     ``low``, ``high``: 95 % interval of ``value``, None if there are too few units. ``units``: "logs" are the
-    independent units, or "seeds" for a single log. ``count``: number of units. ``least``, ``most``: range over the
-    units. ``logs``: number of logs.
+    independent units, or "seeds" for a single log. ``least``, ``most``: smallest and largest score of a unit.
+    ``count``, ``logs``: numbers of units and logs.
     """
 
     value: float
@@ -242,10 +242,10 @@ def independent_count(values: Array) -> float:
 
 
 def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float, float]:
-    """Return the 95 % interval of the NEES of a consistent estimator, averaged over each log and then over logs.
+    """Return the 95 % interval of the mean NEES of a consistent estimator. The mean is over each log, and then over the logs.
 
-    ``counts``: by log, the effective number of independent values. ``dofs``: by log, the degrees of freedom of a pose.
-    The distribution is approximated by a scaled chi-square distribution with the same mean and variance.
+    ``counts``: by log, the effective number of independent values. ``dofs``: by log, the degrees of freedom of a pose. The
+    distribution is approximated by a scaled chi-square distribution with the same mean and variance.
     """
     expected = float(np.mean(dofs))
     matched = (expected * len(dofs)) ** 2 / float(np.sum(np.asarray(dofs) / np.asarray(counts, dtype=float)))
@@ -272,7 +272,8 @@ def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> l
 
 
 def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:
-    """Return the units, "logs" or "seeds", and True if there are enough of them for intervals and tests."""
+    """Return the independent units, "logs", or "seeds" for a single log, and True if they are enough for intervals and
+    tests."""
     if len(clusters) == 1:
         return "seeds", len(clusters[0]) >= ENOUGH_LOGS
     return "logs", len(clusters) >= ENOUGH_LOGS

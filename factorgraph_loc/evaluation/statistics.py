@@ -110,7 +110,7 @@ class Interval:
 
 
 def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
-    """Compare the frequencies of an event with two methods in the same N cases by McNemar's exact test.
+    """Return the result of McNemar's exact test: is an event equally frequent with two methods in the same N cases?
 
     ``a``, ``b`` (N,): masks of the cases that have the event with method a, and with method b.
     """
@@ -130,17 +130,18 @@ def quantile(values: ArrayLike, share: float) -> float:
 
 
 def median_difference(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Return the median of ``a`` (N,) minus that of ``b`` (N,), with its interval. Both have values of the same N cases.
+    """Return the median of ``a`` (N,) minus that of ``b`` (N,), with its interval. Values may be infinite.
 
-    Values may be infinite.
+    ``a`` and ``b`` have a value for each of the same N cases.
     """
     return _of_medians(np.subtract, a, b, lowest=-math.inf)
 
 
 def median_ratio(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Return the median of ``a`` (N,) divided by that of ``b`` (N,), with its interval. Both have values of the same N cases.
+    """Return the median of ``a`` (N,) divided by that of ``b`` (N,), with its interval. Values may be infinite, but not
+    negative.
 
-    Values must not be negative, and may be infinite.
+    ``a`` and ``b`` have a value for each of the same N cases.
     """
     return _of_medians(np.divide, a, b, lowest=0.0)
 

@@ -18,7 +18,7 @@ from factorgraph_loc.evaluation.scores import REPORT, TIMINGS, Metric, metric_of
 from factorgraph_loc.evaluation.warned import WARNINGS
 from factorgraph_loc.files.models import write_text
 
-SHOWN = 8  # maximum number of variants whose trajectories are visible initially
+SHOWN = 8  # maximum number of variants with trajectories that are visible initially
 _SWEPT = 3  # maximum number of metrics that are plotted over a swept setting
 
 
