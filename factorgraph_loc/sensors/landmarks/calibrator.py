@@ -1,4 +1,4 @@
-"""Calibration of a landmark sensor: its constants and its noise are estimated from sightings along reference trajectories."""
+"""Calibration of a landmark sensor: constants and noise are estimated from sightings along reference trajectories."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
 MAX_OFFSET = 0.5  # s; largest offset between the clocks of the sensor and the reference
-GROSS = 4.0  # minimum ratio of the standard deviations of gross and of normal errors
-SEPARATIONS = 20  # steps of expectation-maximisation
+GROSS = 4.0  # minimum standard deviation of gross errors, as a multiple of that of normal errors
+SEPARATIONS = 20  # number of iterations of expectation-maximisation
 SMALLEST = 1e-3  # m, rad, m per m; minimum standard deviation
 MIN_SIGHTINGS = 100
 MOST_SIGHTINGS = 12000  # largest number of sightings that are used per log
-# the kind of ranges (distance or depth) is changed if the other kind reduces the range errors to less than this fraction
+# the setting ``range_kind`` (distance or depth) is changed if this reduces the range errors to less than this fraction
 BETTER_KIND = 0.9
 SIGMAS = ("range_sigma", "range_sigma_relative", "bearing_sigma")
 WINDOW = 10.0  # s; errors of the sightings in different windows are treated as independent
-FIRST = BearingRangeSettings(range_sigma=0.1)  # initial settings if the rig has none
+FIRST = BearingRangeSettings(range_sigma=0.1)  # initial settings if the rig lacks the section
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Sightings:
     """K sightings of mapped landmarks in one log.
 
     ``t`` (K,): timestamps [s] by the sensor's clock. ``points`` (K, 2): positions of the landmarks [m] in the world
-    frame, or (K, 3) with heights above the sensor. ``ranges`` (K,) [m] and ``bearings`` (K,) [rad]: NaN if not
-    measured. ``sound`` (K, 2): the probabilities that range and bearing are not gross errors.
+    frame, or (K, 3) with heights above the sensor. ``ranges`` (K,) [m], ``bearings`` (K,) [rad]: NaN if not measured.
+    ``sound`` (K, 2): the probabilities that the range and the bearing are inliers.
     """
 
     log: Log
@@ -60,9 +60,8 @@ class Sightings:
     sound: Array
 
     def whitened(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Return range and bearing residuals (K, 2), predicted minus measured, in standard deviations. They are zero if
-        not measured.
-        ``moved`` (3,): a body-frame perturbation (x, y, heading) that is applied to all reference poses."""
+        """Return range and bearing residuals (K, 2), predicted minus measured, in standard deviations. Residuals are 0
+        if not measured. ``moved`` (3,): a body-frame perturbation that is applied to all reference poses."""
         assert self.log.reference is not None
         poses = self.log.reference.at(self.t + settings.time_offset)
         if np.any(moved):
@@ -70,11 +69,11 @@ class Sightings:
         return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
 
     def residuals(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Return :meth:`whitened` residuals (K, 2), multiplied by the root of the probability ``sound``."""
+        """Return :meth:`whitened` residuals (K, 2), multiplied by the square root of ``sound``."""
         return np.sqrt(self.sound) * self.whitened(settings, moved)
 
     def errors(self, settings: BearingRangeSettings) -> Array:
-        """Return range and bearing residuals (K, 2) in m and rad, predicted minus measured. They are NaN if not measured."""
+        """Return range and bearing residuals (K, 2) [m, rad], predicted minus measured, NaN if not measured."""
         out = self.whitened(settings) * bearing_range.sigmas(settings.model(), self.ranges)
         out[np.isnan(self.ranges), 0] = np.nan
         out[np.isnan(self.bearings), 1] = np.nan
@@ -82,10 +81,10 @@ class Sightings:
 
 
 def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]:
-    """Estimate the noise of ``errors`` (K,) that include gross errors. NaN marks an error that is not measured.
+    """Estimate the standard deviation of the inliers among ``errors`` (K,), which may include gross errors and NaN.
 
-    Returns the constant and the relative part of the standard deviation, and the probability (K,) that each error is not gross.
-    The standard deviation at range r is the root of constant^2 + (relative r)^2. ``ranges`` (K,): measured ranges [m].
+    Returns (constant, relative), and the probability (K,) that each error is an inlier. The standard deviation at range
+    r is sqrt(constant^2 + (relative r)^2). ``ranges`` (K,): measured ranges [m].
 
     A mixture of two zero-mean Gaussians is fitted by expectation-maximisation, which starts from the median absolute
     error (McLachlan and Peel, "Finite mixture models", 2000, section 3.2). The wider Gaussian models the gross errors.
@@ -110,10 +109,10 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
 
 
 def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
-    """Return the constant and the relative part of the standard deviation of ``errors`` (K,) with ``weights`` (K,).
+    """Return (constant, relative) of :func:`separated` for ``errors`` (K,) with ``weights`` (K,).
 
-    One step of Fisher scoring from ``start``, the previous values of both (Nelder and Pregibon, "An extended
-    quasi-likelihood function", Biometrika 74(2), 1987).
+    This is one step of Fisher scoring from ``start``, the values of the previous step (Nelder and Pregibon, "An
+    extended quasi-likelihood function", Biometrika 74(2), 1987).
     """
     design = np.column_stack((np.ones(len(errors)), ranges**2))
     root = np.sqrt(weights) / (design @ np.square(start))
@@ -128,9 +127,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     first, rounds = FIRST, 4
 
     def part(self, log: Log) -> Sightings:
-        """Return the sightings of mapped landmarks at least ``MAX_OFFSET`` inside the time span of the reference. If
-        there are more than ``MOST_SIGHTINGS``, only every n-th timestamp is used. Raises InputError if there are fewer
-        than ``MIN_SIGHTINGS``."""
+        """Return the sightings of mapped landmarks during the reference, without its first and last ``MAX_OFFSET``
+        seconds. At most about ``MOST_SIGHTINGS`` are returned. Raises InputError for fewer than ``MIN_SIGHTINGS``."""
         stream, reference = log.streams["bearing_range"], log.reference
         assert isinstance(stream, BearingRangeStream)
         assert reference is not None
@@ -151,8 +149,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return Sightings(log, stream.t[rows], points, stream.range[rows], bearings[rows], np.ones((len(rows), 2)))
 
     def parameters(self, parts: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
-        """Return the constants to estimate, each with a prior around the rig's value. Without reference headings the
-        mounting and the time offset are not estimated."""
+        """Return the constants to estimate, each with a prior around its value in ``settings``. If the reference has no
+        headings, the position on the robot and the time offset are not estimated."""
         has_range = any(np.isfinite(part.ranges).any() for part in parts)
         has_bearing = any(np.isfinite(part.bearings).any() for part in parts)
         has_heading = all(part.log.reference is not None and part.log.reference.has_heading for part in parts)
@@ -169,8 +167,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings]:
-        """Return the sightings with new probabilities ``sound``, and the settings with the noise of the errors that are
-        not gross."""
+        """Estimate the noise without gross errors. Returns the sightings with new probabilities ``sound``, and the
+        settings with new noise."""
         errors = np.concatenate([part.errors(settings) for part in parts])
         ranges = np.nan_to_num(np.concatenate([part.ranges for part in parts]))
         sigmas, sound = dict[str, float](), np.ones(errors.shape)
@@ -186,10 +184,9 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def estimated(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings, Posterior | None]:
-        """Return ``parts`` and ``settings`` with the estimates of the best fit, and its posterior.
+        """Return ``parts`` and ``settings``, both updated with the best fit, and the posterior of the constants.
 
-        Ranges are fitted as distances and as depths. A kind of range other than the one in ``settings`` is chosen only
-        if its range errors are clearly smaller (``BETTER_KIND``).
+        The fit is repeated with the other ``range_kind``, distance or depth. The better of the two fits is returned.
         """
         given = super().estimated(parts, settings)
         if not any(np.any(np.isfinite(part.ranges) & np.isfinite(part.bearings)) for part in parts):
@@ -200,7 +197,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return changed if new < BETTER_KIND * old else given
 
     def finished(self, parts: Sequence[Sightings], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the result with standard deviations that are enlarged, because errors within a time window are correlated."""
+        """Return the result with enlarged noise, because the errors in a time window are correlated. See
+        :func:`pose_share`."""
         scatter: BearingRangeSettings = rig.bearing_range
         factor = pose_share(parts, scatter) ** -0.5
         wider = {name: factor * getattr(scatter, name) for name in SIGMAS}
@@ -213,7 +211,7 @@ class LandmarkCalibrator(ConstantsCalibrator):
 
 
 def _residuals(part: Sightings, settings: BearingRangeSettings) -> Residuals:
-    """Return the errors of ranges and bearings of one log for the report."""
+    """Return the errors of ranges and bearings in one log, for plots."""
     sigmas = bearing_range.sigmas(settings.model(), part.ranges)
     units = {"range": "m", "bearing": "rad"}
     return Residuals(part.log.name, units, part.t, part.ranges, part.errors(settings), sigmas)
@@ -223,8 +221,8 @@ CALIBRATOR = LandmarkCalibrator()
 
 
 def pose_share(parts: Sequence[Sightings], settings: BearingRangeSettings) -> float:
-    """Return the fraction of the sightings' information on the pose that is left after correlated errors are accounted
-    for. See :func:`independent_share`."""
+    """Return the information of the sightings on the pose, divided by the information if all errors were independent.
+    The result is at most 1. See :func:`independent_share`."""
 
     def residuals(moved: Array) -> Array:
         return np.concatenate([part.residuals(settings, moved) for part in parts])

@@ -24,28 +24,27 @@ from factors.motion import ChainState, propagate
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
-MOST = 1000  # stored sightings of a landmark
-USED = 80  # largest number of sightings that a position is computed from, evenly spaced
-DRIFT = 0.2  # rad; older sightings are not used if the standard deviation of the rotation since then exceeds this
-APART = 0.1  # m; the last sighting is replaced by the next one if the robot had moved less than this before it
-FEWEST, GROWTH = 8, 1.25  # number of sightings at the first attempt, and its factor from one attempt to the next
+MOST = 1000  # maximum number of stored sightings of a landmark
+USED = 80  # maximum number of sightings from which a position is computed, evenly selected
+DRIFT = 0.2  # rad; sightings are too old if the standard deviation of the rotation since then exceeds this
+APART = 0.1  # m; minimum motion of the robot between stored sightings
+FEWEST, GROWTH = 8, 1.25  # number of sightings for the first attempt; factor by which each attempt needs more
 DIRECTIONS = 24  # number of initial positions on a circle around the robot
 RADII = (1.0, 3.0, 10.0, 30.0)  # m; radii of the initial positions if there is no range
-ITERATIONS, REFINEMENTS = 20, 8  # largest numbers of iterations, with independent and with correlated odometry errors
-CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m; iterations end if a step is shorter than CONVERGED; longest step
+ITERATIONS, REFINEMENTS = 20, 8  # maximum number of iterations with independent, and with correlated odometry errors
+CONVERGED, LONGEST_STEP = 1e-3, 5.0  # m; a step below CONVERGED is the last one; longer steps are shortened
 FLAT = 1e-4 * np.eye(2)  # information of the nearly flat prior [1/m^2]
-NEAR, MOST_FUSED = 0.5, 8  # m; minimum distance between distinct positions; largest number of distinct positions
-# the best position is unambiguous if the loss of each other position is larger by MARGIN, which is multiplied by the median squared
-# residual over TYPICAL if that is above 1
+NEAR, MOST_FUSED = 0.5, 8  # minimum distance [m] and maximum number of positions to refine with correlated errors
+# minimum difference of the losses of the best and the next position (more if residuals are larger than predicted)
 MARGIN = 12.0
-TYPICAL = 0.455  # median of the square of a standard normal residual
-MISFIT = 2.0  # if the mean loss of a sighting is above this, the best position is rejected
-ACCURATE, SHARE = 0.3, 0.15  # largest accepted standard deviation: m, or fraction of the distance if larger
+TYPICAL = 0.455  # median of the square of a standard normal variable
+MISFIT = 2.0  # the best position is rejected if the mean loss per sighting exceeds this
+ACCURATE, SHARE = 0.3, 0.15  # maximum standard deviation: the larger of ACCURATE [m] and SHARE times the distance
 
 
 class PartialSighting(NamedTuple):
-    """A sighting with a range [m] or a bearing [rad]; the missing value is NaN. ``odometry``: the odometry state at its
-    time."""
+    """A sighting of a landmark with ``range`` [m] alone or ``bearing`` [rad] alone. The other value is NaN.
+    ``odometry``: the odometry state at the time of the sighting."""
 
     odometry: ChainState
     range: float
@@ -55,8 +54,8 @@ class PartialSighting(NamedTuple):
 class LocatedPoint(NamedTuple):
     """An estimated position of a landmark.
 
-    ``point`` (2,) [m] with ``covariance`` (2, 2): in the frame of the robot at the last sighting. ``loss``: the
-    negative log-likelihood of the sightings at that point. ``squared``: the median of their squared residuals.
+    ``point`` (2,) [m] with ``covariance`` (2, 2): the position in the robot frame at the last sighting. ``loss``: the
+    negative log-likelihood of the sightings. ``squared``: the median of the squared residuals of the sightings.
     """
 
     point: Array
@@ -67,18 +66,19 @@ class LocatedPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Candidate:
-    """The sightings of a landmark whose position is not known yet.
+    """All sightings of one landmark with an unknown position. Immutable.
 
-    Immutable, because filters go back to an earlier state when a measurement is late. ``sightings``: in order of time.
-    ``sources``: for each sighting, an object that the caller makes a factor of, once the landmark is located.
-    ``due``: the next attempt to locate the landmark is made after this number of sightings."""
+    ``sightings``: in order of time. ``sources``: the object that the caller passed with each sighting. ``due``: the
+    number of sightings that the next attempt to locate the landmark needs.
+    """
 
     sightings: tuple[PartialSighting, ...] = ()
     sources: tuple[object, ...] = ()
     due: float = FEWEST
 
     def plus(self, sighting: PartialSighting, source: object) -> Candidate:
-        """Return a candidate with a further sighting. It replaces the last one if the last two are closer than APART."""
+        """Return a copy with a further sighting and any object ``source`` that belongs to the sighting. The previous
+        sighting is discarded if the robot had moved less than APART before it."""
         end = len(self.sightings)
         if end > 1:
             previous, last = (np.array(s.odometry[1:3]) for s in self.sightings[-2:])
@@ -88,17 +88,17 @@ class Candidate:
 
     @property
     def is_due(self) -> bool:
-        """True if there are enough sightings for the next attempt to locate the landmark."""
+        """True if the number of sightings is sufficient for an attempt to locate the landmark."""
         return len(self.sightings) >= self.due
 
     def tried(self) -> Candidate:
-        """Return the candidate after a failed attempt. The next attempt requires more sightings."""
+        """Return a copy for which the next attempt needs more sightings. Call this after a failed attempt."""
         return replace(self, due=min(GROWTH * len(self.sightings), MOST))
 
     def position(
         self, model: BearingRangeModel, motion: Motion, constants: Array, uncertainty: Array
     ) -> LocatedPoint | None:
-        """Return the position that explains the sightings. Returns None if no position explains them, or if several do.
+        """Return the estimated position of the landmark, or None if no position or several positions fit the sightings.
 
         ``model``: the model of the sensor. ``motion``: the odometry. ``constants`` (P,) with covariance ``uncertainty``
         (P, P): estimated calibration constants of the odometry.
@@ -116,9 +116,9 @@ class Candidate:
 
 
 class _PathSightings:
-    """K sightings of one landmark along a path that is known from odometry.
+    """Locates one landmark from K sightings along a path. The odometry gives the path.
 
-    All positions and poses are in the frame of the robot at the last sighting.
+    All positions and poses are in the robot frame at the last sighting.
     """
 
     def __init__(
@@ -146,16 +146,16 @@ class _PathSightings:
         self._ranges, self._bearings = np.array([row.range for row in used]), np.array([row.bearing for row in used])
         self._is_measured = ~np.isnan(np.column_stack((self._ranges, self._bearings)))
         self._back = se2.inverse(np.array(forth)[back])  # poses of the robot at the sightings
-        # matrices (K, 3, 3) from an error of the path to the error of the pose at a sighting
+        # matrices (K, 3, 3) from an error of the motion since a sighting to an error of the pose at the sighting
         self._carried = se2.adjoint(np.array(forth)[back])
-        # covariance (K, K, 3, 3) of the path errors: the errors of two poses have the error since the later pose in common
+        # covariance (K, K, 3, 3) of the motion errors: those of two sightings share the error since the later sighting
         self._common = np.array(covariances)[np.minimum(back[:, None], back)]
         turns = np.array(by_constants)[back]
         self._common += np.einsum("iap,pq,jbq->ijab", turns, uncertainty, turns)
 
     def positions(self) -> list[LocatedPoint]:
-        """Return possible positions of the landmark, sorted by loss: the distinct local optima, and a position that is
-        refined from the mirror image of the best of them."""
+        """Return possible positions of the landmark, sorted by loss. They are the local optima, and one optimum that is
+        found from the mirror image of the best one."""
         starts = self._starts()
         points = self._refined(starts)
         points = points[np.argsort(self._losses(points))]
@@ -163,8 +163,8 @@ class _PathSightings:
         return sorted((self._fused(point) for point in (*distinct, self._mirrored(points[0]))), key=_loss)
 
     def _starts(self) -> Array:
-        """Return initial positions (N, 2) on circles around the robot. Their radius is the last range, or RADII without
-        ranges."""
+        """Return initial positions (N, 2) on a circle around the robot. The radius is the last range. Without ranges,
+        the positions are on circles with the radii RADII."""
         known = self._ranges[self._is_measured[:, 0]] / self._model.range_scale
         angles = np.arange(DIRECTIONS) * 2.0 * np.pi / DIRECTIONS
         circle = np.column_stack((np.cos(angles), np.sin(angles)))
@@ -172,16 +172,16 @@ class _PathSightings:
         return np.concatenate([radius * circle for radius in radii])
 
     def _mirrored(self, point: Array) -> Array:
-        """Return the mirror image (2,) of a position at the line that is fitted to the path."""
+        """Return the mirror image (2,) of the position ``point`` (2,) at the straight line that fits the path best."""
         middle = self._back[:, :2].mean(axis=0)
         ahead = np.linalg.svd(self._back[:, :2] - middle)[2][0]
         away = point - middle
         return np.asarray(middle + 2.0 * (away @ ahead) * ahead - away)
 
     def _linearized(self, points: Array, path: Array | None = None) -> tuple[Array, Array]:
-        """Return residuals (N, K, 2) at positions (N, 2), in standard deviations of the sensor, and their Jacobians (N,
-        K, 2, 11). The columns are those of :func:`linearize_each`. ``path`` (K, 3): the poses at the sightings, by
-        default from odometry."""
+        """Return residuals (N, K, 2), whitened by the sensor noise, and their Jacobians (N, K, 2, 11), with columns as
+        in :func:`linearize_each`. ``points`` (N, 2): positions of the landmark. ``path`` (K, 3): the robot's poses at
+        the sightings, by default from odometry."""
         count, size = self.count, len(points)
         sightings = np.repeat(points, count, axis=0), np.tile(self._ranges, size), np.tile(self._bearings, size)
         poses = np.tile(self._back if path is None else path, (size, 1))
@@ -189,8 +189,8 @@ class _PathSightings:
         return error.reshape(size, count, 2), jacobian.reshape(size, count, 2, -1)
 
     def _widened(self, points: Array) -> tuple[Array, Array]:
-        """Return residuals (N, K, 2) at positions (N, 2), and their Jacobians (N, K, 2, 2) by the position. Both are
-        divided by the standard deviation that results from sensor noise and odometry error."""
+        """Return residuals (N, K, 2) at landmark positions ``points`` (N, 2), and their Jacobians (N, K, 2, 2) by the
+        position. Both are divided by the standard deviation of sensor noise and odometry error."""
         error, jacobian = self._linearized(points)
         by_path = jacobian[..., :POINT] @ self._carried
         numbers = np.arange(self.count)
@@ -203,7 +203,8 @@ class _PathSightings:
         return np.asarray(geman_mcclure_loss(squared, self._model.robust).sum(axis=1))
 
     def _refined(self, starts: Array) -> Array:
-        """Return positions (N, 2) refined by Levenberg-Marquardt. The odometry errors are treated as independent noise."""
+        """Return local optima (N, 2) of the landmark position, by Levenberg-Marquardt from ``starts`` (N, 2). The
+        odometry errors of different sightings are treated as independent."""
 
         def at(points: Array, _: Integers) -> tuple[Array, Array, Array]:
             error, jacobian = self._widened(points)
@@ -216,11 +217,11 @@ class _PathSightings:
         return minima(at, starts, ITERATIONS, CONVERGED, largest=LONGEST_STEP).states
 
     def _fused(self, point: Array) -> LocatedPoint:
-        """Refine a position (2,) with the path as an unknown that is marginalised.
+        """Return a position refined from ``point`` (2,) with correlated odometry errors. The path is marginalised.
 
-        Residuals e in standard deviations of the sensor have the covariance R = I + J C J'. C is the covariance of the
-        path, and J is the Jacobian of e by the path. The most likely path has residuals R^-1 e, and differs from the
-        odometry by -C J' R^-1 e. Residuals are linearised on that path.
+        Let e be the residuals, whitened by the sensor noise, J their Jacobian by the path, and C the covariance of the
+        path. The covariance of e is R = I + J C J'. The most likely path differs from the odometry by -C J' R^-1 e. The
+        residuals are linearised on that path.
         """
         measured, weight, change = self._is_measured, np.ones(self.count), np.zeros((self.count, 3))
         row_of = np.nonzero(measured)[0]
@@ -253,7 +254,7 @@ def _loss(position: LocatedPoint) -> float:
 
 
 def _distinct(points: Array) -> list[Array]:
-    """Return the rows of ``points`` (N, 2) without those within NEAR of an earlier kept row."""
+    """Return the rows of ``points`` (N, 2) that are more than NEAR [m] away from all previously returned rows."""
     kept: list[Array] = []
     for point in points:
         if all(np.hypot(*(point - earlier)) > NEAR for earlier in kept):

@@ -1,4 +1,4 @@
-"""Localization from identified landmarks alone, at an unknown start or after a kidnapping; and detection of a lost track.
+"""Global localization from identified landmarks alone, and detection of a wrong estimated pose.
 
 The odometry relates the sightings of the last minute to the present pose. Candidate poses are generated from few
 sightings: one landmark gives a circle around it, two landmarks give the alignment of two points. All sightings score
@@ -37,36 +37,36 @@ from factors.se2 import Array
 from factors.update import GATE
 
 DURATION = 60.0  # s; older sightings are not used
-INTERVAL = 1.0  # s; sightings of one landmark that are closer have nearly equal errors, so only one is used
-ROWS = 60  # largest number of sightings in a search
-REFINED = 24  # number of candidates that are refined
-# squared Mahalanobis distances: hypotheses closer than SAME are equal; one is rejected if refinement moves it by DIVERGED
+INTERVAL = 1.0  # s; minimum time between the sightings of one landmark, because errors at nearly equal times are equal
+ROWS = 60  # maximum number of sightings in a search
+REFINED = 24  # maximum number of candidates that are refined
+# squared Mahalanobis distances: closer hypotheses are merged; an unambiguous one must not move further when refined
 SAME, DIVERGED = 9.0, 25.0
 NEGLIGIBLE = 1e-3  # hypotheses with a smaller weight are discarded
-MARGIN = 5.0  # m; largest assumed distance of the robot from the bounding box of the map's landmarks
+MARGIN = 5.0  # m; maximum distance of the robot from the bounding box of the landmarks
 WIDE = 3.0  # m; a hypothesis with a larger standard deviation is not treated as Gaussian
-# a hypothesis refutes the track if it explains this many landmarks and this fraction of the sightings,
-# and if its robust loss is smaller by REFUTED times the largest possible loss
+# the estimated pose is rejected if a hypothesis explains this many landmarks and this fraction of the sightings, and if
+# its robust loss is lower than that of the estimated pose by this fraction of the maximum loss
 REFUTING_LANDMARKS, REFUTING_SHARE, REFUTED = 3, 0.8, 0.5
 
-# an unambiguous hypothesis has at least this weight, explains this many sightings, and has no larger standard deviations than
-# CLEAR_POSITION [m] (or the standard deviation of a range, if larger) and CLEAR_HEADING [rad]
+# minimum weight and number of explained sightings of an unambiguous hypothesis, and its maximum standard deviations
+# [m, rad]; the limit of the position is at least the standard deviation of a range
 CLEAR_WEIGHT, CLEAR_SIGHTINGS = 0.99, 4
 CLEAR_POSITION, CLEAR_HEADING = 0.3, 0.15
 FOUND_HEADING = 0.3  # rad; replaces CLEAR_HEADING if the start position is known
-STAMPS, MONITORED = 4, 2.0  # a track is judged by at least this many timestamps, over at least this time [s]
+STAMPS, MONITORED = 4, 2.0  # minimum number of timestamps, and their minimum time span [s], to judge the estimated pose
 KEPT = 100  # number of stored timestamps
-BEYOND = 2.0  # a landmark contradicts the track if its squared innovation exceeds this multiple of the gate
-SHARE = 0.6  # the track is suspicious if more than this fraction of the landmarks contradicts it
-SEARCH_INTERVAL = 1.0  # s between searches while the track is suspicious
+BEYOND = 2.0  # a landmark contradicts the estimated pose if its squared innovation exceeds BEYOND * GATE
+SHARE = 0.6  # the estimated pose is suspicious if a larger fraction of landmarks contradicts it
+SEARCH_INTERVAL = 1.0  # s between searches while the estimated pose is suspicious
 
 
 @dataclass(frozen=True)
 class Hypothesis(Mode):
     """A possible pose of the robot, as a Gaussian. Its ``weight`` is its posterior probability.
 
-    ``explained``: number of sightings whose residuals at the pose are within the gate. ``share``: their fraction of all
-    sightings. ``landmarks``: number of different landmarks in these sightings.
+    ``explained``: the number of inliers among the sightings at this pose. ``share``: the fraction of inliers.
+    ``landmarks``: the number of different landmarks among the inliers.
     """
 
     explained: int
@@ -75,11 +75,10 @@ class Hypothesis(Mode):
 
 
 class LandmarkFinder:
-    """Finds the pose by landmarks of the map, without a prediction. It implements
-    :class:`~factorgraph_loc.sensors.base.Finder`.
+    """Global localization by landmarks of the map. It implements :class:`~factorgraph_loc.sensors.base.Finder`.
 
-    ``factor``: a function that returns the factor of a measurement's mapped landmarks, or None without any.
-    ``positions`` (L, 2): positions of the map's landmarks.
+    ``factor``: a function from a measurement to the factor of its mapped landmarks, or to None if it has no such
+    landmarks. ``positions`` (L, 2): the positions of the landmarks in the map.
     ``hypotheses``: the results of the last search, most likely first.
     ``best``: the pose at the last sighting if one hypothesis is unambiguous, otherwise None.
     """
@@ -103,7 +102,7 @@ class LandmarkFinder:
 
     @property
     def suspicious_since(self) -> float | None:
-        """The time [s] since which most landmarks contradict the track, or None."""
+        """The time [s] since which most landmarks contradict the estimated pose, or None if most agree with it."""
         return self._monitor.suspicious_since
 
     def look(self, m: BearingRange, odometry: ChainState) -> bool:
@@ -133,7 +132,7 @@ class LandmarkFinder:
         self._monitor.clear()
 
     def add(self, odometry: ChainState, factor: BearingRangeFactor) -> None:
-        """Store the sightings of a factor, made at the odometry state ``odometry``. They may be late or repeated."""
+        """Store the sightings in ``factor``, made at the odometry state ``odometry``."""
         self._model = factor.model
         points, ranges = factor.points[:, :HEIGHT], on_floor(factor.model, factor.points, factor.ranges)
         places, values = points.tolist(), zip(ranges.tolist(), factor.bearings.tolist(), strict=True)
@@ -150,7 +149,7 @@ class LandmarkFinder:
                 del self._sightings[key]
 
     def search(self) -> None:
-        """Compute ``hypotheses`` and ``best`` at the time of the last sighting."""
+        """Search for the pose at the time of the last sighting. Sets ``hypotheses`` and ``best``."""
         rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
         earlier, previous = self.hypotheses, self._window
         self.hypotheses, self.best, self._window = (), None, None
@@ -175,10 +174,10 @@ class LandmarkFinder:
         self.best = self._clear(window)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` poses (N, 3) at the last sighting, sampled from the hypotheses. Returns (0, 3) if nothing was found.
+        """Return ``count`` random poses (N, 3) at the last sighting, or (0, 3) before the first sighting.
 
-        Hypotheses that are too wide to be Gaussian are replaced by samples from the likelihood of the last sighting
-        (sensor resetting: Lenser, Veloso, ICRA 2000).
+        Samples are drawn from narrow hypotheses, in proportion to their weights. The remaining samples are drawn from
+        the likelihood of the last sighting (sensor resetting: Lenser, Veloso, ICRA 2000).
         """
         if self._window is None:
             return np.empty((0, 3))
@@ -192,11 +191,10 @@ class LandmarkFinder:
         return np.concatenate(poses)
 
     def refutes(self, pose: Array, covariance: Array) -> bool:
-        """True if the track must be wrong: an unambiguous hypothesis explains nearly all sightings, and far more than
-        the track does.
+        """Return True if an estimated pose must be wrong, because ``best`` explains nearly all sightings, and many more
+        than the estimated pose does.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the track at the last sighting. A hypothesis that is based
-        on wrongly mapped landmarks does not count, because correctly mapped landmarks contradict it.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimated pose at the last sighting.
         """
         if self.best is None or self._window is None:
             return False
@@ -208,8 +206,8 @@ class LandmarkFinder:
         return bool(track - best > REFUTED * 0.5 * scale**2 * len(window.points))
 
     def _log_prior(self, window: SightingWindow, poses: Array, covariances: Array) -> Array:
-        """Return the log prior probability (N,) of the regions around ``poses`` (N, 3) with body-frame covariances
-        (N, 3, 3)."""
+        """Return the logarithm (N,) of the prior probability of N Gaussian modes: the prior density times the volume.
+        ``poses`` (N, 3), ``covariances`` (N, 3, 3): means and body-frame covariances of the modes."""
         volume: Array = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1]
         density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
         return np.asarray(np.minimum(volume + density, 0.0))
@@ -217,10 +215,11 @@ class LandmarkFinder:
     def _weighed(
         self, window: SightingWindow, poses: Array, covariances: Array, squared: Array, logs: Array
     ) -> tuple[Hypothesis, ...]:
-        """Return the distinct hypotheses with their posterior probabilities, most likely first.
+        """Return the distinct hypotheses with posterior probabilities, most likely first.
 
-        ``poses`` (N, 3) with body-frame ``covariances`` (N, 3, 3). ``squared`` (N, K): squared residuals of the K sightings.
-        ``logs`` (N,): log probabilities, not normalised. The normalisation includes a pose elsewhere that explains no sighting.
+        ``poses`` (N, 3), ``covariances`` (N, 3, 3): means and body-frame covariances. ``squared`` (N, K): squared
+        residuals of K sightings. ``logs`` (N,): logarithms of the unnormalised probabilities. The probability that all
+        sightings are outliers is part of the normalisation.
         """
         covariances = se2.body_to_world(poses, covariances)
         kept: list[int] = []
@@ -245,14 +244,14 @@ class LandmarkFinder:
         )
 
     def _clear(self, window: SightingWindow) -> PosePrior | None:
-        """Return the most likely hypothesis if it is unambiguous, otherwise None. The pose and covariance are refined
-        with correlated odometry errors."""
+        """Return the most likely hypothesis if it is unambiguous, otherwise None. It is refined with correlated
+        odometry errors."""
         if not self.hypotheses:
             return None
         best = self.hypotheses[0]
         if best.weight < CLEAR_WEIGHT or best.share <= 0.5:
             return None
-        # a single landmark may be misidentified, so one is enough only if it agrees with the known start
+        # a single landmark is not enough, unless the start is known, because it may be misidentified
         if best.explained < CLEAR_SIGHTINGS or best.landmarks < (2 if self.start is None else 1):
             return None
         pose, covariance = window.fused(best.pose, window.whitener(), iterations=8)
@@ -271,21 +270,22 @@ def _time(row: Sighting) -> float:
 
 
 def _insert(rows: list[Sighting], row: Sighting) -> None:
-    """Insert ``row`` into the sightings ``rows`` of its landmark, and keep them in order of time and an interval apart."""
+    """Insert the sighting ``row`` into ``rows``, the sightings of the same landmark in order of time. Sightings that
+    are less than INTERVAL after the previous one are removed, except the last."""
     if rows and row.odometry.t <= rows[-1].odometry.t:
         rows[:] = [r for r in rows if r.odometry.t != row.odometry.t]
         rows.append(row)
         rows.sort(key=_time)
         rows[:] = _thinned(rows)
         return
-    # the times of all rows except the last differ by at least INTERVAL
+    # only the last two rows may be closer than INTERVAL
     if len(rows) > 1 and rows[-1].odometry.t < rows[-2].odometry.t + INTERVAL:
         rows.pop()
     rows.append(row)
 
 
 def _thinned(rows: list[Sighting]) -> list[Sighting]:
-    """Return the sightings of one landmark that are at least INTERVAL apart, and the last one."""
+    """Return those sightings of a landmark that are at least INTERVAL apart in time, and the last sighting."""
     kept = rows[:1]
     for row in rows[1:]:
         if row.odometry.t >= kept[-1].odometry.t + INTERVAL:
@@ -294,8 +294,8 @@ def _thinned(rows: list[Sighting]) -> list[Sighting]:
 
 
 def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
-    """Return indices of at most ``count`` of the poses (N, 3), by increasing loss (N,). A pose is left out if a better
-    one differs from it by less than ``apart`` (3,) in each component."""
+    """Return the indices of at most ``count`` distinct poses with the lowest losses. ``poses`` (N, 3), ``losses`` (N,):
+    all poses. ``apart`` (3,): two poses are distinct if they differ by at least this in one component."""
     kept: list[int] = []
     losses = losses.copy()
     while len(kept) < count and np.isfinite(losses).any():
@@ -314,18 +314,18 @@ def _distance(pose: Array, mean: Array, covariance: Array) -> float:
 
 
 class TrackMonitor:
-    """Detects that most landmarks of the last timestamps contradict the track: their innovations are far outside the gate.
+    """Detects that most of the last sightings contradict the estimated pose. The pose or the map may be the reason.
 
-    This is only a suspicion, because a wrong map has the same effect. A search decides if there is a better pose.
+    ``suspicious_since``: the time [s] since which they contradict it, or None.
     """
 
     def __init__(self) -> None:
         self._stamps: list[tuple[float, int, int]] = []
-        self.suspicious_since: float | None = None  # s, or None if the track is not suspicious
+        self.suspicious_since: float | None = None
 
     def add(self, t: float, factor: BearingRangeFactor, pose: Array, covariance: Array) -> None:
-        """Record how many landmarks of ``factor``, sighted at the time ``t`` [s], contradict the predicted ``pose``
-        (3,) with its body-frame ``covariance`` (3, 3)."""
+        """Count the landmarks of ``factor`` that contradict ``pose``, and update ``suspicious_since``. ``t``: the time
+        [s]. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate before the measurement corrects it."""
         beyond = factor.count_beyond(BEYOND * GATE, pose, covariance)
         while self._stamps and self._stamps[-1][0] >= t:
             self._stamps.pop()
@@ -337,19 +337,18 @@ class TrackMonitor:
         self.suspicious_since = self._beginning() if lasts else None
 
     def clear(self) -> None:
-        """Discard the history, because a new track starts."""
+        """Discard all counts, because the estimated pose was replaced or confirmed."""
         self._stamps.clear()
         self.suspicious_since = None
 
     def _beginning(self) -> float:
-        """Return the time [s] at which the contradiction begins. It maximises the number of contradicting landmarks
-        after it and of agreeing landmarks before it."""
+        """Return the time [s] that best separates agreeing landmarks from later contradicting landmarks."""
         excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
         return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
 
     def _last(self) -> list[tuple[float, int, int]]:
-        """Return the fewest last timestamps that suffice to judge the track, or [] if there are too few. Each item has
-        the time [s], the number of contradicting landmarks, and the number of all landmarks."""
+        """Return the counts of the last timestamps, as few as suffice to judge the pose, or [] if there are too few. A
+        count is (time [s], number of contradicting landmarks, number of all landmarks)."""
         for i in range(len(self._stamps) - STAMPS, -1, -1):
             if self._stamps[i][0] <= self._stamps[-1][0] - MONITORED:
                 return self._stamps[i:]

@@ -17,19 +17,17 @@ from factors.motion import Increment
 from factors.se2 import Array
 
 NamedFactor = tuple[str, BearingRangeFactor]
-EXACT = 0.2  # a landmark is treated as exact if the sigma of its survey is below this fraction of `range_sigma`
+EXACT = 0.2  # a survey is treated as exact if its standard deviation is below this fraction of `range_sigma`
 
 
 class KnownLandmarks:
-    """Turns measurements into factors, and counts sightings that cannot be used in ``diagnostics``.
+    """Converts measurements of landmarks to factors. Sightings that cannot be used are counted in ``diagnostics``.
 
-    ``use``: how the map is used. ``known`` uses mapped landmarks and ignores others. ``extended`` uses mapped landmarks
-    and estimates others. ``unknown`` estimates all landmarks and uses only the heights of the map.
-    ``estimated``: indices of the sensor's constants that are estimated.
-    ``carries``: True if the estimator estimates mapped landmarks with an inexact survey. Otherwise the survey's
-    covariance is added to the noise.
-    ``locates``: True if the estimator can locate new landmarks from ranges alone or bearings alone.
-    ``biased``: True if the ranges of each landmark have an unknown bias.
+    ``use``: how the map is used. "known": landmarks that are not in the map are ignored. "extended": they are
+    estimated. "unknown": all landmarks are estimated, and only their heights are taken from the map. ``estimated``:
+    indices of the sensor's constants that are estimated. ``carries``: True to estimate mapped landmarks with an inexact
+    survey. Otherwise the covariance of the survey is added to the noise. ``locates``: True if the estimator can locate
+    new landmarks from ranges alone or bearings alone. ``biased``: True to estimate a range bias of each landmark.
     """
 
     def __init__(
@@ -48,9 +46,9 @@ class KnownLandmarks:
         landmarks = {} if use == "unknown" else world.landmarks
         places = dict(zip(world.landmarks, points_of(world.landmarks.values(), settings.z), strict=True))
         self._positions = {name: places[name] for name in landmarks}
-        # a landmark whose position is estimated still has the height of the map
+        # the height is taken from the map even if the position is estimated
         self._heights = {name: np.concatenate((np.zeros(HEIGHT), place[HEIGHT:])) for name, place in places.items()}
-        # initial position of a landmark that the map lacks; it has a height (zero) if mapped landmarks have heights
+        # position of landmarks that are not in the map, until they are located; height 0 if the map has heights
         self._nowhere = np.zeros_like(next(iter(places.values()), np.zeros(HEIGHT)))
         limit = 2.0 * (EXACT * settings.range_sigma) ** 2
         surveys = {name: m.spread() for name, m in landmarks.items()}
@@ -61,8 +59,8 @@ class KnownLandmarks:
         self._diagnostics = diagnostics
 
     def factor(self, m: BearingRange) -> BearingRangeFactor | None:
-        """Return one factor of all mapped landmarks that are not estimated. It depends on the pose at the measurement's
-        time. Returns None if the measurement has no such landmark."""
+        """Return one factor of all landmarks in ``m`` that are in the map and not estimated, or None without such
+        landmarks. The factor depends on the pose at the time of ``m``."""
         return self.factors(m)[0]
 
     def factors(
@@ -72,16 +70,16 @@ class KnownLandmarks:
         twist: Array | None = None,
         late: LateRanges = NONE,
     ) -> tuple[BearingRangeFactor | None, list[NamedFactor], list[NamedFactor], list[NamedFactor]]:
-        """Return the factors of a measurement, in four groups.
+        """Return the factors of the measurement ``m``, in four groups. A factor of one landmark comes after its name.
 
         1. One factor of all mapped landmarks that are not estimated, or None without such landmarks.
-        2. Mapped landmarks whose ranges have a bias: one factor each, with the landmark's name.
-        3. Mapped landmarks with an inexact survey: one factor each, which also depends on the landmark's position.
-        4. Landmarks whose position is unknown: one factor each, which also depends on the landmark's position.
+        2. One factor for each mapped landmark with a range bias. It also depends on the bias.
+        3. One factor for each mapped landmark with an inexact survey. It also depends on the landmark's position.
+        4. One factor for each landmark with an unknown position. It also depends on the landmark's position.
 
         ``offset``: the motion from the pose that the factors depend on to the measurement, None if the times are equal.
-        ``twist`` (3,): the robot's velocity at the measurement. It is required if the sensor's time offset is estimated.
-        ``late``: the fraction of late ranges and their excess, as estimated so far.
+        ``twist`` (3,): the robot's velocity at the measurement, required if the sensor's time offset is estimated.
+        ``late``: the estimated fraction of late (too long) ranges and their excess.
         """
         fixed, single, surveyed, unknown = self._usable(m)
         model = with_late(self._model, late)
@@ -123,8 +121,8 @@ class KnownLandmarks:
         return factor, *single_factors
 
     def _usable(self, m: BearingRange) -> tuple[list[int], list[int], list[int], list[int]]:
-        """Return the row numbers of a measurement for each of the four groups of :meth:`factors`. Count rows that are
-        not used."""
+        """Return the row numbers of the landmarks in ``m`` for each of the four groups of :meth:`factors`. Other rows
+        are counted in the diagnostics."""
         fixed, single, surveyed, unknown = list[int](), list[int](), list[int](), list[int]()
         lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
         for i, (name, no_range, no_bearing) in enumerate(lacks):
@@ -144,5 +142,5 @@ class KnownLandmarks:
         return fixed, single, surveyed, unknown
 
     def survey(self, name: str) -> tuple[Array, Array]:
-        """Return the position (2,) and covariance (2, 2) of a mapped landmark with an inexact survey."""
+        """Return the surveyed position (2,) and its covariance (2, 2) of a mapped landmark with an inexact survey."""
         return self._positions[name][:2], self._surveys[name]

@@ -33,7 +33,7 @@ BEARING_RANGE = Table(
     (
         STAMP,
         named("landmark", "the name of a landmark"),
-        # radios report 0 if they get no answer, and gross errors may be negative; both are treated as missing ranges
+        # radios report 0 without an answer, and gross errors may be negative: such ranges are treated as missing
         number(
             "range",
             LENGTH,
@@ -54,8 +54,8 @@ BEARING_RANGE = Table(
 class BearingRange:
     """A measurement of K identified landmarks at the time ``t`` [s].
 
-    ``landmarks``: their names. ``range`` (K,) [m] and ``bearing`` (K,) [rad, in the sensor frame]: NaN if not measured.
-    ``source``: the name of the sensor.
+    ``landmarks``: the names of the landmarks. ``range`` (K,) [m]: NaN if not measured. ``bearing`` (K,) [rad]: the
+    direction in the sensor frame, NaN if not measured. ``source``: the name of the sensor.
     """
 
     sensor: ClassVar[str] = "bearing_range"
@@ -77,7 +77,7 @@ class BearingRange:
 class BearingRangeStream(ScanStream):
     """All sightings of a log, one landmark per row. Rows of one timestamp form one measurement.
 
-    ``landmark``: names. ``range`` [m] and ``bearing`` [rad]: NaN if not measured.
+    ``landmark``: N names. ``range`` (N,) [m], ``bearing`` (N,) [rad]: NaN if not measured.
     """
 
     kind: ClassVar[type[Any]] = BearingRange
@@ -87,7 +87,7 @@ class BearingRangeStream(ScanStream):
 
 
 class BearingRangeUncertainty(FileModel):
-    """Standard deviations of the sensor's constants before a run. A constant is estimated if its value is above 0."""
+    """Standard deviations of the sensor's calibration constants before a run. Constants above 0 are estimated."""
 
     x: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
     """standard deviation of the sensor's x"""
@@ -106,7 +106,8 @@ class BearingRangeUncertainty(FileModel):
 
 
 class BearingRangeSettings(SensorSettings):
-    """Mounting, constants and noise of a landmark sensor. The model is :class:`factors.landmarks.model.BearingRangeModel`."""
+    """Mounting, constants and noise of a landmark sensor. The model is
+    :class:`factors.landmarks.model.BearingRangeModel`."""
 
     constants: ClassVar[tuple[str, ...]] = PARAMETERS
     x: Offset = 0.0
@@ -172,8 +173,8 @@ class SightingSettings(FileModel):
 class Landmark(FileModel):
     """A point landmark of the map, with position and height ``z`` [m] in the world frame.
 
-    ``sigma``: standard deviation of the surveyed x and y [m]. ``covariance``: may be given instead of ``sigma``, as
-    (xx, xy, yy) [m^2].
+    ``sigma``: standard deviation [m] of the surveyed x and y. ``covariance``: the elements (xx, xy, yy) [m^2] of the
+    covariance of the survey, as an alternative to ``sigma``.
     """
 
     x: Coordinate
@@ -188,8 +189,8 @@ class Landmark(FileModel):
 
 
 def points_of(landmarks: Iterable[Landmark], z: float) -> Array:
-    """Return positions (K, 2) of landmarks if all have the height ``z`` [m] of the sensor. Otherwise return positions
-    (K, 3), whose last column is the height above the sensor."""
+    """Return the positions (K, 2) of landmarks if all are at the height ``z`` [m] of the sensor. Otherwise return (K,
+    3) with the height above the sensor in the last column."""
     places = np.array([(mark.x, mark.y, mark.z - z) for mark in landmarks]).reshape(-1, 3)
     return places if places[:, 2].any() else np.ascontiguousarray(places[:, :2])
 
@@ -208,12 +209,11 @@ LANDMARKS = Table(
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """Return the section ``landmarks`` of a world file. If its ``content`` refers to a table, read the landmarks from
-    that table.
+    """Return the landmarks of a world file. If its section ``landmarks`` names a table, they are read from the table.
 
-    A mapping in ``content`` assigns the table's columns to the fields landmark, x, y, and optionally z, and sigma or both
-    sigma_x and sigma_y. The larger of sigma_x and sigma_y is used. ``source``: the world file for messages. ``folder``: the
-    folder of the table. Raises InputError with file, row and field for an invalid value or a duplicate name.
+    ``content``: the section. For a table, it assigns columns to the fields landmark, x, y and optionally z, and to
+    sigma or both sigma_x and sigma_y, of which the larger value is used. ``source``: the name of the world file in
+    messages. ``folder``: the folder of the table. Raises InputError for an invalid value or a duplicate name.
     """
     if not isinstance(content, dict) or not isinstance(content.get("file"), str):
         return content

@@ -1,4 +1,4 @@
-"""The landmark sensor of a run: it turns measurements into observations, and initialises landmarks that the map lacks."""
+"""The landmark sensor of a run: it converts measurements to observations, and initialises new landmarks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NOT_LOCATED = "landmark not located yet"
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
-    """Merge factors on the same pose into one factor of all their landmarks."""
+    """Return one factor with the landmarks of all ``factors``. All must depend on the same pose."""
     first, *rest = factors
     if not rest:
         return first
@@ -48,18 +48,18 @@ def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
     )
 
 
-SURVEYED_ITERATIONS = 4  # linearisations of an observation with inexactly surveyed landmarks
+SURVEYED_ITERATIONS = 4  # number of linearisations if the position of a surveyed landmark is estimated
 WORK = 8  # time to compute the likelihood of one landmark at one pose, relative to the time for an RFID tag
-SMALL = 40  # largest error state whose matrices are inverted by compiled code
-MAX_PENDING = 5  # stored sightings of a new landmark until two of them agree
+SMALL = 40  # maximum size of an error state that compiled code corrects
+MAX_PENDING = 5  # maximum number of stored sightings of a new landmark, of which two must agree
 
 
 @dataclass(frozen=True)
 class LandmarkObservation(ResidualObservation):
-    """The observation of one measurement. One term has all landmarks with a known position, each estimated landmark has
-    its own term.
+    """The observation of one measurement of landmarks. One term contains all landmarks with a known position. Each
+    other landmark has its own term.
 
-    ``surveyed``: True if the position of a landmark is estimated from a survey. Its correction requires several linearisations.
+    ``surveyed``: True if the position of a surveyed landmark is estimated.
     """
 
     surveyed: bool = False
@@ -111,7 +111,7 @@ class LandmarkObservation(ResidualObservation):
             if factor.estimated and term.blocks[0] in values:
                 parameters = np.zeros((len(poses), len(PARAMETERS)))
                 parameters[:, list(factor.estimated)] = values[term.blocks[0]]
-            if factor.free:  # a shift of the landmark has the same effect as the opposite shift of the robot
+            if factor.free:  # shift the robots instead of the landmark, which has the same effect
                 places = values[term.blocks[-1]]
                 point = np.concatenate((places[:1], factor.points[:1, HEIGHT:]), axis=1)
                 factor, at = replace(factor, points=point), poses.copy()
@@ -124,8 +124,7 @@ class LandmarkObservation(ResidualObservation):
         return frozenset(map(tuple, self.measured.points.tolist()))
 
     def at_its_time(self) -> Self | None:
-        """Return the observation on the pose at the time of the measurement. Returns None if it also depends on
-        estimated blocks."""
+        """Return an observation that depends only on the pose at the time ``t``, or None if it depends on blocks."""
         if self.blocks:
             return None
         factor = self.measured
@@ -134,8 +133,8 @@ class LandmarkObservation(ResidualObservation):
         )
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """Return the observation as a function of the pose only. Constants and landmarks are fixed at ``values``. The
-        covariances ``spreads`` of landmarks and range biases are added to the noise."""
+        """Return an observation that depends on the pose only, with all blocks fixed at ``values``. Its noise includes
+        the covariances ``spreads`` of landmarks and range biases, but not those of calibration constants."""
         if len(self.terms) == 1 and not self.terms[0].blocks:
             return self
         fixed = []
@@ -147,45 +146,41 @@ class LandmarkObservation(ResidualObservation):
             bound = factor.fixed([values[name] for name in names], point, shorter)
             uncertain = np.zeros((2, 2)) if bound.point_covariances is None else bound.point_covariances[0]
             uncertain = uncertain if own is None else spreads[own]
-            if (
-                bias is not None
-            ):  # an error of the range has the effect of a shift of the landmark along the line of sight
+            if bias is not None:  # a range error acts as a shift of the landmark along the line of sight
                 uncertain = uncertain + spreads[bias] * np.eye(2)
             fixed.append(bound if len(names) == len(term.blocks) else replace(bound, point_covariances=uncertain[None]))
         factor = together(fixed)
         return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 
 
-Sighted = tuple[
-    float, LandmarkObservation
-]  # the time [s] of the pose that the observation refers to, and the observation
+Sighted = tuple[float, LandmarkObservation]  # the time [s] of the pose that the observation depends on
 
 
 @dataclass(frozen=True)
 class NewLandmarks:
-    """Stored sightings of landmarks that are not initialised yet, by the name of the landmark's block.
+    """Stored sightings of landmarks with unknown positions, by the name of the landmark's state block. Immutable.
 
-    Immutable, because filters go back to an earlier state when a measurement is late.
-    ``pending``: sightings with range and bearing, each with the landmark's position (2,) and covariance (2, 2). Two
-    sightings must agree on the position, because one may be an outlier.
-    ``partial``: sightings with a range alone or a bearing alone.
+    ``pending``: sightings with range and bearing: the position (2,) of the landmark, its covariance (2, 2), and the
+    observation. Two of them must agree before the landmark is added to the state. ``partial``: sightings with range
+    alone or bearing alone.
     """
 
     pending: Mapping[str, tuple[tuple[Array, Array, Sighted], ...]] = field(default_factory=dict)
     partial: Mapping[str, Candidate] = field(default_factory=dict)
 
     def without(self, name: str) -> NewLandmarks:
-        """Return the sightings of all landmarks except ``name``."""
+        """Return a copy without the sightings of the landmark ``name``."""
         pending = {key: rows for key, rows in self.pending.items() if key != name}
         return NewLandmarks(pending, {key: rows for key, rows in self.partial.items() if key != name})
 
     def propose(
         self, name: str, point: Array, covariance: Array, sighting: Sighted
     ) -> tuple[NewLandmarks, Sighted | None]:
-        """Add a sighting that locates the landmark at ``point`` (2,) with ``covariance`` (2, 2).
+        """Compare a new sighting with the stored sightings of the landmark ``name``.
 
-        Returns the remaining sightings, and an earlier sighting that agrees with the new one. If none agrees, the
-        second value is None, and the new sighting is stored.
+        ``point`` (2,), ``covariance`` (2, 2): the position of the landmark from the new sighting. If a stored sighting
+        agrees with it, returns a copy without this landmark, and the stored sighting. Otherwise returns a copy that
+        also contains the new sighting, and None.
         """
         waiting = self.pending.get(name, ())
         for earlier, noise, candidate in reversed(waiting):
@@ -197,10 +192,10 @@ class NewLandmarks:
 
 
 class LandmarkSensor(Sensor):
-    """The sensor of identified landmarks, bound to a run. For the ``use`` of the map see :class:`KnownLandmarks`.
+    """A sensor of identified landmarks in a run. :class:`KnownLandmarks` describes how it uses the map.
 
-    A landmark that the map lacks becomes a block ``bearing_range/NAME`` of the state, which all landmark sensors share.
-    It is initialised when two sightings agree on its position, or when several sightings by range alone or bearing
+    A landmark that is not in the map becomes the state block ``bearing_range/NAME``, which all landmark sensors share.
+    It is initialised when two sightings agree on its position, or when several sightings with range alone or bearing
     alone determine it.
     """
 
@@ -216,7 +211,7 @@ class LandmarkSensor(Sensor):
         self._landmarks = KnownLandmarks(
             settings, world, self._diagnostics, use, constants.indices, carries=True, locates=locates, biased=biased
         )
-        # makes factors for the search of the pose, with separate diagnostics, so that no sighting is counted twice
+        # factors for global localization; with own diagnostics, so that no sighting is counted twice
         self._sought = KnownLandmarks(settings, world, Diagnostics())
         self._shared = (self.name,) if constants.names else ()
         self._new: NewLandmarks = NewLandmarks()
@@ -239,7 +234,7 @@ class LandmarkSensor(Sensor):
             block, (position, spread) = f"{self.modality}/{name}", self._landmarks.survey(name)
             if view.value(block) is None:
                 yield NewVariable(block, position, np.zeros((2, 3)), {}, spread, ())
-            # if the estimator did not accept the block, the survey's covariance becomes noise
+            # if the estimator has rejected the block, the covariance of the survey becomes noise
             if view.value(block) is None:
                 prior = replace(factor, point_covariances=spread[None], free=False)
                 terms.append(self._term(name, prior, view))
@@ -268,13 +263,13 @@ class LandmarkSensor(Sensor):
                 yield new
 
     def _new_bias(self, name: str, view: View) -> Iterator[NewVariable]:
-        """Yield a new block for the range bias of a landmark, unless the estimator has it."""
+        """Yield a new state block for the range bias of the landmark ``name``, unless the state contains it."""
         block = f"{self.modality}/{name}/bias"
         if view.value(block) is None:
             yield NewVariable(block, np.zeros(1), np.zeros((1, 3)), {}, np.array([[self._bias**2]]), ())
 
     def _term(self, name: str, factor: BearingRangeFactor, view: View) -> Term:
-        """Return the term of one landmark. The factor has no range bias if the estimator does not estimate one."""
+        """Return the term of the landmark ``name``. It has a range bias only if the state contains the bias."""
         block = f"{self.modality}/{name}"
         if factor.biased and view.value(f"{block}/bias") is None:
             factor = replace(factor, biased=False)
@@ -282,8 +277,8 @@ class LandmarkSensor(Sensor):
         return Term(factor, (*self._shared, *biases, *((block,) if factor.free else ())), 2)
 
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """Return a new landmark, located by the sighting ``term`` at ``t`` [s], if an earlier sighting agrees with it.
-        Otherwise store the sighting and return None. ``block``: the name of the landmark's block."""
+        """Return a new landmark if two sightings with range and bearing agree on its position. Otherwise store the
+        sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's state block."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
         factor = replace(cast(BearingRangeFactor, term.factor), biased=False)
         point, (by_pose, *by_shared), noise = factor.locate([view.pose, *shared])
@@ -294,8 +289,8 @@ class LandmarkSensor(Sensor):
         return None if earlier is None else replace(new, sightings=(earlier, current))
 
     def _located(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """Return a new landmark if its sightings by range alone or bearing alone determine its position. Otherwise
-        store the sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's block."""
+        """Return a new landmark if sightings with range alone or bearing alone determine its position. Otherwise store
+        the sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's state block."""
         factor = cast(BearingRangeFactor, term.factor)
         (along_floor,) = on_floor(factor.model, factor.points, factor.ranges).tolist()
         sighting = PartialSighting(self._motion.state(t), along_floor, float(factor.bearings[0]))
@@ -332,8 +327,8 @@ class LandmarkSensor(Sensor):
         return True
 
     def _learn(self, observation: LandmarkObservation, view: View) -> None:
-        """Update the estimate of late ranges (their fraction and their excess) by an observation. An observation
-        without landmarks sighted by range alone is not used."""
+        """Update the estimated fraction and excess of late (too long) ranges. Observations in which all landmarks have
+        bearings are ignored. ``view``: the estimate before the observation corrects it."""
         if not self._late.probability or np.isfinite(observation.measured.bearings).all():
             return
         self._late_before.append((observation.t, self._late))
@@ -377,8 +372,7 @@ def _rotation(heading: float) -> Array:
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:
-    """Return the landmark sensor of a run, or None if the run does not use it. The particle filter does not estimate
-    the sensor's time offset."""
+    """Return the landmark sensor of a run, or None if the run does not use it."""
     settings = binding.setup.rig.find(BearingRangeSettings)
     if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
         return None

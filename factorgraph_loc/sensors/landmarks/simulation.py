@@ -31,7 +31,7 @@ from factors.se2 import Array
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the stream of sightings of a simulated drive. It is empty without landmarks in the world."""
+    """Return the simulated sightings of a drive, which are empty if the world has no landmarks."""
     if not ride.world.landmarks:
         return Simulated()
     settings, times = ride.settings.sightings, ride.times(ride.settings.sightings.rate)
@@ -41,8 +41,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"landmarks": the largest number of simulated sightings per second}. Raises ValueError if the world has
-    landmarks, but the rig has no landmark sensor."""
+    """Return {"landmarks": N}, where N is the maximum number of simulated sightings per second. Raises ValueError if
+    the world has landmarks, but the rig has no landmark sensor."""
     if settings.world.landmarks and settings.rig.find(BearingRangeSettings) is None:
         raise ValueError("the world has landmarks, expected a rig with a section [bearing_range]")
     return {"landmarks": settings.sightings.rate * settings.world.landmarks}
@@ -57,9 +57,9 @@ def sighting_stream(
     rng: np.random.Generator,
     z: float = 0.0,
 ) -> BearingRangeStream:
-    """Simulate the sightings of all visible landmarks at ``times`` (N,) [s] from robot ``poses`` (N, 3).
+    """Return simulated sightings of all visible landmarks at ``times`` (N,) [s] from robot ``poses`` (N, 3).
 
-    ``settings``: range and field of view of the sensor. ``z``: its height [m]. Random noise is drawn from ``rng``.
+    ``settings``: range and field of view of the sensor. ``z``: the height of the sensor [m]. ``rng``: draws the noise.
     """
     points, names = points_of(world.landmarks.values(), z), list(world.landmarks)
     n, k = in_sight(model, world, poses, settings)
@@ -78,9 +78,9 @@ def sighting_stream(
 def in_sight(
     model: BearingRangeModel, world: World, poses: Array, settings: SightingSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices of K poses and K landmarks, pair by pair, so that each landmark is visible from its pose.
+    """Return all K pairs of a pose and a landmark that is visible from this pose, as indices (K,) and (K,).
 
-    ``poses`` (N, 3): of the robot. A visible landmark is in range, in the field of view, and not behind a wall.
+    ``poses`` (N, 3): poses of the robot. A visible landmark is in range, in the field of view, and not behind a wall.
     """
     points = world.positions()
     sensors = se2.compose(poses, np.array(model.mounting))
@@ -95,7 +95,7 @@ def in_sight(
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSightings:
-    """A simulated landmark sensor on a moving robot. It implements :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`."""
+    """A simulated landmark sensor on a robot. It implements :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`."""
 
     model: BearingRangeModel
     world: World
@@ -106,11 +106,11 @@ class SimulatedSightings:
 
     @property
     def rate(self) -> float:
-        """Measurement rate [Hz]."""
+        """The number of measurements per second."""
         return self.settings.rate
 
     def measure(self, t: float, pose: Array) -> BearingRange:
-        """Simulate the measurement at the time ``t`` [s] from the robot's ``pose`` (3,)."""
+        """Return a simulated measurement at the time ``t`` [s] from the robot's ``pose`` (3,)."""
         sightings = sighting_stream(self.model, self.world, np.array((t,)), pose[None], self.settings, self.rng)
         return BearingRange(t, tuple(sightings.landmark), sightings.range, sightings.bearing)
 
@@ -127,7 +127,7 @@ class LandmarkForecast:
     """Predicts the information of landmark sightings on candidate paths. It implements
     :class:`~factorgraph_loc.sensors.interfaces.Forecast`.
 
-    ``looks_per_metre``: number of measurements per metre of path. ``settings``: range and field of view of the sensor.
+    ``looks_per_metre``: the number of measurements per metre of path. ``settings``: range and field of view.
     """
 
     world: World
@@ -137,8 +137,8 @@ class LandmarkForecast:
     goals: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Return the information (N, 3, 3) on ``poses`` (N, 3) by visible landmarks, each along a path length
-        ``ways`` (N,) [m]."""
+        """Return the Fisher information (N, 3, 3) of visible landmarks on ``poses`` (N, 3). ``ways`` (N,): the length
+        [m] of the path segment of each pose, to which the number of measurements is proportional."""
         points = self.world.positions()
         n, k = in_sight(self.model, self.world, poses, self.settings)
         pairs = poses[n], points[k], *bearing_range.predict(self.model, poses[n], points[k])
@@ -148,7 +148,8 @@ class LandmarkForecast:
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Add log-likelihoods of simulated sightings to ``out``. See :class:`~factorgraph_loc.sensors.interfaces.Forecast`."""
+        """Simulate sightings from particles, and add their log-likelihoods to ``out``. See
+        :meth:`~factorgraph_loc.sensors.interfaces.Forecast.add_log_weights`."""
         sightings, scans = metres * self.looks_per_metre / len(poses), len(out)
         points = self.world.positions()
         for s in range(len(poses)):
@@ -166,8 +167,8 @@ class LandmarkForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> LandmarkForecast | None:
-    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: settings of the simulation. Returns
-    None without a landmark sensor or without landmarks."""
+    """Return the forecast for a robot that drives at ``speed`` [m/s], or None without landmark sensor or landmarks.
+    ``settings``: settings of the simulation."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     sightings = settings.sightings
@@ -186,8 +187,9 @@ def _add(
 ) -> None:
     """Add to ``out[j, i]`` the log-likelihood of particle i, given the sightings that were simulated from particle j.
 
-    ``scans``, ``landmarks`` (K,): particle j and landmark of each sighting. ``measured``, ``sigmas`` (K, 2): its range
-    and bearing, and their standard deviations. ``ranges``, ``bearings`` (M, L): those of L landmarks from M particles.
+    ``scans``, ``landmarks`` (K,): the particle j and the landmark of each sighting. ``measured``, ``sigmas`` (K, 2):
+    simulated range and bearing, and their standard deviations. ``ranges``, ``bearings`` (M, L): the predictions for L
+    landmarks from M particles.
     """
     for n in range(len(scans)):
         j, k = scans[n], landmarks[n]

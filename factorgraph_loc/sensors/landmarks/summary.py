@@ -1,8 +1,8 @@
 """Summarises the landmarks of a log, warns about problems of sightings and map, and checks a log before a run.
 
-If the log has a reference, the position of each landmark is estimated from its sightings at the reference poses. The method is
-the median of positions by range and bearing, or robust trilateration if there are only ranges. A landmark far from its map
-position is a suspect. Sightings are also compared with predictions from the reference at various time shifts.
+If the log has a reference, the position of each landmark is estimated from its sightings at the reference poses. The
+method is the median of positions by range and bearing, or robust trilateration if there are only ranges. A landmark far
+from its map position is a suspect. Time shifts are also tried between sightings and reference.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from factors.landmarks import model as bearing_range
 from factors.se2 import Array
 
 UNKNOWN_LANDMARK = "landmark {landmark} is not in the map: {sightings} sightings"
-MIN_SIGHTINGS = 10  # minimum number of sightings to judge a landmark
+MIN_SIGHTINGS = 10  # minimum number of sightings to judge the position of a landmark
 MIN_OFFSET = 0.5  # m; smaller survey errors are harmless for robust estimators
-PASS = 10.0  # s; errors within such a time interval are correlated, so intervals are counted, not sightings
-MIN_PASSES = 3  # minimum number of intervals of length PASS with sightings, to judge a landmark
-MOST = 2000  # number of sightings that are compared at time shifts
+PASS = 10.0  # s; the sightings in an interval of this length count as one, because their errors are correlated
+MIN_PASSES = 3  # minimum number of intervals of length PASS with sightings to judge the position of a landmark
+MOST = 2000  # maximum number of sightings from which a time shift is estimated
 TALL = 0.5  # m; minimum difference of heights that is reported
-MOUNTING = (0.5, 0.0, 0.0, 0.0)  # m, m, m, rad: initial height, x, y and rotation for the fit of a mounting
+MOUNTING = (0.5, 0.0, 0.0, 0.0)  # initial height, x, y [m] and rotation [rad] for the fit of the sensor's mounting
 _REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
 
 
@@ -53,8 +53,8 @@ _REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
 class Suspect:
     """A landmark whose position in the map is probably wrong.
 
-    ``offset`` (2,) [m]: its position by the sightings minus its position in the map. ``sightings``: their number.
-    ``swapped_with``: another landmark if the two seem to be interchanged in the map, otherwise None.
+    ``offset`` (2,) [m]: the position from sightings minus the position in the map. ``sightings``: number of sightings.
+    ``swapped_with``: the name of a landmark that seems to be interchanged with this one in the map, or None.
     """
 
     landmark: str
@@ -63,7 +63,7 @@ class Suspect:
     swapped_with: str | None = None
 
     def warning(self) -> Notice:
-        """Return the warning about this landmark."""
+        """Return a warning about the position of this landmark."""
         sentence = "landmark {landmark}: {sightings} sightings put it {distance:.2f} m from its position in the map"
         values = self.landmark, self.sightings, np.hypot(*self.offset)
         if self.swapped_with:
@@ -72,11 +72,11 @@ class Suspect:
 
 
 def summarize(log: Log) -> Summary:
-    """Return a summary of the log's landmarks, with warnings. Its entries are:
+    """Return the summary of the landmarks in a log, with warnings and these entries:
 
-    - ``unseen``: names of mapped landmarks without any sighting.
-    - ``unknown``: the number of sightings of each name that the map lacks.
-    - ``suspects``: landmarks whose position in the map is probably wrong.
+    - ``unseen``: names of mapped landmarks without sightings.
+    - ``unknown``: the number of sightings of each name that is not in the map.
+    - ``suspects``: landmarks that are probably at a wrong position in the map, see :class:`Suspect`.
     """
     unseen, unknown = _unmatched(log)
     suspects = find_suspects(log)
@@ -93,8 +93,8 @@ def summarize(log: Log) -> Summary:
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
-    """Return the landmarks with another position in the map than by their sightings from reference poses. The
-    difference exceeds both ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
+    """Return the landmarks that are probably at a wrong position in the map, according to sightings from reference
+    poses. The position differs by more than ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
     implied: dict[str, tuple[Array, int]] = {}
     for name, sightings in _seen_from_reference(log).items():
         passes = len(np.unique(sightings.t // PASS))
@@ -112,10 +112,10 @@ def find_suspects(log: Log) -> tuple[Suspect, ...]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """N sightings of one landmark, with poses from the reference.
+    """N sightings of one landmark from reference poses.
 
-    ``t`` (N,): times [s]. ``sensors`` (N, 3): poses of the sensor in the world. ``ranges`` (N,) [m]: calibrated, along
-    the floor. ``bearings`` (N,) [rad]: calibrated, NaN if not measured.
+    ``t`` (N,): times [s]. ``sensors`` (N, 3): poses of the sensor in the world frame. ``ranges`` (N,): calibrated
+    ranges [m], projected on the floor. ``bearings`` (N,): calibrated bearings [rad], NaN if not measured.
     """
 
     t: Array
@@ -129,8 +129,8 @@ class _Seen:
 
 
 def _seen_from_reference(log: Log) -> dict[str, _Seen]:
-    """Return the sightings of each mapped landmark that have a range and lie within the reference. Returns {} without a
-    reference or sightings."""
+    """Return the sightings of each mapped landmark, by its name. Sightings without a range or without a reference pose
+    are omitted. Returns {} without a reference, sightings or landmark sensor."""
     stream = log.streams.get("bearing_range")
     if (
         log.reference is None
@@ -156,7 +156,7 @@ def _seen_from_reference(log: Log) -> dict[str, _Seen]:
 
 
 def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
-    """Return the median (2,) of the landmark positions that single sightings imply, and their robust standard deviation [m]."""
+    """Return the median (2,) of landmark positions from single sightings, and their robust standard deviation [m]."""
     rows = np.isfinite(sightings.bearings)
     direction = sightings.sensors[rows, 2] + sightings.bearings[rows]
     points = sightings.sensors[rows, :2] + sightings.ranges[rows, None] * np.stack(
@@ -167,8 +167,8 @@ def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
 
 
 def _by_range(sightings: _Seen, place: Array) -> tuple[Array, float]:
-    """Return the position (2,) by robust trilateration, which starts at ``place`` (2,), and a standard deviation [m].
-    The position's standard error is this value divided by the root of the number of independent sightings."""
+    """Return the position (2,) of a landmark by robust trilateration, and its standard deviation [m] for one sighting.
+    ``place`` (2,): the initial position."""
 
     def residual(point: Array) -> Array:
         away: Array = sightings.sensors[:, :2] - point
@@ -184,8 +184,8 @@ def _by_range(sightings: _Seen, place: Array) -> tuple[Array, float]:
 
 
 def _partner(world: World, name: str, implied: Mapping[str, tuple[Array, int]]) -> str | None:
-    """Return the landmark that seems to be interchanged with ``name`` in the map, or None. Each of the two is nearer to the map
-    position of its partner than to its own. ``implied``: positions (2,) and numbers of sightings of all suspects."""
+    """Return the landmark that seems to be interchanged with ``name`` in the map, or None. ``implied``: the position
+    (2,) of each suspect from sightings, and its number of sightings."""
     for candidate in implied:
         if candidate != name:
             mine, theirs = _place(world, name), _place(world, candidate)
@@ -205,7 +205,8 @@ def _distance(a: Array, b: Array) -> float:
 
 
 def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
-    """Return the mapped landmarks without any sighting, and the number of sightings of each name that the map lacks."""
+    """Return the names of mapped landmarks without sightings, and the number of sightings of each name that is not in
+    the map."""
     stream = log.streams.get("bearing_range")
     if not isinstance(stream, BearingRangeStream):
         return (), {}
@@ -215,8 +216,8 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
 
 
 def _shifted(log: Log) -> list[Notice]:
-    """Return a warning if the sightings fit the reference clearly better after a time shift, or with landmarks at
-    another height. A time shift must also be better than another mounting."""
+    """Return a list with a warning if sightings and reference agree clearly better after a time shift, or with
+    landmarks at another height, otherwise []."""
     stream, reference = log.streams.get("bearing_range"), log.reference
     if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:
         return []
@@ -231,8 +232,9 @@ def _shifted(log: Log) -> list[Notice]:
     model = settings.model()
 
     def errors(shift: float, height: float = 0.0, x: float = 0.0, y: float = 0.0, turn: float = 0.0) -> Array:
-        """Return range and bearing errors (N, 2) in standard deviations, NaN if unknown. ``shift``: a time shift [s].
-        ``height``: of the landmarks above the sensor [m]. ``x``, ``y`` [m], ``turn`` [rad]: changes of the mounting."""
+        """Return range and bearing errors (N, 2) in standard deviations, NaN if unknown. ``shift``: the time shift [s].
+        ``height``: the height of the landmarks above the sensor [m]. ``x``, ``y`` [m], ``turn`` [rad]: changes of the
+        sensor's pose on the robot."""
         mounted = replace(model, mounting=tuple(np.add(model.mounting, (x, y, turn)).tolist()))
         ranges, bearings = bearing_range.predict(mounted, reference.at(t - shift, max_gap=3.0 * SLOWEST), places)
         far = (np.hypot(ranges, height) - stream.range[rows]) / model.range_sigma
@@ -240,7 +242,8 @@ def _shifted(log: Log) -> list[Notice]:
         return np.column_stack((far, aside if reference.has_heading else np.full_like(far, np.nan)))
 
     def fitted(shift: float) -> tuple[float, float]:
-        """Return the error :func:`_cost` at a time shift [s] with the best mounting and height, and |height| [m]."""
+        """Return :func:`_cost` with the best pose of the sensor and the best height, and the absolute height [m].
+        ``shift``: the time shift [s]."""
         start = np.array(MOUNTING if reference.has_heading else MOUNTING[:1])
         fit = scipy.optimize.least_squares(
             lambda mounting: np.nan_to_num(errors(shift, *mounting)).ravel(), start, loss="soft_l1"
@@ -262,15 +265,15 @@ def _shifted(log: Log) -> list[Notice]:
 
 
 def _cost(errors: Array) -> float:
-    """Return the sum of the median absolute errors of ranges and bearings (the columns of ``errors`` (N, 2)). It is
-    infinite if both have too few values."""
+    """Return the median absolute range error plus the median absolute bearing error. Columns with too few errors are
+    ignored. Returns infinity if both are. ``errors`` (N, 2): range and bearing errors, NaN if unknown."""
     usable = [kept for column in errors.T if len(kept := column[np.isfinite(column)]) >= FEWEST // 2]
     return sum(float(np.median(np.abs(kept))) for kept in usable) if usable else np.inf
 
 
 def check(use: Use) -> Use:
-    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate the landmarks of the log: it needs
-    sightings with range and bearing, no sighting has both, and no landmark of the map is used and sighted."""
+    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate any landmark of the log, because it
+    needs sightings with range and bearing and no sighting has both."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
     if wanted == "known" or use.estimates_points or not streams:
@@ -288,12 +291,12 @@ def check(use: Use) -> Use:
 
 
 def _streams(log: Log) -> dict[str, BearingRangeStream]:
-    """Return the streams of sightings by the name of their sensor."""
+    """Return the streams of sightings in a log, by the name of the sensor."""
     return {name: stream for name, stream in log.streams.items() if isinstance(stream, BearingRangeStream)}
 
 
 def draw(log: Log) -> Marks:
-    """Return what a viewer shows: the positions of the map's landmarks at floor level, and the times of their sightings."""
+    """Return the marks of the landmarks for plots and viewers: positions on the floor and times of sightings."""
     places = log.world.positions()
     positions = np.column_stack((places, np.zeros(len(places))))
     stream = log.streams.get("bearing_range")
@@ -304,7 +307,7 @@ def draw(log: Log) -> Marks:
 
 
 def require_mappable(log: Log) -> None:
-    """Raise InputError if no landmark can be mapped, because the log has no sightings or its rig has no landmark sensor."""
+    """Raise InputError if the log has no sightings of landmarks, or if its rig has no landmark sensor."""
     streams = [stream for stream in _streams(log).values() if len(stream.t)]
     if not streams:
         raise InputError(f"{log.name}: has no sightings of landmarks (bearing_range), so there is nothing to map")
@@ -313,12 +316,12 @@ def require_mappable(log: Log) -> None:
 
 
 def detected(log: Log) -> Counter[str]:
-    """Return the number of sightings of each landmark, by its name."""
+    """Return the number of sightings of each landmark in a log, by its name."""
     return Counter(name for stream in _streams(log).values() for name in stream.landmark)
 
 
 def not_located(log: Log, located: Container[str]) -> list[Notice]:
-    """Return a note that lists the sighted landmarks that are not in ``located``. Returns [] if all are."""
+    """Return a list with a warning that names the sighted landmarks that ``located`` lacks, or [] if it lacks none."""
     missing = [f"{name} ({count} sightings)" for name, count in sorted(detected(log).items()) if name not in located]
     return (
         [notice("not_located", "landmarks that were sighted but could not be located: {landmarks}", listed(missing))]

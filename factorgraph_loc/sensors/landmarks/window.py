@@ -20,20 +20,20 @@ from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
-RECENT = 6  # number of landmarks whose last sightings generate candidates
-CIRCLE = 72  # number of candidate headings of a pose from the sighting of one landmark
-HEADINGS = 24  # number of candidate bearings of this landmark if the sighting has no bearing
+RECENT = 6  # maximum number of landmarks from which candidates are computed
+CIRCLE = 72  # number of candidate headings for the sighting of one landmark
+HEADINGS = 24  # number of candidate bearings if the bearing is not measured
 RADII = (0.7, 1.5, 3.0, 6.0)  # m; candidate ranges if the range is not measured
-BASELINE = 0.3  # m; minimum distance of two landmarks that determine a heading
-CONVERGED = 1e-4  # m, rad; a candidate whose step is smaller is not refined further
+BASELINE = 0.3  # m; minimum distance of two landmarks from which a heading is computed
+CONVERGED = 1e-4  # m, rad; the refinement of a candidate ends if a step is smaller
 FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the nearly flat prior: 1/m^2, 1/m^2, 1/rad^2
 
 
 class Sighting(NamedTuple):
     """One sighting of a mapped landmark.
 
-    ``odometry``: the odometry state at its time. ``point`` (2,): the landmark's position in the map [m]. ``range`` [m]
-    and ``bearing`` [rad]: NaN if not measured.
+    ``odometry``: the odometry state at the time of the sighting. ``point`` (2,): the position [m] of the landmark in
+    the map. ``range`` [m], ``bearing`` [rad]: the measurement, NaN if not measured.
     """
 
     odometry: ChainState
@@ -43,10 +43,10 @@ class Sighting(NamedTuple):
 
 
 class SightingWindow:
-    """Constraints on the present pose by K sightings, and by the start of the run if its position is known.
+    """Likelihood of the present pose (at the last sighting), given K sightings, and candidates for this pose.
 
-    ``rows``: the sightings in order of time. The present pose is the pose at the last sighting. ``now``: the odometry
-    state there. ``points`` (K, 2): positions of the sighted landmarks in the map.
+    ``rows``: the sightings in order of time. ``start``: the start of the run if its position is known, otherwise None.
+    ``now``: the odometry state at the last sighting. ``points`` (K, 2): positions of the landmarks in the map.
     """
 
     def __init__(
@@ -58,8 +58,8 @@ class SightingWindow:
         self._ranges, self._bearings = np.array([r.range for r in rows]), np.array([r.bearing for r in rows])
         since = [motion.relative(r.odometry, self.now) for r in rows]
         self._forth = np.array([i.delta for i in since])
-        self._back = se2.inverse(self._forth)  # pose at each sighting relative to the present pose
-        # matrices (K, 3, 3) from a body-frame perturbation of the present pose to one of the pose at a sighting
+        self._back = se2.inverse(self._forth)  # poses at the sightings, relative to the present pose
+        # matrices (K, 3, 3) from perturbations of the present pose to perturbations of the poses at the sightings
         self._carried = se2.adjoint(self._forth)
         self._covariance = np.array([i.covariance for i in since])
         self._drift = self._carried @ self._covariance @ self._carried.transpose(0, 2, 1)
@@ -67,12 +67,11 @@ class SightingWindow:
         self._sigmas = sigmas(model, self._ranges)
 
     def starts(self) -> Array:
-        """Return candidates (N, 3) of the present pose from the known start position, or (0, 3) if it is unknown."""
+        """Return candidates (N, 3) of the present pose from the start position, or (0, 3) if the start is unknown."""
         return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
 
     def circles(self) -> Array:
-        """Return candidates (N, 3) of the present pose that agree with the last sighting: poses on a circle around the
-        sighted landmark."""
+        """Return candidates (N, 3) of the present pose on circles around the landmark of the last sighting."""
         k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
@@ -80,8 +79,8 @@ class SightingWindow:
         return self._placed(k, *(g.ravel() for g in grid))
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Return samples (N, 3) of the present pose: from the known start position, otherwise from the last sighting's
-        likelihood."""
+        """Return ``count`` random samples (N, 3) of the present pose, from the known start position if there is one,
+        otherwise from the likelihood of the last sighting."""
         if self._start is not None:
             return self._start.drawn(rng, count, self.now)
         k, noise = len(self.points) - 1, rng.standard_normal((2, count))
@@ -95,15 +94,15 @@ class SightingWindow:
         return self._placed(k, headings, ranges, bearings)
 
     def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
-        """Return present poses (N, 3) from assumptions about sighting ``k``: ``headings`` (N,) of the robot at its
-        time, ``ranges`` (N,) and ``bearings`` (N,) of its landmark."""
+        """Return the present poses (N, 3) that follow from values for the sighting ``k``. ``headings`` (N,): headings
+        of the robot at the sighting. ``ranges``, ``bearings`` (N,): range and bearing of the landmark."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
         relative = se2.transform_from(turned, located(self._model, ranges, bearings))
         return se2.compose(np.column_stack((self.points[k] - relative, headings)), self._forth[k])
 
     def alignments(self) -> Array:
-        """Return candidates (N, 3) of the present pose, one per pair of landmarks sighted with range and bearing. Each
-        one aligns the observed positions of its pair with the map."""
+        """Return candidates (N, 3) of the present pose, one for each pair of landmarks with range and bearing. At this
+        pose the observed positions of the two landmarks are aligned with the map."""
         full = [k for k in self._recent() if not self._missing[k].any()]
         pairs = np.array(list(combinations(full, 2)), dtype=int).reshape(-1, 2)
         mapped, observed = self.points[pairs], self._from_present()[pairs]
@@ -116,42 +115,42 @@ class SightingWindow:
         return np.asarray(poses[wide])
 
     def grain(self) -> Array:
-        """Return the covariance (3, 3) of a candidate's error, from the spacing of the candidates and the noise of
-        sightings."""
+        """Return the approximate covariance (3, 3) of the errors of candidates, which are not refined yet."""
         heading = 2.0 * np.pi / HEADINGS / 2.0 if self._missing[-1, 1] else 0.1
         distances = self._ranges[~self._missing[:, 0]]
         position = 0.1 + 0.05 * float(np.median(distances) if len(distances) else RADII[-1])
         return np.diag(np.square((position, position, heading)))
 
     def whitener(self, noise: Array | None = None) -> Array:
-        """Return matrices (K, 2, 2) that whiten the residuals for sensor noise and odometry error, linearised at the
-        measured range and bearing. ``noise`` (3, 3): an additional body-frame covariance of the present pose."""
+        """Return matrices (K, 2, 2) that whiten the residuals of the sightings by sensor noise and odometry error.
+        ``noise`` (3, 3): an additional body-frame covariance of the present pose."""
         error = self._drift
         if noise is not None:
             error = error + self._carried @ noise @ self._carried.transpose(0, 2, 1)
         sightings = np.zeros((len(self.points), 3)), self._from_robot(), self._ranges, self._bearings
         jacobian = linearize_each(self._model.packed, *sightings)[1][..., :POINT]
         covariance = np.eye(2) + jacobian @ error @ jacobian.transpose(0, 2, 1)
-        # without a bearing the direction to the landmark is unknown, so use the odometry error in the worst direction
+        # without a bearing the direction to the landmark is unknown: use the largest odometry error of all directions
         worst = np.linalg.eigvalsh(error[:, :2, :2])[:, -1] / self._sigmas[:, 0] ** 2
         covariance[:, 0, 0] = np.where(self._missing[:, 1], 1.0 + worst, covariance[:, 0, 0])
         return positive.whitener(covariance)
 
     def squared(self, poses: Array, whitener: Array) -> Array:
-        """Return squared norms (N, K) of the whitened residuals at present poses (N, 3). ``whitener``: see :meth:`whitener`."""
+        """Return the squared norms (N, K) of the whitened residuals. ``poses`` (N, 3): present poses. ``whitener``: the
+        result of :meth:`whitener`."""
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
     def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:
-        """Return the losses (N,) of present poses (N, 3): robust losses of the sightings plus the loss of the known
-        start. ``whitener``: see :meth:`whitener`. ``noise`` (3, 3): a body-frame covariance, added for the start."""
+        """Return the losses (N,) of present poses ``poses`` (N, 3): robust losses of the sightings, plus the loss of a
+        known start. ``noise`` (3, 3): body-frame covariance of the poses, for the loss of the start."""
         loss: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return loss if self._start is None else loss + self._start.loss(poses, self.now, noise)
 
     def refined(
         self, poses: Array, whitener: Array, iterations: int, noise: Array | None = None
     ) -> tuple[Array, Array]:
-        """Minimise :meth:`losses` from ``poses`` (N, 3) by Levenberg-Marquardt. Returns the refined present poses (N, 3)
-        and their body-frame covariances (N, 3, 3). ``whitener``, ``noise``: see :meth:`losses`."""
+        """Minimise :meth:`losses` from the initial values ``poses`` (N, 3) by Levenberg-Marquardt. Returns the optimal
+        poses (N, 3) and their body-frame covariances (N, 3, 3)."""
 
         def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
             information, gradient = self._normal_equations(poses, whitener, noise)
@@ -164,15 +163,14 @@ class SightingWindow:
         return optima.states, np.asarray(np.linalg.inv(optima.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """Refine a present pose (3,) by ``iterations`` of Gauss-Newton with correlated odometry errors. Returns it and
-        its body-frame covariance (3, 3). ``whitener``: see :meth:`whitener`.
+        """Refine the present pose ``pose`` (3,) by Gauss-Newton with correlated odometry errors.
 
-        The path since the sightings is marginalised. Residuals e in standard deviations of the sensor have the
-        covariance R = I + J C J'. C is the covariance of the path, and J is the Jacobian of e by the path. On the most
-        likely path the residuals are R^-1 e.
+        Returns the pose and its body-frame covariance (3, 3). The path since the sightings is marginalised. Let e be
+        the residuals, whitened by the sensor noise, J their Jacobian by the path, and C the covariance of the path. The
+        covariance of e is R = I + J C J'. The residuals on the most likely path are R^-1 e.
         """
         covariances = self._covariance
-        if self._start is not None:  # the known start is the first row; it has no robust loss
+        if self._start is not None:  # the known start becomes the first row, without robust loss
             covariances = np.concatenate((self._start.whitened(pose, self.now)[2][None], covariances))
         rows = np.arange(len(covariances))
         common = covariances[np.maximum(rows[:, None], rows)]
@@ -197,28 +195,28 @@ class SightingWindow:
         return pose, covariance
 
     def _recent(self) -> list[int]:
-        """Return the row numbers of the last sightings of at most RECENT landmarks, newest first."""
+        """Return the row number of the last sighting of each landmark, newest first, for at most RECENT landmarks."""
         last = {tuple(p): k for k, p in enumerate(self.points.tolist())}
         return sorted(last.values(), reverse=True)[:RECENT]
 
     def _from_robot(self) -> Array:
-        """Return positions (K, 2) of the landmarks in the robot frame at the sighting. A missing range is replaced by
-        ``RADII[2]``, a missing bearing by 0."""
+        """Return the observed positions (K, 2) of the landmarks in the robot frame at each sighting. Missing ranges are
+        replaced by ``RADII[2]``, missing bearings by 0."""
         ranges = np.where(self._missing[:, 0], RADII[2], self._ranges)
         return located(self._model, ranges, np.where(self._missing[:, 1], 0.0, self._bearings))
 
     def _from_present(self) -> Array:
-        """Return positions (K, 2) of the landmarks in the present robot frame."""
+        """Return the observed positions (K, 2) of the landmarks in the present robot frame."""
         return se2.transform_from(self._back, self._from_robot())
 
     def _residuals(self, poses: Array) -> Array:
-        """Return residuals (N, K, 2) at present poses (N, 3), in standard deviations of the sensor."""
+        """Return residuals (N, K, 2), whitened by the sensor noise, for N present ``poses`` (N, 3)."""
         at = se2.compose(poses[:, None], self._back)
         return residuals(self._model, at, self.points, self._ranges, self._bearings)
 
     def _linearized(self, poses: Array) -> tuple[Array, Array]:
-        """Return residuals (N, K, 2) at present poses (N, 3), in standard deviations of the sensor, and their Jacobians
-        (N, K, 2, 3) by the body-frame perturbation of the present pose."""
+        """Return residuals (N, K, 2), whitened by the sensor noise, for N present ``poses`` (N, 3). Also return their
+        Jacobians (N, K, 2, 3) by the body-frame perturbation of the present pose."""
         at, count = se2.compose(poses[:, None], self._back), len(poses)
         sightings = np.tile(self.points, (count, 1)), np.tile(self._ranges, count), np.tile(self._bearings, count)
         error, jacobian = linearize_each(self._model.packed, at.reshape(-1, 3), *sightings)
@@ -226,8 +224,8 @@ class SightingWindow:
         return error.reshape(*at.shape[:2], 2), jacobian
 
     def _normal_equations(self, poses: Array, whitener: Array, noise: Array | None) -> tuple[Array, Array]:
-        """Return the robustly weighted information (N, 3, 3) and gradient (N, 3) of :meth:`losses` at present poses (N,
-        3). The information includes a nearly flat prior."""
+        """Return the Gauss-Newton Hessian (N, 3, 3) and the gradient (N, 3) of :meth:`losses` for N present poses. The
+        Hessian includes a nearly flat prior."""
         error, jacobian = self._linearized(poses)
         error, jacobian = (whitener @ error[..., None])[..., 0], whitener @ jacobian
         weight = geman_mcclure_weight(np.sum(error**2, axis=-1), self._model.robust)
