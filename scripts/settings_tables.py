@@ -24,8 +24,9 @@ def _rig() -> list[str]:
     top = [setting for setting in settings_in(Rig) if "." not in setting.key and setting.kind == "text"]
     lines = ["## Rig", "", *_own(top)]
     for name in SENSORS.own:
-        for section, settings in sections_of(sensor(name)).items():
-            lines += [f"### [{section}]", "", f"A section of the sensor `{name}`. {about(name)}", "", *_own(settings)]
+        for i, (section, settings) in enumerate(sections_of(sensor(name)).items()):
+            what = f"A section of the sensor `{name}`." + ("" if i else f" {about(name)}")
+            lines += [f"### [{section}]", "", what, "", *_own(settings)]
     return lines
 
 

@@ -64,7 +64,7 @@ class ParticleFilterSettings(FilterSettings):
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     """number of particles; with kld the maximum number"""
     kld: bool = False
-    """whether the number of particles is adapted to the spread of the poses"""
+    """whether the number of particles is adapted to the spread of the poses (KLD sampling)"""
     min_particles: Annotated[int, Field(ge=10, le=1_000_000)] = 500
     """minimum number of particles with kld"""
     resample_below: Annotated[float, Field(ge=1e-6, le=1.0)] = 0.5
@@ -72,10 +72,10 @@ class ParticleFilterSettings(FilterSettings):
     smoothing_trajectories: Annotated[int, Field(ge=10, le=10_000)] = 100
     """number of trajectories that are drawn backwards for the final result"""
     smoothing_interval: Annotated[float, Field(ge=0.1, le=60.0), InUnit("s")] = 1.0
-    """time between the stored particle sets through which these trajectories are drawn"""
+    """time between the stored particle sets that trajectories of the final result pass through"""
     self_calibration: bool = True
     """whether each particle estimates the sensor constants that have an uncertainty in the rig, except the time offset
-    of landmarks, and constants of a camera, which increase its noise instead"""
+    of landmarks and the constants of a camera; the uncertainty of camera constants increases the noise of pixels"""
 
 
 class _CloudView(FilterView):

@@ -115,9 +115,9 @@ class PositionSettings(SensorSettings):
     """Settings of a system that measures the position of a point on the robot."""
 
     x: Offset = 0.0
-    """position of the point on the robot, forward"""
+    """position of the measured point on the robot, forward"""
     y: Offset = 0.0
-    """position of the point on the robot, to the left"""
+    """position of the measured point on the robot, to the left"""
     sigma: Annotated[float, Field(ge=1e-4, le=100.0), InUnit("m")] = 0.3
     """standard deviation of x and y if the log has no plausible covariance"""
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0

@@ -41,11 +41,11 @@ class RfidUncertainty(FileModel):
     defaults are multiples of the largest setting ``prior.range_scale`` of the detection models."""
 
     yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
-    """standard deviation of a yaw that all antennas share; by default 0.35 times range_scale"""
+    """standard deviation of a yaw that all antennas share; by default 0.35 times the largest prior.range_scale"""
     antenna_yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
-    """standard deviation of an additional yaw of each of several antennas; by default 0.25 times range_scale"""
+    """standard deviation of an additional yaw of each of several antennas; by default 0.25 times the largest prior.range_scale"""
     time_offset: Annotated[float, Field(ge=0.0, le=1.0), InUnit("s")] | None = None
-    """standard deviation of the time offset; by default 0.4 times range_scale"""
+    """standard deviation of the time offset; by default 0.4 times the largest prior.range_scale"""
 
 
 BY_RANGE = {"yaw": 0.35, "antenna_yaw": 0.25, "time_offset": 0.4}  # rad, rad, s; default values for range_scale = 1
@@ -68,7 +68,7 @@ class BeamSettings(FileModel):
     sigma_phi: Annotated[float, Field(ge=1e-3, le=10.0), InUnit("rad")] = 0.698
     """beam: width of the beam, as standard deviation of the bearing"""
     behind: Annotated[float, Field(ge=1e-3, le=1.0)] = 1.0
-    """beam: factor of the probability behind a tag whose facing is known"""
+    """beam: read probability from behind a tag, relative to that from its front"""
 
     def model(self) -> DetectionModel:
         return BeamModel(self.p0, self.r_max, self.s_r, self.sigma_phi, self.behind)

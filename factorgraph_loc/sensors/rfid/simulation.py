@@ -84,7 +84,7 @@ class Silence(FileModel):
     """An interval without reads by any antenna."""
 
     time: Duration
-    """start of the interval"""
+    """start of the interval without reads"""
     duration: Duration
     """duration of the interval"""
 

@@ -37,9 +37,8 @@ def configs(seen: str) -> dict[str, RunConfig]:
 def section(options: Options) -> Report:
     report = Report("slam", options)
     report.say(
-        "The start pose is known to 0.1 m and 0.05 rad. Only tags reduce its error later. *Aligned*: the final "
-        "trajectory is aligned "
-        "with the reference, which removes the error of the start pose."
+        "The start pose is known to 0.1 m and 0.05 rad. Its error remains in all poses of a run, unless tags reduce it. "
+        "*Aligned*: the final trajectory is aligned with the reference, which removes the error of the start pose."
     )
     for name, runs, usual, first, folder in (
         ("identified", RUNS, DURATION, FIRST, None),

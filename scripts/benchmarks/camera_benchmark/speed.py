@@ -84,8 +84,8 @@ def chain(report: Report, options: Options) -> None:
         report.say(
             f"The log has {links.images} images of 640 x 480 px with at most {COUNT} features (`{links.feature}`) each, "
             "and a map of "
-            f"{links.points} points. {os.cpu_count()} threads detect features, the other steps use one thread. *Smooth*: "
-            "time of the smoother without *associate*."
+            f"{links.points} points. {os.cpu_count()} threads detect features, the other steps use one thread. *Associate*: "
+            "matching of features with the map. *Smooth*: time of the smoother without *associate*."
         )
         whole = links.find + links.follow + links.associate + links.smooth
         parts = {name: getattr(links, name) for name in ("find", "follow", "associate", "smooth")}

@@ -34,7 +34,7 @@ class Case:
 CASES = (
     Case("range 20 % too long", "r_max", 4.5, 5.4),
     Case("range 20 % too short", "r_max", 4.5, 3.6),
-    Case("more reads than there are", "p0", 0.5, 0.9),
+    Case("read probability too high", "p0", 0.5, 0.9),
 )
 
 
