@@ -38,8 +38,8 @@ class Cloud:
     """N weighted particles at one time.
 
     ``poses`` (N, 3). ``constants`` (N, P): each particle's estimated constants of odometry and sensors.
-    ``log_weights`` (N,): normalised. ``localized``: True if there is only one mode.
-    ``parts``: the columns of each named block in ``constants``. ``odometry``: the integrated odometry at the time of the particles.
+    ``log_weights`` (N,): normalised. ``localized``: True if there is only one mode. ``parts``: for each sensor by name,
+    the columns of its constants in ``constants``. ``odometry``: the integrated odometry at the time of the particles.
     """
 
     poses: Array
@@ -65,8 +65,8 @@ class Cloud:
         return mean[3:], covariance
 
     def _errors(self) -> tuple[Array, Array, Array]:
-        """For each particle the body-frame perturbation of its pose from the mean pose, and its constants (N, 3+P).
-        Also returns their mean (3+P,) and covariance (3+P, 3+P)."""
+        """The body-frame perturbations from the mean pose and the constants of all particles (N, 3+P), with the mean
+        (3+P,) and the covariance (3+P, 3+P) of these values."""
         errors = np.concatenate((se2.twists_to(self.moments[0], self.poses), self.constants), axis=1)
         return errors, *vector_moments(errors, self.weights)
 
@@ -81,8 +81,8 @@ class Cloud:
         return replace(self, constants=np.concatenate((self.constants, drawn), axis=1), parts=parts)
 
     def weighed(self, likelihood: Array, share: float) -> tuple[Cloud, float]:
-        """Multiply the weights by a likelihood to the power of ``share``. ``likelihood`` (N,): the log-likelihood of each particle.
-        Returns the new cloud, and the logarithm of the weighted mean of likelihood to the power of ``share``."""
+        """Return the cloud with the weights multiplied by a likelihood to the power of ``share``. Also returns the
+        logarithm of the weighted mean of this power. ``likelihood`` (N,): the log-likelihood of each particle."""
         weighed = self.log_weights + share * likelihood
         log_weights = normalised(weighed)
         heaviest = int(np.argmax(weighed))
@@ -97,12 +97,11 @@ class Cloud:
     def density(self) -> tuple[Cloud, Array]:
         """Return a kernel density with the same moments as the particles.
 
-        The poses are shrunk towards their mean, and each gets a Gaussian kernel (Liu, West, in "Sequential Monte Carlo Methods in
-        Practice", 2001, eq. 10.3.8), whose width depends on the number of particles (:func:`silverman`). The sensor constants are
-        drawn from a Gaussian given the pose. Resampling of the constants themselves would soon leave only few distinct values.
+        The poses are shrunk towards their mean, and each gets a Gaussian kernel (Liu, West, in "Sequential Monte Carlo
+        Methods in Practice", 2001, eq. 10.3.8). The sensor constants are a Gaussian given the pose.
 
-        Returns the shrunk cloud, and the covariance (3+P, 3+P) of the kernel for the pose's body-frame perturbation and the
-        constants. If the cloud has several modes, the poses are not shrunk and the kernel's covariance of the pose is zero.
+        Returns the shrunk cloud, and the covariance (3+P, 3+P) of the kernel for the pose's body-frame perturbation and
+        the constants. If the cloud has several modes, the poses are not shrunk and have a kernel of width zero.
         """
         weights = self.weights
         middle, _ = self.moments
@@ -158,8 +157,8 @@ class Cloud:
 
 
 class Corrected(NamedTuple):
-    """A ``cloud`` after a correction by a likelihood. ``evidence``: the logarithm of the mean likelihood over the particles.
-    ``left``: the exponent of the part of the likelihood that is not yet applied, or 0."""
+    """A ``cloud`` after a correction by a likelihood. ``evidence``: the logarithm of the likelihood's mean over the
+    particles. ``left``: the sum of the exponents that are not yet applied, see :func:`corrected`."""
 
     cloud: Cloud
     evidence: float
@@ -177,14 +176,15 @@ def corrected(
     left: float = 1.0,
     to_end: bool = True,
 ) -> Steps[Corrected]:
-    """Progressive correction of particles by a likelihood (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods
+    """Correct particles by a likelihood in several steps (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods
     in Practice", 2001, section 12.4).
 
-    The likelihood is written as a product of powers, whose exponents have the sum 1. The powers are applied one by one.
-    Each exponent is the largest that keeps enough effective particles. The particles are resampled after each step.
+    Each step multiplies the weights by a power of the likelihood, then resamples. The exponents have the sum 1. Each
+    exponent is the largest that keeps enough effective particles.
 
-    ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a resampled cloud.
-    ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the time of the measurement.
+    ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a
+    resampled cloud. ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the
+    time of the measurement.
     ``below``: after the last step, particles are resampled only if the effective number is below this fraction of N.
     ``left``: the sum of the exponents to apply. ``to_end``: False to omit the last step.
 
@@ -270,7 +270,7 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 
 
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
-    """Replace values of a log-likelihood (N,) that are not finite by ``-inf``, which gives these particles no weight.
+    """Return a log-likelihood (N,) with ``-inf`` instead of values that are not finite, so that these weigh nothing.
 
     ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement. Raises
     RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
@@ -289,7 +289,7 @@ def effective_size(log_weights: Array) -> float:
 
 
 def normalised(log_weights: Array) -> Array:
-    """Normalise log-weights (N,), so that the weights have the sum 1."""
+    """Return log-weights (N,) normalised, so that the weights have the sum 1."""
     log_weights = log_weights - log_weights.max()
     return np.asarray(log_weights - np.log(np.sum(np.exp(log_weights))))
 
@@ -315,10 +315,10 @@ def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def _inflated(covariance: Array, lost: float) -> Array:
-    """Divide a covariance by ``1 - lost``, because it is too small by this factor."""
+    """Return a covariance divided by ``1 - lost``."""
     return covariance / max(1.0 - lost, 0.5)
 
 
 def _normalised_moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """:func:`pose_moments` with weights of any sum."""
+    """Return the result of :func:`pose_moments` for weights of any sum."""
     return pose_moments(poses, weights / weights.sum())

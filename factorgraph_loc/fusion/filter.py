@@ -40,7 +40,7 @@ class _Checkpoint(NamedTuple):
     """A copy of a filter's state, to return to if a late measurement arrives.
 
     ``state``: the estimate. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time. ``records``,
-    ``ticks``: the numbers of records and ticks so far.
+    ``ticks``: the numbers of records for smoothing and of times at which the run recorded the pose, so far.
     """
 
     state: Any
@@ -75,7 +75,7 @@ class FilterView:
         return np.asarray(self._filter._motion.poses_at(self._filter._odometry, times, values))
 
     def earlier(self, t: float) -> EarlierPose | None:
-        """None, because filters have no estimates of earlier poses."""
+        """Return None, because filters have no estimates of earlier poses."""
         return None
 
     def track(self) -> Tracked:
@@ -88,7 +88,7 @@ class FilterView:
 
 
 class Filter(Timeline):
-    """A recursive estimator. It predicts its state along the odometry to the time of each measurement, then updates the state.
+    """A recursive estimator. It predicts its state by odometry to the time of each measurement, then updates the state.
 
     A state is replaced and never changed in place, so that a checkpoint needs no copy.
     """
@@ -172,7 +172,7 @@ class Filter(Timeline):
         """Return the data of the present state that :meth:`trajectory` needs, with an attribute ``t``, the time [s]."""
 
     def _seek(self, m: Any) -> Any:
-        """Use a measurement to find the unknown start pose. Returns the first state, or None if the pose is not yet determined."""
+        """Search the start pose with a measurement. Returns the first state, or None if the pose is still unknown."""
         return None
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:

@@ -146,8 +146,8 @@ def _positive(covariance: Array, where: str = "") -> Array:
 
 
 def nearest_positive(covariance: Array) -> Array | None:
-    """Return a symmetric and positive definite covariance (D, D) unchanged. If it is so except for rounding errors,
-    return the nearest symmetric and positive definite matrix. Otherwise return None."""
+    """Return a symmetric and positive definite covariance (D, D) unchanged. If rounding errors have made it asymmetric
+    or indefinite, return the nearest symmetric and positive definite matrix. Otherwise return None."""
     sigmas = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(covariance)) and np.all(sigmas > 0.0)):
         return None

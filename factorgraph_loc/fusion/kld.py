@@ -22,10 +22,10 @@ def enough(cells: Array | NDArray[np.int64]) -> Array:
 
 
 def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int64]:
-    """Select a random subset of ``poses`` (N, 3) that is large enough by KLD sampling, and has at least ``least`` poses.
+    """Return the indices of a random subset of ``poses`` (N, 3), with at least ``least`` poses, chosen by KLD sampling.
 
-    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy. If it
-    never is, all are selected. Returns the indices of the selected poses.
+    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy, or until
+    all are added.
     """
     order = rng.permutation(len(poses))
     _, first = np.unique(cell_numbers(poses[order], CELL), return_index=True)
@@ -36,11 +36,11 @@ def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int
 
 
 def jittered(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator, room: Array | float = 0.0) -> Array:
-    """Draw one particle from a Gaussian kernel around each of the particles ``rows`` (K,) of ``poses`` (N, 3). Returns (K, 3).
+    """Return a random pose (K, 3) near each of the ``poses`` (N, 3) with the indices ``rows`` (K,), from Gaussian
+    kernels.
 
-    The kernel's width is proportional to the mean distance between particles. This distance is the cube root of the volume per
-    particle: the number of occupied grid cells, divided by the number of distinct particles. ``room`` (K,): a lower limit of the
-    volume around each particle, in cells. The kernel is much narrower than a mode, so several modes stay separate.
+    The kernel's width is proportional to the cube root of the volume per particle: the number of occupied grid cells,
+    divided by the number of distinct particles. ``room`` (K,): a lower limit of this volume for each particle.
     """
     chosen = poses[rows]
     cells = len(np.unique(cell_numbers(chosen, CELL)))

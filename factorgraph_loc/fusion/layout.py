@@ -23,8 +23,8 @@ POSE = 3  # number of components of the pose, which are the first components of 
 
 @dataclass(frozen=True)
 class Layout:
-    """The order of the blocks of an error state that follow the pose: sensor constants and landmarks. ``sizes``: the
-    number of components of each block, by name."""
+    """The layout of an error state: the pose, then blocks of sensor constants and landmarks. ``sizes``: the number of
+    components of each block, by name, in the order of the blocks."""
 
     sizes: Mapping[str, int] = field(default_factory=dict)
 
@@ -66,11 +66,12 @@ def on_pose(observation: Observation, view: View) -> Observation:
 def learnt_from(
     constants: Mapping[str, Estimated], blocks: Iterable[tuple[str, Array, Array]], points: PointMap | None = None
 ) -> Learnt:
-    """Make the report of estimated constants and landmarks.
+    """Return a report of estimated constants and landmarks.
 
-    ``constants``: the estimated constants of each sensor. ``blocks``: name, mean and covariance of each block of the state. A block
-    is one of ``constants``, the constant of a landmark (1 component), or a landmark ``KIND/NAME`` (2 components). Larger blocks are
-    points in space and are left out. ``points``: a map of the points that were estimated, or None.
+    ``constants``: the estimated constants of each sensor. ``blocks``: name, mean and covariance of each block of the
+    state. A block has the constants of a sensor (see ``constants``), the constant of a landmark (1 component), or the
+    position of a landmark called ``KIND/NAME`` (2 components). Larger blocks are points in space and are left out.
+    ``points``: a map of estimated points, or None.
     """
     values: dict[str, tuple[float, float]] = {}
     landmarks: dict[str, LearntPoint] = {}

@@ -226,7 +226,7 @@ class ParticleFilter(Filter):
         return cloud
 
     def _cloud(self, poses: Array, previous: Cloud | None = None) -> Cloud:
-        """Particles of equal weight at poses (N, 3). Their constants are drawn from the cloud ``previous``, or from the prior."""
+        """Return particles of equal weight at ``poses`` (N, 3), with constants drawn from ``previous`` or the prior."""
         count = len(poses)
         poses[:, 2] = se2.wrap(poses[:, 2])
         log_weights = np.full(count, -np.log(count))
@@ -268,10 +268,9 @@ class ParticleFilter(Filter):
         return pose, se2.body_to_world_one(pose, body)
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
-        """Move the particles of ``cloud`` by an odometry increment, each with its own constants, and with body-frame ``noise``.
+        """Move the particles of ``cloud`` by an odometry increment, with their own constants and body-frame ``noise``.
 
-        Returns the poses (N, 3), and the transition (3, 3+P) from body-frame perturbation and constants to the pose. Constants are
-        linearised at their mean. The effect of a particle's difference from the mean is added to the noise.
+        Returns the poses (N, 3), and the Jacobian (3, 3+P) of the pose by body-frame perturbation and constants.
         """
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
@@ -325,7 +324,7 @@ class ParticleFilter(Filter):
         view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:
-            # mark the records since the estimated pose became wrong, so that smoothing does not use them
+            # mark the records since the estimated pose became wrong, so that smoothing does not continue from them
             self._records = [r.lost() if r.t >= refuted.since else r for r in self._records]
             self.diagnostics.event(self._t, "lost", LOST, why=refuted.why, since=refuted.since)
             self._lost = True
@@ -337,9 +336,11 @@ class ParticleFilter(Filter):
         self._changes = [(rejected, change) for rejected, change in self._changes if rejected <= self._t]
 
     def _weigh(self, observation: Observation) -> float:
-        """Weigh the particles by an observation (:func:`~factorgraph_loc.fusion.cloud.corrected`). Returns the
-        logarithm of the mean likelihood. If weighing is costly, only a few particles are corrected by most of the
-        likelihood. All particles are then drawn from these few, and corrected by the rest."""
+        """Weigh the particles by an observation, and return the logarithm of the mean likelihood.
+
+        If weighing is costly, a few particles are corrected first (:func:`~factorgraph_loc.fusion.cloud.corrected`).
+        All particles are then drawn from these few, and corrected by the last step.
+        """
         cloud, count, enough = self._state, self._settings.particles, self._settings.resample_below
 
         @in_one_step
@@ -356,9 +357,8 @@ class ParticleFilter(Filter):
 
         evidence, left = 0.0, 1.0
         if count > FEW and observation.work * count > HEAVY:
-            doubted = (
-                self._search.doubts
-            )  # while sensors contradict the pose, the search may soon replace all particles
+            # while sensors contradict the pose, a few particles are enough, because the search may soon replace all
+            doubted = self._search.doubts
             few, evidence, left = correct(cloud.thinned(FEW), FEW, enough, left, to_end=doubted)
             if doubted:
                 self._state = few

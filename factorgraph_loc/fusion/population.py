@@ -135,7 +135,7 @@ class Population:
 
     @property
     def best(self) -> PosePrior | None:
-        """The robot's pose at the last observation. None if no mode has exceeded a probability in :data:`CLEAR` for long enough."""
+        """The robot's pose at the last observation, None if no mode meets a limit in :data:`CLEAR`."""
         at = self.newest
         if at is None or all(at.t < since + lasts for since, (_, lasts) in zip(self._since, CLEAR, strict=True)):
             return None
@@ -144,7 +144,7 @@ class Population:
 
     @property
     def particles(self) -> tuple[Array, Array]:
-        """The particles' poses (N, 3) at the last observation and weights (N,). Both are empty before the first observation."""
+        """Poses (N, 3) and weights (N,) of the particles at the last observation. Empty before the first one."""
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
@@ -171,8 +171,8 @@ class Population:
         return done
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Draw ``count`` poses (N, 3) at the last observation, around :attr:`best`, or from all particles if that is
-        None. Empty before the first observation."""
+        """Return ``count`` random poses (N, 3) at the last observation: around :attr:`best` or, if it is None, drawn
+        from all particles. The array is empty before the first observation."""
         if self._cloud is None:
             return np.empty((0, 3))
         best, weights = self.best, self._cloud.weights
@@ -280,7 +280,7 @@ class Population:
 
 
 def _cloud(poses: Array, log_weights: Array) -> Cloud:
-    """Make a cloud of particles from poses (N, 3) and log-weights (N,), without constants, and with possibly several modes."""
+    """Return particles with poses (N, 3) and log-weights (N,), without constants, and with possibly several modes."""
     return Cloud(poses, np.zeros((len(poses), 0)), log_weights, localized=False)
 
 

@@ -32,8 +32,9 @@ class Description:
 
 
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
-    """Return the settings of the estimator ``name``: the defaults, changed by ``overrides``. These are values by dotted
-    key, without the estimator's name in the key.
+    """Return the settings of the estimator ``name``: the defaults, changed by ``overrides``.
+
+    ``overrides``: values by key. A key has dots between its parts, and does not contain the estimator's name.
 
     Raises InputError if the estimator or a key is unknown, or if a value is out of bounds.
     """

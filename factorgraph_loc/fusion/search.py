@@ -28,14 +28,15 @@ from factors.se2 import Array
 
 DURATION = 60.0  # s: observations of this duration are kept
 SLICE = 2_500_000  # computing cost of one slice of the search, in the unit of the module `population`
-PAUSE = 0.05  # s: minimum time between two slices, so that a measurement and a tick at one time cause only one
+PAUSE = 0.05  # s: minimum time between two slices, so that a measurement and a request at one time cause only one
 
 
 class Search:
     """A global search for the robot's pose. See the module docstring.
 
-    ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space; None means the
-    bounds of the sensors' maps. ``fewest``: the minimum number of particles. ``work``: the computing cost of one slice.
+    ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space that contains the robot. If it
+    is None, particles are drawn within the bounds of the sensors' maps. ``fewest``: the minimum number of particles.
+    ``work``: the computing cost of one call of :meth:`advance`.
     """
 
     def __init__(
@@ -72,7 +73,7 @@ class Search:
         return sensor.name in self._sensors
 
     def remember(self) -> None:
-        """Keep odometry for longer than usual. A later search needs it."""
+        """Keep odometry for longer than usual, because a later search needs it."""
         self._motion.horizon = self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:
@@ -85,8 +86,11 @@ class Search:
             self._population = self._new_population(start)
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process a measurement while the pose is unknown. ``odometry``: the integrated odometry at its time. Returns True if the
-        result of the search may have changed: the measurement was informative, or the particles completed an observation."""
+        """Process the measurement ``m`` while the pose is unknown. Returns True if the result may have changed.
+
+        The result changes if the measurement is informative, or if the particles have processed an observation
+        completely. ``odometry``: the integrated odometry at the time of the measurement.
+        """
         sensor, finder = self._sensors.get(m.source), self._finders.get(m.source)
         if sensor is None:
             return False
@@ -100,11 +104,10 @@ class Search:
         return self.advance(odometry.t) or is_informative
 
     def queue(self, observation: Evidence, odometry: ChainState) -> None:
-        """Queue an observation that does not come from the search's sensors, such as the free distances of a proximity
-        sensor. ``odometry``: the integrated odometry at its time.
+        """Queue an observation of another sensor than the search's, such as the free distances of a proximity sensor.
 
-        :meth:`advance` then weighs the particles by it. The observation is ignored before the particles have processed
-        their first one.
+        :meth:`advance` weighs the particles by queued observations. Before the particles have processed an observation
+        of the search's sensors, others are ignored. ``odometry``: the integrated odometry at the observation's time.
         """
         if self._population is not None and self._population.newest is not None:
             self._population.add(odometry, observation)
@@ -136,8 +139,7 @@ class Search:
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """True if the particles reject ``place``, a pose from one sensor, or have not processed all measurements
-        yet."""
+        """True if the particles reject ``place``, a pose from one sensor, or have unprocessed observations."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
@@ -153,8 +155,7 @@ class Search:
         ]
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
-        """Return the particles' poses (N, 3) at time ``t`` [s] and weights (N,), None if the result has another
-        source."""
+        """Return poses (N, 3) at time ``t`` [s] and weights (N,) of the particles, None if no particles are used."""
         leading = self._leading
         if not isinstance(leading, Population) or leading.newest is None:
             return None
@@ -192,7 +193,7 @@ class Search:
         return next(iter(informative), None)
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
-        """True if the particles' last observation of this sensor is long enough before ``t`` [s], so that they need a new one."""
+        """True if the particles need an observation of this sensor at ``t`` [s], long enough after their last one."""
         last = self._last.get(sensor.name, -math.inf)
         if t <= last or t < last + sensor.evidence_every:
             return False

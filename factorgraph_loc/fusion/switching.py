@@ -51,7 +51,8 @@ class _PoseBelief:
 
 
 class Switching:
-    """The fusion rule of Raoui, Bouyakhf and Devy (2011): a particle filter while RFID tags are read, otherwise an EKF."""
+    """An estimator that uses a particle filter while RFID tags are read, otherwise an EKF (Raoui, Bouyakhf, Devy,
+    2011)."""
 
     deterministic = False
     takes_rows = True
@@ -126,7 +127,7 @@ class Switching:
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """Return the smoothed estimates at the ticks, or the causal ones if the setting ``smooth`` is false."""
+        """Return the smoothed poses, or the causal poses if the setting ``smooth`` is false."""
         times = sorted(self._records)
         records = [self._records[t] for t in times]
         track = [(r.pose, r.covariance) for r in records[-1:]]
@@ -146,7 +147,7 @@ class Switching:
         self._records = {t: record for t, record in self._records.items() if t >= until}
 
     def _hand_over(self, successor: Filter) -> None:
-        """Make ``successor`` the active filter, starting at the present pose. Do nothing if the active filter is not localized."""
+        """Make ``successor`` the active filter, starting at the present pose, if the active filter is localized."""
         if successor is self._active:
             return
         now = self._active.estimate()

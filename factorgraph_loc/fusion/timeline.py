@@ -38,17 +38,17 @@ class Taken(NamedTuple):
 
 
 class Timeline(ABC):
-    """The base of estimators that process measurements in the order of time. ``modalities``: the kinds of sensors they use."""
+    """The base class of estimators that process measurements in order of time. ``modalities``: the used sensors."""
 
     deterministic = True
-    takes_rows = True  # several measurements of odometry may arrive joined to one
+    takes_rows = True  # one measurement may contain several rows of odometry
     # the kinds of sensors that the estimator uses; measurements of other sensors are only counted as ignored
     modalities: Container[str] = EVERY
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics, max_delay: float) -> None:
         self.diagnostics, self._motion, self._max_delay = diagnostics, motion, max_delay
         self._sensors: dict[str, Sensor] = {}  # by name
-        self._t = -math.inf  # s; the time of the newest measurement or tick
+        self._t = -math.inf  # s; the time of the newest measurement or recorded pose
         self._begun = math.inf  # s; the time of the estimator's start, infinite before the start
         self._taken: deque[Taken] = deque()  # the last measurements, in the order of processing
         self._seeking: Tracking | None = None  # the search for the start pose, None if there is none
@@ -68,7 +68,7 @@ class Timeline(ABC):
             self._process(measurement)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """Return the pose at the time of the newest measurement or tick, or at ``t`` [s] if that is later.
+        """Return the pose at the time of the newest measurement or recorded pose, or at ``t`` [s] if that is later.
 
         Before the start, the estimate is the most likely hypothesis of the search with the status ``ambiguous``, or NaN
         with the status ``unlocalized`` if there is none. After the start, the status is ``ambiguous`` while a search is

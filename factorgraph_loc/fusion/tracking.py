@@ -38,7 +38,7 @@ from factors.se2 import Array
 from factors.update import Correction
 
 REFUTING = 8.0  # the estimated track is rejected above these log-odds, which are high because robots are rarely carried
-BEFORE = 2.0  # s: the robot left the track at most this long before a sensor's first doubt or the first observation against it
+BEFORE = 2.0  # s: the robot left the track at most this long before the first observation that contradicts the track
 # the robot may have left the track at any time with a log-likelihood that is less than this below the maximum
 UNSURE = 5.0
 NEAR, SURE = 0.5, 0.9  # m: a pose is known if its error is below NEAR with probability SURE
@@ -134,7 +134,8 @@ class Tracking(Search):
         return is_doubted(self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
-        """Report an observation before it corrects the pose, for sensors that check the track. ``view``: the state."""
+        """Process an observation before it corrects the pose. Some sensors check the track with it. ``view``: the
+        estimator's state."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
             self._looked.append(odometry.t)
@@ -156,11 +157,11 @@ class Tracking(Search):
             self._population.add(*self._kept[-1])
 
     def refuted(self, m: Any, track: Callable[[], Tracked], pose_at: Callable[[float, Array], Array]) -> Refuted | None:
-        """Check whether the track must be rejected. Call this after each measurement and at each tick.
+        """Return the rejection of the track, None if it is not rejected. Call this after each measurement.
 
-        ``m``: the measurement or tick. ``track()``: returns the track's estimate at that time. ``pose_at(t, best)``:
-        returns the robot's pose (3,) at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now. Returns None if
-        the track is not rejected. If it is rejected, :attr:`best` is the robot's pose.
+        If the track is rejected, :attr:`best` is the robot's pose. ``m``: the measurement, or the time of a recorded
+        pose. ``track()``: returns the estimate of the track at that time. ``pose_at(t, best)``: returns the robot's
+        pose (3,) at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now.
         """
         if isinstance(m, Tick) and not self.waits:
             return None
@@ -200,7 +201,7 @@ class Tracking(Search):
         return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at), FOUND)
 
     def brought(self, best: PosePrior, now: ChainState) -> PosePrior:
-        """Move ``best``, a pose of the search, by odometry to the later time of the odometry state ``now``."""
+        """Return ``best``, a pose of the search, moved by odometry to the later time of the odometry state ``now``."""
         if best.t >= now.t:
             return best
         since = self._motion.relative(self._motion.state(best.t), now)
@@ -269,7 +270,7 @@ class _Compared(NamedTuple):
 
 class SlipMonitor:
     """A detector of wrong odometry (wheel slip, carried robot), which uses the observations that corrected the pose.
-    While the odometry is wrong, it marks the ``motion`` as unknown. It adds an event to the ``diagnostics``."""
+    While the odometry is wrong, ``motion`` is marked as unknown. Each detection is an event in ``diagnostics``."""
 
     def __init__(self, motion: Motion, diagnostics: Diagnostics) -> None:
         self._motion, self._diagnostics = motion, diagnostics
@@ -311,9 +312,11 @@ class SlipMonitor:
         return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the assumed start of the error:
-        the time of the first observation from ``begin`` on that is not surprising. The log-odds are zero with too few
-        observations or too little motion."""
+        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the time when the error begins.
+
+        This is the time of the first observation from ``begin`` on that agrees with its prediction. The log-odds are
+        zero with too few observations or too little motion.
+        """
         rows = [row for row in self._rows if row.odometry.t >= begin]
         while rows and surprise(rows[0].correction) > 1.0:
             del rows[0]

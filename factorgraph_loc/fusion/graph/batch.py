@@ -18,13 +18,12 @@ from factors.se2 import Array
 
 ITERATIONS_PER_WIDTH = 5
 WIDEST = 8.0  # the initial factor on the scales of robust losses, if the initial values are rough
-NARROWED = 0.5  # the ratio of the scales of a step to those of the step before
+NARROWED = 0.5  # each step of graduated non-convexity multiplies the scales by this
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
-    """Return all measurements of a graph as one problem. ``width`` multiplies the scales of robust losses.
-    ``link_width`` multiplies the scales of the losses of links (factors between two poses, such as loop closures)
-    instead."""
+    """Return all measurements of a graph as one problem. ``link_width`` multiplies the scales of the robust losses of
+    links (factors between two poses, such as loop closures), ``width`` those of all other robust losses."""
     assert graph.prior is not None
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
@@ -72,11 +71,11 @@ def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, S
 
 
 def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, Array]:
-    """Solve a graph with all its measurements. Observations of points that are certainly false matches are removed.
+    """Solve a graph with all its measurements. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of keyframes.
 
-    ``start``: initial values of all variables. ``is_guess``: True if the initial values are rough, so that graduated non-convexity
-    is needed. Returns the poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes. The estimates of all other variables
-    are written into the graph. Raises RunFailedError if the measurements do not determine a variable.
+    The estimates of all other variables are written into the graph. Observations of points that are certainly false
+    matches are removed. ``start``: initial values of all variables. ``is_guess``: True to use graduated non-convexity,
+    because the initial values are rough. Raises RunFailedError if the measurements do not determine a variable.
     """
     graph.drop_astray(graph.keyframes.values(), start)
     problem, best = best_optimum(graph, start, WIDEST if is_guess else 1.0)

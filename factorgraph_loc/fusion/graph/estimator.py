@@ -116,8 +116,8 @@ class Smoother(Timeline):
             self._doubt(m)
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """Return the newest keyframe's pose, predicted by odometry. With ``final_only`` it is a rough estimate with the
-        status ``unlocalized``."""
+        """Return the newest keyframe's pose, predicted by odometry. With the setting ``final_only``, this is a rough
+        estimate with the status ``unlocalized``."""
         at = self._t if t is None else max(t, self._t)
         pose, _, covariance = self._graph.moved(at)
         doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
@@ -134,8 +134,8 @@ class Smoother(Timeline):
         return _learnt(end.graph, end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
-        """Return the best estimate of all poses since the start, at the ticks (the times at which a run records the
-        pose). Empty if the start pose was never found."""
+        """Return the best estimate of all poses since the start, at the times at which a run records the pose.
+        The trajectory is empty if the start pose was never found."""
         if self._graph.prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         end = self._concluded()
@@ -266,10 +266,10 @@ def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Arr
 
 
 def _trajectory(graph: Graph, poses: Array, covariances: Array) -> Trajectory:
-    """Return the trajectory at the ticks, interpolated between keyframes. See :func:`factors.motion.poses_between`.
+    """Return the trajectory at the times at which the run records the pose, interpolated between keyframes.
 
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the final poses of all keyframes and their body-frame covariances.
-    Ticks at which the pose is unknown, because the robot was carried, are left out.
+    Times at which the pose is unknown, because the robot was carried, are left out.
     """
     newest = {tick.t: tick for tick in graph.ticks}
     stamps = np.array(sorted(newest))

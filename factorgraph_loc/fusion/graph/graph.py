@@ -61,10 +61,11 @@ Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
 class Keyframe:
     """A pose variable of the graph.
 
-    ``index``, ``key``: its number and its key. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time.
-    ``from_previous``: the motion since the previous keyframe. ``factor``: the factor of this motion, None until it is needed.
-    ``is_elsewhere``: True if the robot was carried from the previous keyframe to this one. ``nodes``: the factors of measurements.
-    ``causal``: the estimate while this was the newest keyframe. ``final``: the estimate when it left the window.
+    ``index``, ``key``: its number and its key. ``t`` [s], ``odometry``: its time, and the integrated odometry at that
+    time. ``from_previous``: the motion since the previous keyframe. ``factor``: the factor of this motion, None until
+    it is needed. ``is_elsewhere``: True if the robot was carried since the previous keyframe. ``nodes``: the factors of
+    measurements. ``causal``: the estimate while this keyframe was the newest. ``final``: the estimate when this
+    keyframe left the window.
     """
 
     index: int
@@ -116,9 +117,10 @@ def jumps(guess: Guess, pose: Array) -> bool:
 class Mapper:
     """Adds observed points that the map lacks to the graph, as variables. This base class adds nothing.
 
-    ``sensor``: the name of the sensor, "" for none. ``fewest``: the minimum number of observations of a point in the graph.
-    ``horizon``: the number of recent keyframes that the mapper needs. ``rejected``: the message for rejected observations.
-    ``estimates``: True if points become variables. ``knows_scale``: False if only odometry determines the scale of the points.
+    ``sensor``: the name of the sensor, "" for none. ``fewest``: the minimum number of observations of a point in the
+    graph. ``horizon``: the number of recent keyframes that the mapper needs. ``rejected``: the message for rejected
+    observations. ``estimates``: True if points become variables. ``knows_scale``: False if only odometry determines the
+    scale of the points.
     """
 
     sensor: str = ""
@@ -153,13 +155,13 @@ class Mapper:
         """Discard all points except those with these ``keys``."""
 
     def forget(self, first: Keyframe) -> Sequence[int]:
-        """Delete the data of keyframes before ``first``, and of points that have left the graph without an observation
-        from ``first`` or later. Returns the keys of these points."""
+        """Delete the data of keyframes before ``first``. Also delete points that have left the graph, if ``first`` and
+        later keyframes do not observe them. Returns the keys of the deleted points."""
         return ()
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        """Return a map of all points that were ever in the graph and are not deleted, or None. ``values``,
-        ``covariances``: the estimates of points and keyframes by key."""
+        """Return a map of all points that were ever in the graph and are not deleted, None if there are none.
+        ``values``, ``covariances``: the estimates of points and keyframes by key."""
         return None
 
 
@@ -220,7 +222,7 @@ class Graph:
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
-        """Remove the keyframes from number ``first`` on, and the trajectory after them or after the time ``t`` [s]."""
+        """Remove the keyframes from number ``first`` on. The trajectory is cut before them, and before ``t`` [s]."""
         for index in range(first, self.newest.index + 1):
             del self.keyframes[index]
         self.newest = self.keyframes[first - 1]
@@ -280,8 +282,8 @@ class Graph:
         return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
     def value(self, name: str, default: Array | None = None) -> Array:
-        """Return the estimate of the constants or the landmark with this name. If it is not in the graph, ``default``
-        is returned, or KeyError is raised if it is None."""
+        """Return the estimate of the sensor constants or of the landmark called ``name``, or ``default`` if the graph
+        does not contain them. Raises KeyError if ``default`` is None, too."""
         if default is not None and name not in self.keys:
             return default
         return self.values[self.keys[name]]

@@ -75,12 +75,11 @@ class Incremental:
         graph.forget(min(last, self._solver.oldest))  # a rebuilt solver needs the rest
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """Return the final poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes of ``graph``, a copy of
-        the graph.
+        """Return the final poses (M, 3) and covariances (M, 3, 3) of the keyframes of ``graph``, a copy of the graph.
 
-        If the setting ``lag`` is a number, a pose keeps the estimate that it had when it left the window. Poses in the
-        window have their present estimate. Poses that wait for the solver have a predicted estimate. Otherwise the
-        whole problem is solved.
+        Covariances are in the body frame. If the setting ``lag`` is not a number of seconds, the whole problem is
+        solved. Otherwise poses outside of the window have the estimates from when they left it, and poses in the window
+        have present estimates.
         """
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)

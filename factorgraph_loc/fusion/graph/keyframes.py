@@ -136,14 +136,14 @@ class Builder:
         return since >= interval or (since > 0.0 and m.source == mapper.sensor and mapper.is_due(m))
 
     def gather(self) -> list[Node]:
-        """Convert the collected observations on the newest keyframe to factors, and add these to it. Returns the factors."""
+        """Convert the collected observations to factors of the newest keyframe, and add them. Returns the factors."""
         nodes = self.waiting() if self._waiting else []
         self._graph.newest.nodes += nodes
         self._waiting = []
         return nodes
 
     def waiting(self) -> list[Node]:
-        """Convert the collected observations on the newest keyframe to factors, without adding these to the keyframe."""
+        """Return the collected observations as factors of the newest keyframe, without adding these to the graph."""
         if self._gatherer is None:
             return []
         terms = self._gatherer.gathered(self._waiting)
@@ -228,11 +228,11 @@ class Builder:
         guess: Guess | None,
         addition: Addition,
     ) -> Guess | None:
-        """Convert a measurement to factors of ``keyframe``. Returns the pose and covariance of the keyframe, corrected by them.
+        """Convert a measurement to factors of ``keyframe``, and add these to ``addition``.
 
-        ``odometry``: the integrated odometry at the time of the measurement. ``offset``: the motion from the keyframe to this time,
-        or None. ``guess``: the predicted pose and covariance if ``keyframe`` is the newest keyframe, otherwise None. For an older
-        keyframe, innovations are relative to its causal estimate, and None is returned. ``addition``: gets the factors.
+        ``odometry``: the integrated odometry at the time of the measurement. ``offset``: the motion from the keyframe
+        to this time, or None. ``guess``: the predicted pose and covariance of the newest keyframe, None for an older
+        one. Returns the corrected pose and covariance of the newest keyframe, None for an older one.
         """
         graph, sensor = self._graph, self._graph.sensors[m.source]
         expected = keyframe.causal if guess is None else guess
@@ -256,8 +256,8 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add the landmark ``new``, observed at ``view``, to ``addition``, with its earlier observations by ``sensor``.
-        If it has none, or if most of their poses have left the graph, it gets a prior instead."""
+        """Add the landmark ``new``, observed at ``view``, and factors of its earlier observations by ``sensor`` to
+        ``addition``. If most of the observing poses have left the graph, the landmark gets a prior instead."""
         graph = self._graph
         key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean

@@ -182,8 +182,8 @@ class Chained:
         return chain.normal(len(poses), self._first, jacobian, residual)
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """One step of Levenberg and Marquardt. ``damping``: relative to the diagonal of the Hessian. Returns the new
-        state and the largest component of the step. Returns None if the problem is nearly singular."""
+        """Return the state after a Levenberg-Marquardt step, and the largest component of the step. Returns None if the
+        problem is nearly singular. ``damping``: relative to the diagonal of the Hessian."""
         try:
             is_solved, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
@@ -209,7 +209,7 @@ class Chained:
         return Covariances(dict(zip(self._poses, of_poses, strict=True)) | shared, 0.0)
 
     def _stacked(self, values: Values) -> list[Stack]:
-        """Combine factors of one kind to stacks, which are linearised together."""
+        """Return all factors in stacks. The factors of a stack are linearised together."""
         place = {key: i for i, key in enumerate(self._poses)}
         kinds: defaultdict[Hashable, list[Placed]] = defaultdict(list)
         for factor, keys in self._factors:
@@ -295,7 +295,7 @@ class Problem:
         return chain if chain.fits else None
 
     def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
-        """Find a local optimum from initial ``values``. After ``max_iterations`` the best values so far are returned."""
+        """Return a local optimum near initial ``values``, or the best values after ``max_iterations``."""
         chain = self._chain
         begin = None if chain is None else chain.begin(values)
         if chain is not None and begin is not None:
@@ -304,8 +304,8 @@ class Problem:
         return Solution(*descended(self.cost, self._moved, values, max_iterations)[:2])
 
     def _moved(self, values: Values, damping: float) -> tuple[Values, float] | None:
-        """One step of Levenberg and Marquardt. ``damping``: relative to the diagonal of the Hessian. Returns the new
-        values and the largest component of the step. Returns None if the problem is nearly singular."""
+        """Return the values after a Levenberg-Marquardt step, and the step's largest component. Returns None if the
+        problem is nearly singular. ``damping``: relative to the diagonal of the Hessian."""
         linear = self.linearize(values)
         curvature = {key: np.full(len(value), LEAST) for key, value in values.items()}
         for i in range(linear.size()):

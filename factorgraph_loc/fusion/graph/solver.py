@@ -81,7 +81,7 @@ class FullHistory:
         values: Values,
         stamps: Mapping[int, float],
     ) -> None:
-        """The first update of a new solver. ``factors``: factors of GTSAM, such as priors and marginal factors.
+        """Add the first factors and variables to a new solver, and solve. ``factors``: of GTSAM, such as priors.
         ``nodes``: factors of measurements. ``values``: initial values. ``stamps``: the time [s] of each variable."""
         graph, removed = self._ours.added(self._isam, factors, nodes, values)
         self._ours.place(self._isam.update(graph, to_gtsam(values), removed).getNewFactorsIndices())
@@ -336,11 +336,9 @@ class LinearFactors:
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
     def _followed(self, estimates: Values) -> list[int]:
-        """Return the held variables whose factors must be linearised again. ``estimates``: the present estimates of all
-        held variables.
+        """Return the keys of the variables with factors that must be linearised again, () if the map is known.
 
-        Empty if all held variables are poses. Then the map is known, and their odometry factors are never linearised
-        again.
+        ``estimates``: the present estimates of all variables with a linearisation point that iSAM2 does not move.
         """
         if all(map(is_pose, estimates)):
             return []
@@ -367,8 +365,7 @@ _PLACED = attrgetter("node.factor", "node.keys", "node.rows")
 
 
 def project_out_gauge(jacobian: Array, motions: Array) -> Array:
-    """Remove the gauge directions from a Jacobian: the matrix nearest to ``jacobian`` (m, n) whose product with
-    ``motions`` is zero.
+    """Return the matrix nearest to ``jacobian`` (m, n) that has a product of zero with ``motions``.
 
     ``motions`` (n, 3): the changes of the variables when the whole graph moves or rotates, from
     :func:`factors.graph.frame_motions`. Source: Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics

@@ -38,10 +38,10 @@ class MarginalSummary:
     def of(
         cls, graph: gtsam.NonlinearFactorGraph, points: gtsam.Values, at: Values, ours: Collection[int] = ()
     ) -> MarginalSummary:
-        """Make the summary of a solver's graph.
+        """Return the summary of a solver's ``graph``.
 
         ``points``: the linearisation points of iSAM2. ``at``: the linearisation points of the summary. ``ours``: the
-        slots of the measurements' factors in the graph, which are left out.
+        indices of factors of measurements in ``graph``, which are left out.
         """
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         values = to_gtsam(at)
@@ -63,7 +63,7 @@ class MarginalSummary:
         return oldest_pose(self.keys)
 
     def before_pose(self, pose: int) -> MarginalSummary:
-        """Return the summary without poses from index ``pose`` on. Call this before new poses get the keys of these."""
+        """Return the summary without the poses from index ``pose`` on. Call this before their keys are used again."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
