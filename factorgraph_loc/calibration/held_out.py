@@ -26,7 +26,7 @@ RIGS = ("input", "learnt")
 LONGEST = 150.0  # s; maximum duration of a held-out section of a log
 MOST = 4  # maximum number of sections of a log
 FEWEST_POSES = 20  # minimum number of poses of the reference in a section
-WORSE, WORST = 1.02, 1.10  # a rig is refused above these ratios of errors: over all logs, on one log
+WORSE, WORST = 1.02, 1.10  # a rig is refused if its error grows by a larger factor, over all logs or on one log
 
 Scores = Mapping[str, Any]
 

@@ -26,7 +26,7 @@ from factorgraph_loc.text import Notice, notice
 Smooth = Callable[[Log], RunResult]
 """Runs the smoother on a log, with the log's rig."""
 
-SETTLED = 0.3  # the iteration ends if no value changes by more, in standard errors
+SETTLED = 0.3  # standard errors; the iteration ends when no value changes by more than this
 TURNS = 8  # maximum number of turns of smoothing and learning
 TOO_VAGUE = 1.0  # m; a smoothed trajectory with a larger median standard deviation is not used
 
@@ -80,8 +80,8 @@ def learn(
 ) -> Knowledge:
     """Learn a rig from logs with known trajectories. The constants of each sensor are learnt separately.
 
-    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first turn of smoothing and
-    learning, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written. ``like``: a
+    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before smoothing and learning began to
+    alternate, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written. ``like``: a
     result from more logs; the sensor models selected there are used again. Raises InputError if a log is too short.
     """
     traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]

@@ -272,8 +272,7 @@ def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> l
 
 
 def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:
-    """Return the independent units, "logs", or "seeds" for a single log, and True if they are enough for intervals and
-    tests."""
+    """Return the independent units, "logs", or "seeds" for a single log, and True if there are enough for intervals."""
     if len(clusters) == 1:
         return "seeds", len(clusters[0]) >= ENOUGH_LOGS
     return "logs", len(clusters) >= ENOUGH_LOGS

@@ -138,8 +138,7 @@ def median_difference(a: ArrayLike, b: ArrayLike) -> Interval:
 
 
 def median_ratio(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Return the median of ``a`` (N,) divided by that of ``b`` (N,), with its interval. Values may be infinite, but not
-    negative.
+    """Return the median of ``a`` (N,) divided by that of ``b`` (N,), with its interval. Values may be 0 or infinite.
 
     ``a`` and ``b`` have a value for each of the same N cases.
     """

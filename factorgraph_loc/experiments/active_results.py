@@ -68,8 +68,7 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
     - ``failures``: number of runs that did not end localized. ``failures_low``, ``failures_high``: 95 % interval of
       their fraction.
     - ``claimed_wrong``: number of runs that at any time reported a wrong pose as localized.
-    - ``error_position`` [m], ``error_heading`` [rad], ``seconds`` (simulated): medians over the runs that ended
-      localized.
+    - ``error_position`` [m], ``error_heading`` [rad], ``seconds`` (simulated): medians over runs that ended localized.
     - ``planning_ms``: median over runs of the median computing time of a planning step.
     """
     results = []
@@ -102,13 +101,12 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return comparisons of the first policy ``a`` with each other policy ``b``, for each world and estimator. The keys
-    are:
+    """Return comparisons of the first policy ``a`` with each other policy ``b``, for each world and estimator.
 
     - ``difference``, ``low``, ``high`` [m]: median distance of a minus that of b, and its 95 % interval.
     - ``ratio``, ``ratio_low``, ``ratio_high``: median distance of a divided by that of b, and its 95 % interval.
     - ``failed_only_a``, ``failed_only_b``: number of seeds with a failure of a only, and of b only.
-    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of common seeds, which alone are
+    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of the common seeds, which are
       used.
     """
     results = []

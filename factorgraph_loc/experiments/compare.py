@@ -74,19 +74,17 @@ def compare(
 ) -> Comparison:
     """Run several estimators on several logs with each seed, and compare them.
 
-    ``out``: folder for the results, None for a new folder in ``out/``. ``overwrite``: whether existing results in
-    ``out`` may be replaced. ``settings``: by estimator, its settings by key. ``rig``, ``world``: used instead of those
-    of the logs.
+    ``out``: folder for the results, None for a new folder in ``out/``. ``overwrite``: whether existing results in ``out`` may
+    be replaced. ``settings``: by estimator, its settings by key. ``rig``, ``world``: replace those of all logs.
     ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
     :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``rpe``: whether to write relative errors.
-    ``jobs``: number of processes, None for one per core. ``progress``: called with the number of finished and of all
-    runs.
+    ``jobs``: number of processes, None for one per core. ``progress``: called with the numbers of finished and of all runs.
 
-    A failed run does not stop the others, and the table states the reason. Runs with stored results are not repeated.
-    Files in ``out``:
+    A failed run does not stop the others, and the table states the reason. Runs with stored results are not repeated. The
+    files in ``out`` are:
 
     - ``results.parquet``, ``results.csv``: a row for each run. ``table.md``: the table of the comparison.
-    - ``differences.csv``: see :func:`~factorgraph_loc.evaluation.inference.differences`. ``plots/*.png``.
+    - ``differences.csv``: see :func:`~factorgraph_loc.evaluation.inference.differences`. ``plots``: folder of PNG files.
     - ``report.html``: see :func:`~factorgraph_loc.evaluation.report.write_report`.
     - ``store``: folder with the files of each run, see :class:`~factorgraph_loc.experiments.store.Store`.
 

@@ -177,7 +177,7 @@ class ReportSettings(FileModel):
 
 
 class Limits(FileModel):
-    """Limits of one run. ``memory`` [10^6 bytes]: of its process. ``time`` [s]: maximum computing time.
+    """Limits of one run. ``memory``: memory of its process [10^6 bytes]. ``time``: computing time [s].
 
     The default of ``memory`` is 90 % of the machine's memory, divided by the number of processes.
     """

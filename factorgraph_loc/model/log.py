@@ -103,9 +103,9 @@ class Log:
         yield from _pieces(rows, late, first, len(arrived))
 
     def alone(self, sensor: str) -> Log:
-        """Return the log with ``sensor`` as the only sensor of its kind. It is renamed to the kind: ``bearing_range.front`` becomes
-        ``bearing_range``. Sensors of other kinds do not change. If ``sensor`` has no dot, the log is returned unchanged.
-        """
+        """Return the log with ``sensor`` as the only sensor of its kind. The sensor is renamed to the kind:
+        ``bearing_range.front`` becomes ``bearing_range``. Other kinds do not change. If ``sensor`` has no dot, the log
+        is returned unchanged."""
         if kind_of(sensor) == sensor:
             return self
         streams = {name: self.streams[old] for name, old in as_only(self.streams, sensor).items()}
@@ -147,8 +147,7 @@ def cut(log: Log, start: float, end: float) -> Log:
     """Return the part of a log, and of its reference, with timestamps from ``start`` to before ``end`` [s].
 
     Timestamps do not change. Time offsets of sensors are not considered. The part has no known start pose. Its first
-    odometry increment is still the motion since the previous row of the whole log. Raises InputError without
-    measurements.
+    odometry increment is still the motion since the previous row of the whole log. Raises InputError if it is empty.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:

@@ -156,7 +156,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class ScanStream(Stream):
-    """A stream with K values of each field in a measurement, read from K successive rows with equal timestamps."""
+    """A stream in which successive rows with equal timestamps form one measurement. Each field of it has K values."""
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         """Yield one measurement per timestamp. ``offset`` [s] is added to the timestamps."""

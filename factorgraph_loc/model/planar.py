@@ -93,8 +93,7 @@ AS_IT_IS = Turned()
 
 
 def not_unit(quaternions: Array) -> Fault:
-    """Return a :class:`Fault`, for an error message, with a mask of the ``quaternions`` (N, 4) that do not have length
-    1."""
+    """Return a :class:`Fault` with a mask of the ``quaternions`` (N, 4) that are not of length 1, for an error message."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")
@@ -103,9 +102,9 @@ def not_unit(quaternions: Array) -> Fault:
 def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.bool_]:
     """Return a mask (N,) of null poses, which programs publish while they have lost track.
 
-    A pose with a zero quaternion (N, 4) is null. A pose is also null if its variance of x or y (N, 2) [m^2] rises to
-    :data:`HUGE` or more, far above that of the last valid pose. If more than half of the quaternions are zero, they
-    mark no null poses, so that the reader refuses the file.
+    A pose with a zero quaternion (N, 4) is null. So is a pose with a variance of x or y (N, 2) [m^2] of :data:`HUGE` or
+    more, if it is far above that of the last valid pose. If more than half of the quaternions are zero, they mark no
+    null poses, so that the reader refuses the file.
     """
     null = np.asarray(~quaternions.any(axis=1))
     if 2 * np.count_nonzero(null) > len(null):
@@ -118,7 +117,7 @@ def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.b
 
 def _rise(variances: Array, null: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return a mask (N,) of the ``variances`` (N,) [m^2] that are at least :data:`HUGE` and far above the last valid
-    variance. Valid are those that are neither masked nor in ``null`` (N,). The first variance is not masked."""
+    variance. A valid variance is neither masked nor in ``null`` (N,). The first variance is not masked."""
     out = np.zeros(len(variances), dtype=bool)
     if not (variances >= HUGE).any():
         return out
@@ -142,7 +141,7 @@ def null_poses(source: object, row: int, count: int) -> Notice:
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
     """Return the rotation matrices (N, 3, 3) of ``quaternions`` (N, 4), in the order x, y, z, w.
 
-    ``source``, ``rows`` (N,): the file and the row numbers for errors. Raises InputError if a quaternion has not length 1.
+    ``source``, ``rows`` (N,): the file and the row numbers for errors. Raises InputError if a quaternion is not of length 1.
     """
     require_none(source, rows, [not_unit(quaternions)])
     x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T

@@ -16,10 +16,9 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """A comparison of the detections that one sensor made with those that its model predicted, in G groups of
-    measurements.
+    """A comparison of the numbers of detections that one sensor made and that its model predicted, in G groups.
 
-    ``what``: the plural name of the detections. ``groups`` (G,): names of the groups.
+    ``what``: the plural name of the detections. ``groups`` (G,): names of the groups of measurements.
     ``observed``, ``predicted`` (G,): counts of detections.
     ``sigma`` (G,): standard deviation of ``observed`` if the model is correct, for correlated successive measurements.
     ``overdispersion``: number of correlated measurements that have the information of one independent measurement.

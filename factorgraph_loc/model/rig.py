@@ -65,9 +65,9 @@ class Rig(FileModel):
         return tuple(dict.fromkeys(each for name in sensors for each in self.names(name) or (name,)))
 
     def alone(self, sensor: str) -> Self:
-        """Return the rig with ``sensor`` as the only sensor of its kind. It is renamed to the kind: ``bearing_range.front`` becomes
-        ``bearing_range``. Sensors of other kinds do not change. If ``sensor`` has no dot, the rig is returned unchanged.
-        """
+        """Return the rig with ``sensor`` as the only sensor of its kind. The sensor is renamed to the kind:
+        ``bearing_range.front`` becomes ``bearing_range``. Other kinds do not change. If ``sensor`` has no dot, the rig
+        is returned unchanged."""
         if kind_of(sensor) == sensor:
             return self
         sensors = tuple(as_only(self.sensors, sensor))

@@ -79,7 +79,7 @@ def sections_of_channels() -> dict[str, str]:
 
 @cache
 def several() -> frozenset[str]:
-    """Return the kinds of sensors that a rig may have several times, each with another name."""
+    """Return the kinds of sensors that a rig may have more than once, such as ``camera.front`` and ``camera.back``."""
     return frozenset(name for name, section in sections().items() if section.several)
 
 

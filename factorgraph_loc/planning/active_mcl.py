@@ -36,8 +36,8 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 
 @dataclass(frozen=True)
 class ProximityReading:
-    """A reading of a proximity sensor, by which the search weights its particles. ``lengths`` (D,) [m]: the measured free
-    lengths in D directions. ``found``, ``work``, ``things``: constants that the search expects of every observation."""
+    """A reading of a proximity sensor, by which a particle filter weights its particles. ``lengths`` (D,) [m]: the
+    measured free lengths in D directions. ``found``, ``work``, ``things``: constants that every observation must have."""
 
     sensor: ProximitySensor
     lengths: Array

@@ -110,9 +110,9 @@ def run_active(
 ) -> ActiveRun:
     """Simulate a robot that drives from an unknown start until it is localized or gives up.
 
-    ``policy``, ``estimator``: the names of both. Runs with the same ``seed`` have the same world, start and noise
-    sequences. Raises InputError for an unknown name, a start that is not free, or a sensor with a higher rate than the
-    robot's control. Raises RunFailedError if the estimator fails.
+    ``policy``, ``estimator``: names. Runs with the same ``seed`` have the same world, start and noise sequences. Raises
+    InputError for an unknown name, a start that is not free, or a sensor that is faster than the robot's control.
+    Raises RunFailedError if the estimator fails.
     """
     loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()

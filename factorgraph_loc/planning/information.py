@@ -115,7 +115,7 @@ def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
     """True if particles ``poses`` (M, 3) with ``weights`` (M,) are poorly described by a Gaussian. Either their heading
-    is unknown, or a Gaussian with their covariance has an entropy that is larger by more than :data:`SEVERAL`."""
+    is unknown, or they have less entropy than a Gaussian with their covariance, by more than :data:`SEVERAL`."""
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
         return True
@@ -141,9 +141,8 @@ def expected_gain(
 
     ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. ``space``: a particle stops and measures
     nothing where its path leads into a wall. ``places`` (M,): the index of each particle's mode. If given, the entropy
-    of this index is returned instead of the entropy of the pose at the end of the path. ``noise``: of the odometry,
-    None for no noise. ``samples``: the number of particles. ``scans``: the number of particles at which measurements
-    are simulated.
+    is that of this index, otherwise that of the pose at the end of the path. ``noise``: of the odometry, None for no
+    noise. ``samples``: the number of particles. ``scans``: the number of particles at which measurements are simulated.
     """
     if not paths:
         return np.empty(0)

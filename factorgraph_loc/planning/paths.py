@@ -52,7 +52,7 @@ class Path:
         return float(self.metres[-1])
 
     def passed(self, metres_per_radian: float) -> Array:
-        """Return the distance (S,) [m] up to each pose, including turns by their duration.
+        """Return the distance (S,) [m] up to each pose. Turns count as the distance that the robot drives in the same time.
 
         ``metres_per_radian``: the distance that the robot drives in the time of a turn by one radian.
         """

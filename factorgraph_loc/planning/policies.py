@@ -120,7 +120,7 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Return the expected information (C,) [nats] of long paths about which mode is true, or, of a single mode, about
+    """Return the expected information (C,) [nats] of C long paths. It is about the true mode, or with one mode about
     the pose.
 
     With several modes the information about poses is not used. On a long path particles diverge and run into walls,

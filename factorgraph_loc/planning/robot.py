@@ -193,7 +193,7 @@ class SimulatedRobot:
         return se2.between(at[:-1], at[1:])
 
     def _is_free(self, target: Array) -> bool:
-        """True if the robot may move to ``target`` (3,), because the cell there is free. From a cell that is not free,
-        the robot may move to any cell that is at least as far from walls."""
+        """True if the robot may move to ``target`` (3,), where the cell must be free. From a cell that is not free, the
+        robot may also move to cells that are not nearer to a wall."""
         ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, target))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

@@ -41,8 +41,8 @@ class Surroundings(NamedTuple):
 
     ``origin`` (3,) [m]: the camera position. ``table`` (M, 13): the faces, sorted by distance; its columns are the
     constants of this module. ``starts`` (BINS + 1,), ``items``: a ray in the horizontal bin b can hit only the rows of
-    the table in ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth and height of the building, 1 /
-    width, 1 / depth.
+    the table in ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth, height, inverse width and inverse
+    depth of the building.
     """
 
     origin: Array

@@ -99,7 +99,7 @@ class ImageSettings(FileModel):
 class SimulationSettings(FileModel):
     """All settings of a simulation except the seed.
 
-    Sensors register further sections: ``sightings`` of landmarks, ``rssi`` and ``phase`` of RFID reads, ``faults`` of
+    Further sections, which sensors add: ``sightings`` of landmarks, ``rssi`` and ``phase`` of RFID reads, ``faults`` of
     RFID reads, and ``pixels`` of points.
     """
 

@@ -172,8 +172,7 @@ def _sides(box: Segment) -> list[Segment]:
 
 
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
-    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Sides of boxes count as
-    walls.
+    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Boxes count as walls.
 
     A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no facing.
     Raises InputError if the plan has too few places for the tags.

@@ -136,7 +136,7 @@ class Associator:
     def _similar_views(self, points: Integers, place: Array) -> tuple[Integers, Integers]:
         """Return those views of ``points`` (C,) that were seen from viewpoints similar to the camera position ``place`` (3,).
 
-        The result are the indices of these views, sorted by point, and the start of each point's views in this array (C+1,).
+        Returns the indices of these views, sorted by point, and the start of each point's views in this array (C+1,).
         """
         is_wanted = np.zeros(len(self._positions), dtype=bool)
         is_wanted[points] = True

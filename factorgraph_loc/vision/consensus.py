@@ -28,7 +28,7 @@ SAMPLE = 3  # points
 HYPOTHESES, ROUND = 96, 16  # largest number of samples, and number of samples between two checks for termination
 FAILURE = 1e-3  # largest probability that no sample without outliers was drawn
 REACH = 10.0  # for corrections by samples, the standard deviations of the prediction are multiplied by this factor
-FARTHEST = 3.0  # largest step of a correction, in the standard deviations that are enlarged by REACH
+FARTHEST = 3.0  # largest step of a correction, in standard deviations of the prediction times REACH
 ROUNDING = 1e-12  # relative to the largest eigenvalue of a covariance: smaller ones count as zero
 RIDGE = 1e-9  # regularisation of the information, for points very close to the camera
 SAMPLE_GATE, GATE = 25.0, 13.8  # limits of the squared residuals of inliers, of a sample and of the final pose (99.9 %)
@@ -90,8 +90,7 @@ def _best_of_samples(
     """Return the camera pose with most inliers among corrections of the predicted pose by random samples of points.
 
     Returns the position (1, 3), the rotation (1, 3, 3), and the squared whitened residuals (K,) of all points.
-    ``whiteners`` (K, 2, 2): whiten the pixel errors. ``root`` (6, 6): a square root of the covariance of allowed
-    corrections.
+    ``whiteners`` (K, 2, 2): whiten the pixel errors. ``root`` (6, 6): a square root of the covariance of corrections.
     """
     rng, count = np.random.default_rng(0), len(points)
     best: tuple[float, Array, Array, Array] | None = None
@@ -172,8 +171,7 @@ def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]
 def _whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """Return whitened residuals (H, 2S), predicted minus measured, of H cameras, and Jacobians (H, 2S, 6) by their
-    poses.
+    """Return whitened residuals (H, 2S), predicted minus measured, of H cameras, and Jacobians (H, 2S, 6) by pose.
 
     ``points`` (H, S, 3), ``pixels`` (H, S, 2), ``whiteners`` (H, S, 2, 2): S points of each camera.
     """

@@ -99,7 +99,7 @@ def cross(arm: float) -> Array:
 
 def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
     """Return the weights (M,) of a Gaussian at the lattice places, their offsets (M, 2) from ``centre`` (2,), and the
-    variance. It is ``scale``**2 - 1, because the samples already have a blur with the variance 1."""
+    variance. The variance is ``scale``**2 - 1, because the samples already have a blur with the variance 1."""
     variance = scale**2 - 1.0
     away = LATTICE - centre
     return np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2.0 * np.pi * variance), away, variance

@@ -136,8 +136,7 @@ def p_value(p: float | None) -> str:
 
 
 def uncertainty(metric: Metric, figure: Pooled) -> str:
-    """Return the interval of a pooled score, such as ``[0.1, 0.2]``, or its range ``0.1 to 0.2``, or "" for a single
-    value."""
+    """Return the interval of a pooled score, such as ``[0.1, 0.2]``, or else its range, or "" for a single value."""
     if figure.low is not None and figure.high is not None:
         return f"[{metric.text(figure.low)}, {metric.text(figure.high)}]"
     return metric.range(figure.least, figure.most) if figure.count > 1 else ""

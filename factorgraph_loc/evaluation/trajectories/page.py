@@ -185,8 +185,8 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
 def errors_of(score: TrajectoryScore) -> pl.DataFrame:
     """Return the table of ``errors.csv``, with a row for each pair of poses.
 
-    The columns are the timestamps [ns] and the aligned positions [m] of both trajectories, and the errors of position
-    [m] and rotation [rad]. Missing timestamps are empty.
+    The columns are timestamps [ns] and aligned positions [m] of both trajectories, and errors of position [m] and
+    rotation [rad]. Missing timestamps are empty.
     """
     rotation = score.ape.rotation
     columns = [

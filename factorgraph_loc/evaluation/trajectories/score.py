@@ -252,8 +252,8 @@ def _relative(
 
 
 def _motions(path: PosePath, begins: Integers, ends: Integers) -> tuple[Array, Array]:
-    """Return rotations (K, 3, 3) and translations (K, 3) from the poses ``begins`` to the poses ``ends``, in the frames
-    of the first."""
+    """Return rotations (K, 3, 3) and translations (K, 3) from the poses ``begins`` to ``ends``, in the frames of
+    ``begins``."""
     back = path.rotations[begins].transpose(0, 2, 1)
     shifts = path.positions[ends] - path.positions[begins]
     return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, shifts)
