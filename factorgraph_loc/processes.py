@@ -108,11 +108,7 @@ def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]
 
 
 def run_each(
-    function: Callable[[Job], Value],
-    jobs: Sequence[Job],
-    workers: int,
-    *,
-    beat: Callable[[], None] | None = None,
+    function: Callable[[Job], Value], jobs: Sequence[Job], workers: int, *, beat: Callable[[], None] | None = None
 ) -> Iterator[tuple[int, Value | Exception]]:
     """Call ``function`` on each job in at most ``workers`` parallel processes. A crash affects only one job.
 
@@ -131,9 +127,7 @@ def run_each(
             for connection in wait([worker.connection for worker in team], None if beat is None else BEAT):
                 worker = next(worker for worker in team if worker.connection is connection)
                 answer = worker.hear()
-                if (
-                    isinstance(answer, ProcessDiedError) and worker.job is None and waiting
-                ):  # it died before its first job
+                if isinstance(answer, ProcessDiedError) and worker.job is None and waiting:  # died before its first job
                     worker.job = waiting.popleft()
                 at, worker.job = worker.job, None
                 if isinstance(answer, ProcessDiedError) or at is not None:
@@ -179,11 +173,7 @@ def serve(connection: Connection, *modules: str) -> None:
             answer = _portable(error), "".join(traceback.format_exception(error))
         try:
             connection.send(answer)
-        except (
-            pickle.PicklingError,
-            TypeError,
-            AttributeError,
-        ) as error:  # the value cannot be pickled; nothing was sent
+        except (pickle.PicklingError, TypeError, AttributeError) as error:  # the value cannot be pickled
             connection.send((_portable(error), "".join(traceback.format_exception(error))))
 
 

@@ -111,7 +111,7 @@ def simulate(
 def _write_with_images(
     log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Callable[[float, float], None]
 ) -> None:
-    """Write a log with rendered images. They are rendered into a temporary folder, so that no incomplete log is written."""
+    """Write a simulated log with rendered images to ``folder``. If rendering fails, nothing is written."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(folder) as rendered:

@@ -41,7 +41,7 @@ def view(
     ``results``: folders of runs or comparisons, or only a log. The log of the runs must be given too, unless
     :func:`~factorgraph_loc.api.logs.datasets` lists it.
     ``rrd``: a file to write for the viewer instead of opening it.
-    ``bind``: the IP address of the viewer, which asks for no password. Only this machine reaches the default address.
+    ``bind``: the IP address at which the viewer listens, without a password. By default only this machine can connect.
     Raises InputError if ``rerun-sdk`` is not installed, if the viewer does not start, or if the file cannot be written.
     """
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
@@ -99,7 +99,9 @@ def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, l
 
 
 def show(log: Log, runs: list[StoredRun], rrd: Path | None, bind: str) -> None:
-    """Open the viewer, or write the file ``rrd`` for it. Raises InputError if ``rerun-sdk`` is not installed."""
+    """Show a log and its runs in the viewer Rerun, or write them to the file ``rrd`` if it is not None.
+
+    ``bind``: the IP address at which the viewer listens. Raises InputError if ``rerun-sdk`` is not installed."""
     # Rerun also prints the errors that it raises, unless RUST_LOG is "off" when it is imported
     is_set = "RUST_LOG" in os.environ
     os.environ.setdefault("RUST_LOG", "off")
@@ -143,7 +145,9 @@ def _only(runs: list[StoredRun], out: Path) -> StoredRun:
 
 
 def _trajectory(log: Log, runs: list[StoredRun], out: Path) -> Trajectory:
-    """Return the final trajectory of the only run in ``runs``, or the reference of the log if there are no runs."""
+    """Return the final trajectory of the only run in ``runs``, or the reference of the log if there are no runs.
+
+    ``out``: the file to write, for messages."""
     if runs:
         return _only(runs, out).final
     if log.reference is None:

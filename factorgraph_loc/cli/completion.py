@@ -14,7 +14,7 @@ Completion = Callable[[str], list[str]]
 
 
 def _one_of(names: Callable[[], Iterable[str]]) -> Completion:
-    """Return a completion of a single name. ``names`` returns all valid names."""
+    """Return a function that completes a name for the shell. ``names`` is called to get all valid names."""
 
     def complete(incomplete: str) -> list[str]:
         return [name for name in names() if name.startswith(incomplete)]
@@ -23,8 +23,9 @@ def _one_of(names: Callable[[], Iterable[str]]) -> Completion:
 
 
 def _some_of(names: Callable[[], Iterable[str]]) -> Completion:
-    """Return a completion of the last name in a comma-separated list. Names that are already in the list are not
-    proposed. ``names`` returns all valid names."""
+    """Return a function that completes the last name in a comma-separated list. ``names``: as in :func:`_one_of`.
+
+    Names that are already in the list are not proposed."""
 
     def complete(incomplete: str) -> list[str]:
         first, comma, last = incomplete.rpartition(",")
@@ -49,7 +50,7 @@ map_estimator = _one_of(lambda: MAP_ESTIMATORS)
 
 
 def setting(incomplete: str) -> list[str]:
-    """Complete a setting NAME.KEY=VALUE of an estimator: first the estimator NAME, then the key KEY."""
+    """Return the completions of an estimator's setting NAME.KEY=VALUE: first of the name NAME, then of the key KEY."""
     name, dot, _ = incomplete.partition(".")
     if not dot:
         return [f"{known}." for known in estimator(name)]
@@ -62,7 +63,7 @@ def setting(incomplete: str) -> list[str]:
 
 
 def simulation_setting(incomplete: str) -> list[str]:
-    """Complete the key of a setting KEY=VALUE of a simulation. Keys of the rig (``rig.KEY``) are not proposed."""
+    """Return the completions of the key in a setting KEY=VALUE of a simulation. Keys ``rig.KEY`` are not proposed."""
     from factorgraph_loc.files.settings import settings_in
     from factorgraph_loc.simulation import SimulationSettings
 
@@ -71,7 +72,7 @@ def simulation_setting(incomplete: str) -> list[str]:
 
 
 def active_setting(incomplete: str) -> list[str]:
-    """Complete the key of a setting KEY=VALUE of ``fgloc active``. It sets the robot, the policy or the simulated world."""
+    """Return the completions of the key in a setting KEY=VALUE of ``fgloc active``."""
     from factorgraph_loc.files.settings import settings_in
     from factorgraph_loc.planning.settings import ActiveSettings
 

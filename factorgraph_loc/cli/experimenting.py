@@ -137,12 +137,7 @@ def _print_done(done: Done, folder: Path, metrics: Sequence[str], file: Path, js
 
 @app.command()
 @takes_options
-def status(
-    file: File,
-    *,
-    options: ExperimentOptions,
-    json: Json = False,
-) -> None:
+def status(file: File, *, options: ExperimentOptions, json: Json = False) -> None:
     """Count the runs of an experiment that are done, failed, missing or damaged. A damaged result differs from its checksum.
 
     Example: fgloc experiment status lags.toml
@@ -224,10 +219,10 @@ def _print_damaged(runs: Sequence[str], file: Path, what: str = "") -> None:
 
 
 def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of the table of results.
+    """Return the header and the rows of the table of results. ``rows``: one dictionary of values for each run.
 
-    Each row summarizes the runs (``rows``) of one label, one set of sensors and one combination of swept values. Each
-    cell has the median, minimum and maximum of one of the ``metrics`` over these runs.
+    A row of the table summarizes the runs with the same label, sensors and swept values. Its cells have the median,
+    minimum and maximum of each of the ``metrics``.
     """
     from statistics import median
 

@@ -160,7 +160,9 @@ if TYPE_CHECKING:
 
 
 def print_elements(made: Made) -> tuple[str, ...]:
-    """Print the table of the landmarks or tags of a new map; points have none. Return further lines to print."""
+    """Print a table of the landmarks or tags in the new map ``made``. Return lines to print below it.
+
+    Points have no table."""
     from factorgraph_loc.experiments.maps import DroppedTags
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
@@ -186,7 +188,7 @@ def print_elements(made: Made) -> tuple[str, ...]:
 
 
 def document(made: Made) -> dict[str, Any]:
-    """Return the results of mapping as a dictionary for ``--json``."""
+    """Return a new map as a dictionary for the option ``--json``."""
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
 
@@ -226,7 +228,9 @@ def _rows(made: LandmarkMap, verdicts: Mapping[str, str]) -> list[tuple[str, ...
 
 
 def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Return the values of each landmark or tag by its name. ``verdicts``: by name, texts that replace the verdict of the map."""
+    """Return a dictionary of values for each landmark or tag, by its name.
+
+    ``verdicts``: for some names, texts that replace the verdict in ``made``."""
     return {
         entry.landmark: {
             "given": None if entry.given is None else entry.given.tolist(),

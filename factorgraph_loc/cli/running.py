@@ -196,7 +196,7 @@ def _print_accuracy(scores: Mapping[str, Any]) -> None:
 
 
 def _print_further(scores: Mapping[str, Any], *, rpe: bool) -> None:
-    """Print the tables of further scores that the options request. A table without any value is not printed."""
+    """Print tables of further scores, if they have values. ``rpe``: include the table of relative pose errors."""
     from factorgraph_loc.evaluation.tables import further_tables
 
     for title, keys in further_tables([scores], rpe=rpe).items():
@@ -214,7 +214,7 @@ def _print_consistency(scores: Mapping[str, Any]) -> None:
     for name, value in scores.items():
         if name.startswith("nis.") and name.endswith(".median_ratio") and value is not None:
             sensor = name.removeprefix("nis.").removesuffix(".median_ratio")
-            # the median, because a few gross outliers dominate the mean
+            # a few gross outliers would dominate the mean
             share = 100.0 * scores[f"nis.{sensor}.beyond_95"]
             show.line(
                 f"{sensor}: normalised innovation squared {value:.2f} times the expected median, ideal 1; "

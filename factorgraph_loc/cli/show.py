@@ -138,7 +138,7 @@ def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
 
 
 def fields(content: Mapping[str, str]) -> None:
-    """Print the names and values of a dictionary, one pair per line."""
+    """Print each name and value of ``content`` on a line."""
     width = max(map(len, content))
     for name, value in content.items():
         line(f"{name:<{width}}  {value}")

@@ -32,8 +32,9 @@ class Stop(KeyboardInterrupt):
 
 
 def end(stop: KeyboardInterrupt) -> int:
-    """Remove temporary files and print one line on stderr with the signal and the notes of the exception. Return the
-    exit code, which is 128 plus the number of the signal."""
+    """Remove temporary files, and print the signal and the notes of the exception ``stop`` on stderr.
+
+    Return the exit code, which is 128 plus the number of the signal."""
     from factorgraph_loc.files.temporary import remove_own
 
     remove_own()
@@ -44,9 +45,9 @@ def end(stop: KeyboardInterrupt) -> int:
 
 @contextmanager
 def unwrapped() -> Iterator[None]:
-    """Replace an exception in this block by the :class:`Stop` that caused it, if any.
+    """If an exception in this block was caused by a :class:`Stop`, raise the :class:`Stop` instead.
 
-    Compiled modules that are being imported turn a :class:`Stop` into an ImportError.
+    A compiled module raises ImportError if a :class:`Stop` interrupts its import.
     """
     try:
         yield
@@ -164,7 +165,7 @@ def _replaced(stream: TextIO | None, number: int, kind: type[io.TextIOWrapper], 
 
 
 def _discard(number: int) -> None:
-    """Redirect a descriptor to the null device, so that data in its buffer are discarded."""
+    """Redirect the file descriptor ``number`` to the null device, so that buffered data are discarded."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, number)
     os.close(null)

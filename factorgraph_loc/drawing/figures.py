@@ -131,10 +131,7 @@ def svg(figure: Figure) -> Picture:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Return the figure as a PNG with a palette of 256 colours, which has a third of the size of one in full colour.
-
-    Colours are reduced by the octree method, because Pillow's default (median cut) changes the colours of thin lines.
-    """
+    """Return the figure as a PNG with 256 colours, which is a third as large as a PNG in full colour."""
     from PIL.Image import Dither, Quantize  # noqa: PLC0415
 
     out = io.BytesIO()
@@ -156,7 +153,7 @@ def _drawn(figure: Figure) -> Image:
 
 
 def _lay_out(figure: Figure) -> None:
-    """Place the axes between the title and the legend. This takes a quarter of the time of matplotlib's constrained layout."""
+    """Place the axes of a figure between its title and its legend. Matplotlib's constrained layout is much slower."""
     aspects = [(axis, axis.get_aspect()) for axis in figure.axes]
     for axis in figure.axes:
         axis.set_aspect("auto")  # tight_layout makes room for labels only if the axes fill their cells

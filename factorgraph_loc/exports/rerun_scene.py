@@ -163,7 +163,7 @@ def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colou
 
 
 def _lines_over_time(recording: rr.RecordingStream, at: str, t: Array, lines: Array, colour: Colour) -> None:
-    """Draw one of the ``lines`` (K, L, 2), each with L points, at each of the times ``t`` (K,) [s]."""
+    """Draw the line ``lines[i]`` (L, 2) of L points from the time ``t[i]`` [s] to ``t[i + 1]``. ``at``: entity path."""
     if len(t):
         recording.send_columns(at, _times(t), rr.LineStrips3D.columns(strips=list(_on_floor(lines))))
         recording.log(at, rr.LineStrips3D.from_fields(radii=LINE, colors=colour), static=True)
@@ -262,10 +262,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
         position=(centre[0], centre[1] - 0.2 * size, 0.8 * size), look_target=(*centre, 0.0), eye_up=(0.0, 0.0, 1.0)
     )
     plan = rrb.Spatial3DView(
-        origin=WORLD,
-        name="plan",
-        overrides={f"{WORLD}/{run.name}/causal": past for run in runs},
-        eye_controls=eye,
+        origin=WORLD, name="plan", overrides={f"{WORLD}/{run.name}/causal": past for run in runs}, eye_controls=eye
     )
     beside: list[rrb.View] = []
     if log.rig.find(CameraSettings) is not None and pictures_of.has_pictures(log):

@@ -72,7 +72,9 @@ def _is_listening(host: str) -> bool:
 
 
 def _start(bind: str, printed: BinaryIO) -> "subprocess.Popen[bytes]":
-    """Start the viewer in its own session, so that it stays open when the terminal is closed. ``printed``: gets its output."""
+    """Start the viewer in its own session, so that it stays open when the terminal is closed.
+
+    ``bind``: the IP address at which the viewer listens. ``printed``: a file for the output of the viewer."""
     command = [*COMMAND, "--bind", bind, "--port", str(PORT), "--expect-data-soon"]
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=printed, stderr=printed, start_new_session=True)
 

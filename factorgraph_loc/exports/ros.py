@@ -66,7 +66,7 @@ def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 
 
 def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[Iterator[Message]]:
-    """Yield iterators over all messages. Each iterator is ordered by time."""
+    """Yield iterators over all messages of the log and its runs. The messages of an iterator are in order of time."""
     moving = [(run.name, BASE if len(runs) == 1 else f"{run.name}/{BASE}", run.played(), run.final) for run in runs]
     if log.reference is not None:
         moving.append((REFERENCE, f"{REFERENCE}/{BASE}", log.reference, log.reference))
@@ -85,7 +85,7 @@ def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[It
 
 
 def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
-    """Return the shapes of the walls, and of the landmarks, tags and points in the map."""
+    """Return the shapes of the walls, landmarks, tags and points in the map, as :meth:`_Maker.shape` returns them."""
     ends = [(x, y, 0.0) for x, y in np.array(log.world.walls).reshape(-1, 2).tolist()]
     shapes = [make.shape("walls", LINES, LINE, DARK, ends)] if ends else []
     for marks, positions, _ in scene.layers(log):

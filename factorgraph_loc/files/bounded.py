@@ -100,7 +100,7 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """Return the content of a regular file of at most ``limit`` bytes. Raises InputError as :func:`opened`."""
+    """Return the content of a regular file. Raises InputError as :func:`opened`, or above ``limit`` bytes."""
     with opened(path, limit) as file:
         try:
             content = file.read()

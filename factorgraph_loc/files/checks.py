@@ -50,12 +50,7 @@ def in_order(
 
 
 def increments_in_order(
-    source: object,
-    rows: Integers,
-    t_ns: Integers,
-    moves: Array,
-    warnings: list[Notice],
-    rules: RowRules | None = None,
+    source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[Notice], rules: RowRules | None = None
 ) -> tuple[Integers, Array]:
     """Compose the odometry increments that have equal timestamps ``t_ns`` (N,).
 

@@ -242,9 +242,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         chosen = ((row, parts) for row, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
         first_row, first = next(chosen, body[0])
         header = _numbers(len(first))
-        if (
-            rules := _rules(mapping)
-        ) is not None and rules.bad_rows == "skip":  # the number of columns is that of most rows
+        if (rules := _rules(mapping)) is not None and rules.bad_rows == "skip":  # then use the length of most rows
             lengths = Counter(len(parts) for _, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
             header = _numbers(lengths.most_common(1)[0][0] if lengths else len(first))
     _require_columns(path, mapping, needed, header, first_row)
@@ -259,16 +257,18 @@ def _numbers(count: int) -> list[str]:
 
 
 def _is_chosen(parts: Sequence[str], header: Sequence[str], where: Mapping[str, set[str]]) -> bool:
-    """True if the row with cells ``parts`` has one of the allowed values in each column of ``where``."""
+    """True if a row has one of the allowed values in each column of ``where``.
+
+    ``parts``: the cells of the row. ``header``: the names of the columns."""
     cells = dict(zip(header, parts, strict=False))
     return all(cells.get(name) in values for name, values in where.items())
 
 
 def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
-    """Separate comments from rows of data. ``lines``: line numbers and texts.
+    """Separate the comments at the start of a file from the rows of data. ``lines``: line numbers and texts.
 
-    Returns the comments before the first row of data, without comment marks, and the rows of data. Both have their line
-    numbers. The last of these comments may be the header.
+    Returns two lists of line numbers and texts: the comments without comment marks, and the rows of data. The last
+    comment may be the header.
     """
     content = [(row, line) for row, line in lines if not line.lstrip().startswith(COMMENT)]
     until = content[0][0] if content else 0
@@ -277,7 +277,7 @@ def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, st
 
 
 def parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Split numbered lines into cells. Return the line number and the cells of each row."""
+    """Split the numbered ``lines`` of a CSV file at ``separator``. Yield the line number and the cells of each row."""
     if separator == " ":  # stands for any number of blanks
         return ((row, line.split()) for row, line in lines)
     rows = csv_rows(path, lines, delimiter=separator, skipinitialspace=True)
@@ -335,9 +335,9 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
 
 
 def _wrong_value(path: Path, row: int, entry: Mapping[str, Any], fields: Sequence[str], texts: Collection[str]) -> str:
-    """Return an error message about the first of the ``fields`` of the object ``entry`` whose value has a wrong type, or "".
+    """Return an error message about the first field of the object ``entry`` with a value of a wrong type, or "".
 
-    ``texts``: names of the fields whose values must be texts. ``row``: line number of the object.
+    ``fields``: the fields to check. ``texts``: those fields that must be texts. ``row``: line number of the object.
     """
     for name in fields:
         value = entry.get(name)

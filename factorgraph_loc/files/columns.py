@@ -256,10 +256,7 @@ POINTS = Table(
         *(within(f"from_{name}", LENGTH, FARTHEST, "position of the camera of a view") for name in "xyz"),
         *(
             within(
-                f"cov_{name}",
-                {unit: 1.0},
-                1e8,
-                "entry of the covariance of an error that all points of a view share",
+                f"cov_{name}", {unit: 1.0}, 1e8, "entry of the covariance of an error that all points of a view share"
             )
             for name, unit in zip(
                 ("xx", "xy", "yy", "xh", "yh", "hh"), 3 * ["m^2"] + 2 * ["m rad"] + ["rad^2"], strict=True

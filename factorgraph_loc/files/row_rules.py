@@ -33,8 +33,7 @@ class Fault:
     expected: str
 
     def error(self, source: object, rows: Integers, remedy: str = "") -> InputError:
-        """Return the error for the first invalid cell. ``rows`` (N,): row numbers in the file ``source``. ``remedy``:
-        the end of the message."""
+        """Return the error for the first invalid cell. ``rows`` (N,): row numbers. ``remedy``: end of the message."""
         i = int(self.wrong.argmax())
         value = self.values[i]
         value = value.tolist() if hasattr(value, "tolist") else value

@@ -79,9 +79,7 @@ def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | N
             known = settings.get(setting.key)
             if known is None:
                 settings[setting.key] = setting
-            elif (
-                known.choices and setting.choices
-            ):  # it selects one of several models, and each model allows one choice
+            elif known.choices and setting.choices:  # the choices select a model, and each model has one choice
                 choices = dict.fromkeys((*known.choices, *setting.choices))
                 settings[setting.key] = replace(known, choices=tuple(choices))
     return list(settings.values())
@@ -100,7 +98,7 @@ def bound_text(value: float) -> str:
 
 
 def default_text(setting: Setting) -> str:
-    """Return the default of a setting in TOML, "required" if there is none, or "-" if the setting is not set by default."""
+    """Return the default of a setting in TOML, "required" if the user must set it, or "-" if there is none."""
     return "required" if setting.required else _toml(setting.default)
 
 
@@ -122,7 +120,7 @@ def first_sentence(documented: Any) -> str:
 
 
 def _parts(part: _Part) -> Iterator[_Part]:
-    """Split the annotation of a field into its alternatives. None is omitted."""
+    """Yield the alternatives in the type annotation ``part.type``, such as both types of a union. None is omitted."""
     origin, arguments = get_origin(part.type), get_args(part.type)
     if origin is Annotated:
         yield from _parts(replace(part, type=arguments[0], metadata=(*part.metadata, *arguments[1:])))

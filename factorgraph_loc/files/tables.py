@@ -81,9 +81,10 @@ def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = Non
 
 
 def columns_in(path: Path, header: Sequence[str], tables: Sequence[Table]) -> tuple[Column, ...]:
-    """Choose the table that has most columns in common with the ``header`` of a file, and return its columns in the file.
+    """Return the columns to read from a file, by the names in its ``header``.
 
-    Raises InputError if a required column of that table is missing, or ``header`` has a name twice.
+    They belong to that table of ``tables`` which has most columns in common with the header. Raises InputError if a
+    required column of the table is missing, or ``header`` has a name twice.
     """
     if len(set(header)) < len(header):
         raise bad_field(path, "header", ",".join(header), "each column once", row=1)
@@ -107,8 +108,8 @@ def _unread(header: Sequence[str], columns: Sequence[Column]) -> tuple[str, ...]
 def rows_by_name(kind: type[Model], cells: Cells, table: Table, names: Sequence[str]) -> dict[str, Model]:
     """Convert the N rows of a table to models of class ``kind``, such as the tags of a map. Return them by name.
 
-    ``names``: N names, the first column of ``table``. The fields of ``kind`` are the other columns. For an empty cell
-    the field has its default. Raises InputError with file and row for an empty or repeated name, or an invalid value.
+    ``names``: N names, the first column of ``table``. ``cells``: the other columns, which are the fields of ``kind``.
+    An empty cell gives the default of the field. Raises InputError for an empty or repeated name, or an invalid value.
     """
     column, *fields = table.columns
     numbers = {known.name: cells.numbers(known.name, known) for known in fields if known.name in cells.columns}

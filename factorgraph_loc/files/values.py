@@ -74,14 +74,16 @@ def within(where: str, column: Column, value: object, shape: tuple[int, ...]) ->
 
 
 def names(where: str, field: str, value: object) -> tuple[str, ...]:
-    """Return names as a tuple. Raises InputError if ``value`` is not a list of texts."""
+    """Return the names in ``value`` as a tuple. Raises InputError if ``value`` is not a list of texts.
+
+    ``where``, ``field``: the object and its field that has the value, for the message."""
     if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(name, str) for name in value):
         raise bad_field(where, field, value, "names")
     return tuple(value)
 
 
 def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
-    """Return the items of a list as a tuple. Raises InputError if ``values`` cannot be iterated or is a text."""
+    """Return the items of ``values`` as a tuple. Raises InputError if ``values`` is a text or cannot be iterated."""
     items = None
     if isinstance(values, Iterable) and not isinstance(values, str):
         with contextlib.suppress(TypeError):  # raised by a zero-dimensional array
@@ -92,8 +94,9 @@ def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
 
 
 def integers(where: str, column: Column, value: object, count: int) -> NDArray[np.int64]:
-    """Return ``count`` integers as an array (count,). Raises InputError if there are more or fewer, or one is not whole
-    or exceeds the bounds of ``column``."""
+    """Return ``value`` as an array of integers. ``where``: the object that has the value, for the message.
+
+    Raises InputError unless ``value`` consists of ``count`` whole numbers within the bounds of ``column``."""
     array = numbers(where, column.name, value)
     if array.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
         raise bad_field(where, column.name, value, f"{count} whole numbers")

@@ -104,7 +104,7 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
 
 
 def _needs_of_rig(roles: _Roles) -> list[str]:
-    """Return remarks about the sections that the rig needs for the tables, with the commands that write such a rig."""
+    """Return remarks about the sections that the rig file must have, with the commands that write such a file."""
     out = []
     if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
         antennas = dict.fromkeys(roles.tables["rfid"].columns[roles.tables["rfid"].fields["antenna"]])
@@ -125,8 +125,9 @@ def _needs_of_rig(roles: _Roles) -> list[str]:
 
 
 def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
-    """Add a table of tags or landmarks in the parent folder of ``path`` to ``roles``. Return a remark with the lines of
-    a world file for it, or an empty list if there is no such table."""
+    """Find a table of tags or landmarks in the parent folder of ``path``, and add it to ``roles``.
+
+    Return remarks with the lines of a world file for the table, or an empty list if there is no such table."""
     for table in _guesses(path.parent):
         role = _role(table)
         if role in MAPS:
@@ -142,7 +143,7 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 
 
 def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
-    """Return the settings for a world file that describe the map table with the ``role`` tags or landmarks.
+    """Return the settings of a world file for the table of the map. ``role``: "tags" or "landmarks".
 
     If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map.
     """
@@ -167,9 +168,9 @@ def _guesses(folder: Path) -> list[Guess]:
 
 
 def _roles(guesses: Sequence[Guess]) -> _Roles:
-    """Assign a role to each table.
+    """Assign a role to each of the tables ``guesses``. Return the roles.
 
-    A table of poses is the reference if the name of its file suggests ground truth, or if another table is the odometry.
+    A table of poses is the reference if its file name suggests ground truth, or if another table is the odometry.
     """
     out = _Roles()
     poses = [g for g in guesses if g.has("t", "x", "y") and not g.has("epc") and not g.has("landmark")]
@@ -329,7 +330,7 @@ def _turns_of(reference: Trajectory) -> Turns:
 
 
 def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
-    """Return the headings over time in the table with the ``role``. Returns None if it has no headings or turns."""
+    """Return the headings over time in the table with the ``role``, or None if the table has no headings."""
     table = roles.tables[role]
     if role == "reference":
         reference = _reference(roles, path)

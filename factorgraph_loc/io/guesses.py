@@ -207,7 +207,7 @@ def _is_time(text: str) -> bool:
 
 
 def _filled(out: Guess) -> Guess:
-    """Add the guessed fields and units to a table, and return the table."""
+    """Guess the fields and units of the table ``out`` from its columns. Return ``out`` with these guesses."""
     _add_time(out)
     if not out.header:
         _add_tum(out)
@@ -243,7 +243,7 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _add_time(out: Guess) -> None:
-    """Guess the column of the time and its unit.
+    """Add the column of the time and its unit to ``out``.
 
     Columns with a name such as "time" are tried first, then the first column. The values must be times, or numbers
     that increase from row to row with few exceptions.
@@ -272,7 +272,7 @@ def _add_time(out: Guess) -> None:
 
 
 def _unit_of_times(values: Array) -> str:
-    """Return the unit of timestamps: by their size if they count from 1970, else by the median step between them."""
+    """Guess the unit of timestamps: by their size if they count from 1970, else by the median step between them."""
     if (unit := unit_since_1970(float(values[0]))) is not None:
         return unit
     step = float(np.median(np.diff(np.unique(values))))

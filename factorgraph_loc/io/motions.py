@@ -172,10 +172,10 @@ def between_wheels(
 
 
 def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[Notice]) -> Array:
-    """Return the speed [m/s] and the turn rate [rad/s] (N, 2) of a robot from the speeds (N, 2 or 4) [m/s] of its wheels.
+    """Return the speed [m/s] and the turn rate [rad/s] of a robot (N, 2). ``speeds`` (N, 2 or 4): of the wheels [m/s].
 
-    For mecanum wheels it returns increments (N, 3) instead. A speed is assumed constant until the next timestamp. For
-    ``source`` and ``warnings`` see :meth:`WheelSizes.twists`.
+    For mecanum wheels, increments (N, 3) are returned instead. A speed is assumed constant until the next of the
+    timestamps ``t_ns`` (N,). For ``sizes`` and the other arguments see :meth:`WheelSizes.twists`.
     """
     twists = sizes.twists(source, speeds, warnings)
     if sizes.base is None:

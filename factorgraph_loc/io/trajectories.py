@@ -199,9 +199,10 @@ def _messages() -> Any:
 
 
 def _path(name: str, table: Array, t_ns: Any) -> PosePath:
-    """Return the poses of a ``table`` (N, 7) of positions x, y, z and quaternions x, y, z, w, at the times ``t_ns`` (N,) or None.
+    """Return the poses in ``table`` (N, 7): positions x, y, z and quaternions x, y, z, w. ``name``: for messages.
 
-    Raises InputError if a number is not finite, or if a quaternion is not a unit quaternion.
+    ``t_ns`` (N,): the timestamps, None for poses without times. Raises InputError if a number is not finite, or if a
+    quaternion is not a unit quaternion.
     """
     rows = np.arange(1, len(table) + 1)
     path = PosePath(name, table[:, :3], checked_rotations(name, rows, table), t_ns)

@@ -44,7 +44,7 @@ class SameTurns:
 
 
 def match(first: Turns, second: Turns) -> SameTurns | None:
-    """Find the offset at which the turns of two tables agree best.
+    """Find the clock offset between two tables at which their turns agree best.
 
     Returns None if no offset makes them agree, such as on a straight drive, or if a table lasts longer than :data:`LONGEST`.
     """

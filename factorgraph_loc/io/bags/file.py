@@ -244,9 +244,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     files = [inside(path, file.name, path) for file in path.iterdir()] if path.is_dir() else [path]
     for file in files:
         if not file.is_dir():
-            with opened(
-                file, sys.maxsize
-            ):  # raises InputError at a FIFO, which would block, and at a pointer of Git LFS
+            with opened(file, sys.maxsize):  # raises InputError at a FIFO and at a pointer file of Git LFS
                 pass
     require_rosbags()
     bound()

@@ -159,7 +159,7 @@ def propose(bag: Bag) -> Uses:
 
 
 def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Add the topic of odometry to ``out``. ``tree``: the coordinate frames of the bag.
+    """Add the topic of odometry among ``topics`` to ``out``. ``tree``: the coordinate frames of the bag.
 
     Messages of type Odometry are preferred, then tf with an odometry frame, Twist, and JointState.
     """
@@ -334,7 +334,7 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
 
 
 def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[str, dict[str, Any]]:
-    """Return the proposed topics of ranges to landmarks with their settings, by the name of the topic.
+    """Return the proposed settings of each topic with ranges to landmarks, by the name of the topic.
 
     Such a topic has a field for a distance, and in the same part of the message a field for the name of a landmark.
     ``custom``: as in :func:`_rfid`.

@@ -103,10 +103,10 @@ class JointRows:
 
 
 def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
-    """Pair each message of the left wheel with the nearest message in time of the right wheel.
+    """Pair each message of the left wheel (``lefts``) with the message of the right wheel (``rights``) nearest in time.
 
-    Returns the later timestamps (N,) [ns] and the values (N, 2) of the pairs, left and right. Pairs that are farther
-    apart than :data:`MAX_OFFSET` are skipped, with a warning in ``warnings``. Raises InputError if no pair is left.
+    Returns the later timestamp of each pair (N,) [ns], and the values (N, 2), left and right. Pairs farther apart than
+    :data:`MAX_OFFSET` are skipped, and a warning is appended to ``warnings``. Raises InputError if no pair remains.
     """
     l_ns, left = lefts.in_order(("wheel",), warnings)
     r_ns, right = rights.in_order(("wheel",), warnings)
@@ -230,7 +230,9 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
 
 
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """Register a collector of poses or tf at ``listeners``. Return the function that computes the motion between them."""
+    """Register a collector of poses or tf at ``listeners``. Return the function that computes the motion from them.
+
+    ``static``: the static transforms of the bag."""
     made = poses_of_topic(listeners, options, static)
 
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:

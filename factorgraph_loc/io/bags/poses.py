@@ -93,7 +93,7 @@ class Start:
 
 
 def seven(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
-    """Return x, y, z [m] and the quaternion x, y, z, w of a message. ``position`` and ``orientation``: the names of its fields."""
+    """Return x, y, z [m] and the quaternion x, y, z, w of the message ``pose``, from the fields with the two names."""
     p, q = getattr(pose, position), getattr(pose, orientation)
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
@@ -128,7 +128,9 @@ def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = Tr
 
 
 def upward(parents: Mapping[str, str], frame: str) -> list[str]:
-    """Return ``frame`` and all frames above it, nearest first. ``parents``: the parent of each frame. A cycle is cut."""
+    """Return ``frame``, its parent, the parent of its parent, and so on. ``parents``: the parent of each frame.
+
+    A cycle ends at the first repeated frame."""
     chain = [frame]
     while (parent := parents.get(chain[-1], frame)) not in chain:
         chain.append(parent)
@@ -172,7 +174,7 @@ class StaticFrames:
         return pose
 
     def _up(self, frame: str) -> dict[str, Array]:
-        """Return the poses (4, 4) of ``frame`` in itself and in each frame above it, by the name of that frame."""
+        """Return the poses (4, 4) of ``frame`` in each of the frames that :func:`upward` returns, by frame name."""
         out = {frame: np.eye(4)}
         for child, parent in pairwise(upward(self.parents, frame)):
             out[parent] = self.poses[child] @ out[child]

@@ -55,9 +55,9 @@ FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 
 
 def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSettings:
-    """Return the settings of a camera from its CameraInfo, and its mounting from tf_static.
+    """Return the settings of a camera. ``info``: its CameraInfo. ``frames``: the static transforms of the bag.
 
-    Without a mounting in tf_static, the camera is at the robot's origin and points forward, with a note in ``notes``.
+    If the transforms lack the camera, it is at the robot's origin and points forward. A note is appended to ``notes``.
     """
     pose = frames.pose(info.frame)
     if pose is None:
@@ -202,7 +202,9 @@ def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack
 
 
 def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Images:
-    """Return a collector of images. It is registered at ``listeners`` unless the images are in the cache folder."""
+    """Return a collector of images. It is registered at ``listeners`` unless the images are in the cache folder.
+
+    ``stack``: deletes temporary files when it is closed."""
     stamper = listeners.stamper(options.topic, options.clock)
     images = Images(listeners.bag, options.topic, stamper, stack)
     if images.known:
@@ -215,7 +217,9 @@ def _images(listeners: Listeners, options: CameraTopic, stack: ExitStack) -> Ima
 def _rig(
     streams: dict[str, Stream], info: Info | None, options: Options, frames: StaticFrames, notes: list[Notice]
 ) -> Rig:
-    """Return a rig with the camera, the antennas and the default noise. Adds notes about mountings to ``notes``."""
+    """Return a rig for the ``streams`` of a bag, with default noise. Notes about mountings are appended to ``notes``.
+
+    ``info``: the CameraInfo of the camera, None without a camera. ``frames``: the static transforms of the bag."""
     camera = camera_of(info, frames, notes) if info else None
     reads = streams.get("rfid")
     rfid = None

@@ -95,7 +95,7 @@ class RowsOfTopic:
         self._rows = TopicRows(f"{bag.path} {topic}", len(self._numbered))
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Add the rows of a message, whose timestamp is ``t_ns``."""
+        """Add the rows of the message ``item`` with the timestamp ``t_ns``."""
         for values in self._fields.rows(item.message, item.row):
             row = dict(zip(self._fields.names, values, strict=True))
             try:
@@ -184,14 +184,14 @@ class Reads(RowsOfTopic):
         self._rounds: list[tuple[int, slice, str]] = []  # timestamp of the message [ns], rows of its reads, antenna
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Add the reads of a message, and also its inventory rounds if the option ``rounds`` is ``message``."""
+        """Add the reads of a message, and its inventory rounds if the option ``rounds`` is "message"."""
         first = len(self._rows)
         super().add(item, t_ns)
         if self._options.rounds == "message":
             self._add_rounds(item, t_ns, slice(first, len(self._rows)))
 
     def _add_rounds(self, item: Stamped, t_ns: int, reads: slice) -> None:
-        """Add the inventory rounds of a message, one for each antenna in its reads.
+        """Add the inventory rounds of a message, one for each antenna. ``reads``: the rows of the reads of the message.
 
         A message without reads is one round of the antenna that the message or the options name.
         """

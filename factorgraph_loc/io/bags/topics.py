@@ -201,7 +201,7 @@ class TopicRows:
         self._row, self._t_ns, self._values = array("q"), array("q"), array("d")
 
     def add(self, item: Stamped, t_ns: int) -> None:
-        """Add the row of a message, whose timestamp is ``t_ns``."""
+        """Add the row of the message ``item`` with the timestamp ``t_ns``."""
         assert self._get is not None
         values = self._get(item.message)
         self.append(item, t_ns, values if self._width > 1 else (values,))

@@ -174,9 +174,7 @@ def write_native(
     with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(folder) as temporary:
-            content = (
-                temporary / "log"
-            )  # has the permissions of a new folder, unlike the temporary folder, which is private
+            content = temporary / "log"  # unlike the private temporary folder, it has the permissions of a new folder
             content.mkdir()
             write_files(log, content, format)
             if overwrite and folder.exists():

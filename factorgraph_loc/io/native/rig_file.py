@@ -130,7 +130,7 @@ class RobotOptions:
 
 
 def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
-    """Return a rig with the sensors of a robot, and remarks on guessed values.
+    """Return a rig called ``name`` with the sensors of ``robot``, and remarks on guessed values.
 
     Raises InputError if a value is out of bounds, or if there is no sensor.
     """

@@ -90,11 +90,7 @@ def _type_of(name: str) -> Any:
 
 
 OTHERS = [name for name in native_tables() if name not in Options.model_fields]  # tables without options of their own
-add_fields(
-    Options,
-    {name: (_type_of(name), None) for name in OTHERS},
-    after="camera",
-)
+add_fields(Options, {name: (_type_of(name), None) for name in OTHERS}, after="camera")
 
 
 def read(path: Path | None, options: Options) -> Log:
@@ -198,7 +194,9 @@ def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRo
 
 
 def _names(path: Path, naming: NamesFile) -> dict[str, str]:
-    """Return the name in the map for each name in the table of a sensor. Raises InputError if a name is listed twice."""
+    """Read a table of translations. Return the name in the map for each name in the table of a sensor.
+
+    Raises InputError if a name is listed twice."""
     mapped = read_mapped(path, naming, (("file_name", "name"),))
     known: dict[str, str] = {}
     pairs = zip(mapped.names("file_name", FILE_NAME), mapped.names("name", MAP_NAME), strict=True)

@@ -148,8 +148,9 @@ def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tu
 
 
 def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array, Integers]:
-    """Return the timestamps (N,) [ns] and the planar poses (N, 3) of a file in TUM, KITTI or EuRoC format, and the
-    timestamps of its null poses, at which the device had lost its pose."""
+    """Read a file in TUM, KITTI or EuRoC format. Return its timestamps (N,) [ns] and planar poses (N, 3).
+
+    The third value has the timestamps of null poses, which mean that the device had lost its pose."""
     path = folder.file(options.file)
     if options.columns or options.units:
         raise InputError(f"{path}: format {options.format} names its own columns and units: remove columns and units")

@@ -111,7 +111,7 @@ class RfidFile(TimedMapping, ReadNames):
     @model_validator(mode="before")
     @classmethod
     def _of_preset(cls, content: Any) -> Any:
-        """Merge the columns and units of the preset with the given ones, which have precedence."""
+        """Add the columns and units of the preset to the settings ``content``, unless ``content`` has them."""
         name = content.get("preset") if isinstance(content, dict) else None
         preset = presets().get(name) if isinstance(name, str) else None
         if preset is None or not all(isinstance(content.get(part, {}), dict) for part in preset):
@@ -214,7 +214,7 @@ def _channel(channels: tuple[float, ...] | Channels | None) -> Column:
 def _epcs(mapped: Cells) -> tuple[list[str], list[Fault]]:
     """Return the EPC of each row as hexadecimal digits, and the faults of empty and invalid EPCs.
 
-    Some versions of sllurp write EPCs as Python bytes, ``b'...'``. These marks are removed.
+    The quotes around EPCs such as ``b'30F4'``, which some versions of sllurp write, are removed.
     """
     texts, faults = [""] * len(mapped.rows), []
     if "epc" in mapped.columns:

@@ -66,10 +66,7 @@ def read(path: Path | None, options: Options) -> Log:
         name=f"plaza{options.run}",
         rig=DEFAULT_RIG,
         world=beacons(f"{file}:TL", fields["TL"]),
-        streams={
-            "odometry": increments(driven, t0_ns, warnings),
-            "bearing_range": ranges(observed, t0_ns, warnings),
-        },
+        streams={"odometry": increments(driven, t0_ns, warnings), "bearing_range": ranges(observed, t0_ns, warnings)},
         reference=Trajectory(checks.seconds(truth.t_ns, t0_ns), poses, has_heading=HAS_HEADING[options.run]),
         t0_ns=t0_ns,
         warnings=tuple(warnings),
@@ -78,10 +75,10 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def read_matlab(path: Path, fields: Mapping[str, int]) -> tuple[dict[str, Array], list[str]]:
-    """Return some arrays of a MATLAB file (version 5 to 7) by name, and the names of all other arrays in the file.
+    """Read arrays of a MATLAB file (version 5 to 7). Return them by name, and the names of all other arrays.
 
-    ``fields``: the number of columns of each array to read. The sizes that the file declares are checked before it is
-    unpacked. Raises InputError with the file and the name of a missing or invalid array.
+    ``fields``: the number of columns of each array to read, by name. Raises InputError with the file and the name of a
+    missing, invalid or too large array.
     """
     from scipy.io import loadmat, whosmat  # noqa: PLC0415 - slow to import
 
