@@ -72,7 +72,9 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
     ``log``: the name of the log. ``made``: the new map. ``poses`` (N, 3): the trajectory in its frame. ``label``:
     landmarks are labelled with this many last characters of their name, or with the whole name if it is 0.
     """
-    given = np.array([e.given for e in made.entries if e.given is not None and _is_in_frame(made, e.verdict)])
+    # other given positions are in another frame than the new map
+    drawn = [e for e in made.entries if made.judged or e.verdict == "given"]
+    given = np.array([e.given for e in drawn if e.given is not None])
     learnt = [e for e in made.entries if e.learnt is not None]
     places = np.array([e.learnt.position for e in learnt if e.learnt is not None]).reshape(-1, 2)
     out, axis = _from_above(f"{log}: map", (given.reshape(-1, 2), places, poses[:, :2]))
@@ -120,8 +122,3 @@ def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float
     axis.set_aspect("equal", adjustable="datalim")
     axis.set(xlabel="x [m]", ylabel="y [m]")
     return out, axis
-
-
-def _is_in_frame(made: LandmarkMap, verdict: str) -> bool:
-    """True if the new map ``made`` has the frame of a landmark's given position. ``verdict``: on the landmark."""
-    return made.judged or verdict == "given"

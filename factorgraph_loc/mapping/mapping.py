@@ -52,8 +52,9 @@ CONVERGED = 1e-9  # m and rad
 class Entry:
     """One landmark in the comparison of a new map with a given map.
 
-    ``landmark``: its name. ``given``: its position (2,) in the given map, or None. ``learnt``: its estimate in the frame of the new
-    map, or None. ``verdict``: the result of the comparison, such as "agrees". ``flagged``: True if the given position is wrong.
+    ``landmark``: its name. ``given``: its position (2,) in the given map, or None. ``learnt``: its estimate in the
+    frame of the new map, or None. ``verdict``: the result of the comparison, such as "agrees". ``flagged``: True if the
+    given position is wrong.
     """
 
     landmark: str
@@ -64,7 +65,7 @@ class Entry:
 
     @property
     def distance(self) -> float | None:
-        """Distance [m] between the given and the learnt position, or None if one of both is missing."""
+        """Distance [m] between the given and the learnt position, or None if either is missing."""
         if self.given is None or self.learnt is None:
             return None
         return float(np.hypot(*(self.learnt.position - self.given)))
@@ -216,7 +217,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
 
 
 def _pairs(count: int) -> list[list[int]]:
-    """Return all pairs of ``count`` indices. If there are more than ``MAX_PAIRS``, return so many that are drawn at random."""
+    """Return all pairs of ``count`` indices, or ``MAX_PAIRS`` random pairs if there are more."""
     if count * (count - 1) // 2 <= MAX_PAIRS:
         return [list(pair) for pair in combinations(range(count), 2)]
     rng = np.random.default_rng(0)
@@ -224,7 +225,7 @@ def _pairs(count: int) -> list[list[int]]:
 
 
 def _moved(point: LearntPoint, alignment: Alignment) -> LearntPoint:
-    """Transform a learnt point to the given map's frame. Its covariance then includes the uncertainty of the alignment."""
+    """Return a learnt point in the frame of the given map. Its covariance includes that of the ``alignment``."""
     turn = _rotation(alignment.pose)
     (jacobian,) = _by_alignment(alignment.pose, point.position[None])
     covariance = alignment.factor * turn @ point.covariance @ turn.T + jacobian @ alignment.covariance @ jacobian.T

@@ -244,7 +244,8 @@ def _made(
 
 
 def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Array, Array]:
-    """Return tracks, positions (T, 3), covariances (T, 3, 3) and parallaxes (T,) [rad] of the points that fulfil the settings."""
+    """Return tracks, positions (T, 3), covariances (T, 3, 3) and parallaxes (T,) [rad] of points that meet
+    ``settings``."""
     tracks, points, covariances = adjusted.tracks, adjusted.points, adjusted.point_covariances
     angles = parallax(adjusted.cameras, points, tracks)
     good = (
@@ -288,9 +289,9 @@ def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int
 def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) -> PosedFrames:
     """Return the images of a log with camera poses from the log's reference trajectory.
 
-    Images before or after the reference or in its gaps are left out. ``turn_sigma`` [rad], ``shift_sigma`` [m]: standard deviations
-    of the camera poses about and along each axis. They are used if the reference has no covariances.
-    Raises InputError if the log has no camera, no features or no reference with headings, or if no image remains.
+    Images before or after the reference or in its gaps are left out. ``turn_sigma`` [rad], ``shift_sigma`` [m]:
+    standard deviations of the camera poses about and along each axis, used if the reference has no covariances. Raises
+    InputError if the log has no camera, no features or no reference with headings, or if no image remains.
     """
     t, all_frames = frames_of(log)
     if log.rig.find(CameraSettings) is None:

@@ -33,7 +33,7 @@ SAME = 0.05  # m, rad: optima with smaller differences are equal
 MERGED, OVERLAP = 0.5, 9.0
 # m, rad: read counts are added up while the robot moves less than this: in the search on a lattice, in the refinement
 COARSE, FINE = (0.2, 0.15), (0.05, 0.03)
-# least log-likelihood ratio of a located tag to a tag out of reach. Of false reads even the best position has less.
+# least log-likelihood ratio of a located tag to a tag out of reach; the best position for false reads has a smaller one
 GAIN = 8.0
 SURE = 0.95  # if the weight of a mode is larger, the other modes are ignored
 LARGEST_SIGMA = 1.0  # m: largest standard deviation of a located tag
@@ -108,8 +108,8 @@ class TagPosterior:
 def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
     """Search for the positions of T tags. Returns a result per tag.
 
-    ``counts``: the reads of these tags; its ``offsets`` are the robot poses in the world frame. ``heights`` (T,) [m].
-    ``facing`` (T,) [rad]: NaN where unknown.
+    ``counts``: the reads of these tags, with the robot poses in the world frame as ``offsets``. ``heights`` (T,) [m],
+    ``facing`` (T,) [rad]: of the tags. A facing is NaN if it is unknown.
     """
     counts = merged(counts, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)

@@ -23,7 +23,7 @@ from factors.se2 import Array, Integers
 NEAREST, FARTHEST = 0.1, 100.0  # m: allowed depths of a point in the cameras that observe it
 PARALLAX = 0.02  # rad: least angle between two rays to a point
 ANY_SPREAD = 1e3  # largest relative standard deviation of a triangulated point: so large that none is rejected
-# a frame is matched with these frames in the list of overlapping frames, sorted by distance: 0 is the nearest
+# a frame is matched with the overlapping frames at these places in the order of distance, 0 for the nearest frame
 RANKS = (0, 1, 2, 4, 7, 12, 20, 33)
 APART, ASKEW = 1.0, 0.8  # m, rad: the images of cameras that differ more are assumed not to overlap
 RATIO = 0.85
@@ -103,11 +103,11 @@ class Triangulated:
 
 
 def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
-    """Compute the residuals of N observations, with derivatives.
+    """Return the residuals (N, 2) [px] of N observations, predicted minus measured, with derivatives.
 
-    ``points`` (T, 3): positions in the world frame. Returns the residuals (N, 2) [px], predicted minus measured; their
-    Jacobians with respect to the camera pose (N, 2, 6), as in :func:`factors.camera.model.linearize_in_space`, and to
-    the point (N, 2, 3); the depths (N,) [m].
+    Also returns the Jacobians with respect to the camera pose (N, 2, 6), as in
+    :func:`factors.camera.model.linearize_in_space`, and to the point (N, 2, 3), and the depths (N,) [m].
+    ``points`` (T, 3): positions in the world frame.
     """
     rotations = cameras.rotations[tracks.frame]
     local = np.einsum("nj,njk->nk", points[tracks.track] - cameras.positions[tracks.frame], rotations)

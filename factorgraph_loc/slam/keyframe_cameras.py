@@ -243,19 +243,17 @@ class KeyframeCameras:
         self.anchored = {number: anchored for number, anchored in self.anchored.items() if number >= first}
 
     def at_image(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return the pose at the time when the image was taken, from the pose ``guess`` at the stamp of the image.
-
-        ``keyframe``: the number of the keyframe. The covariance of the returned pose includes the variance of the time offset.
-        """
+        """Return the pose when the image was taken, from the pose ``guess`` at the image's time stamp. The variance of
+        the camera's time offset is added. ``keyframe``: the number of the image's keyframe."""
         return self._moved(keyframe, guess, graph, 1.0)
 
     def at_stamp(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return the pose at the stamp of the image, from the pose ``guess`` at the time when the image was taken.
-        ``keyframe``: the number of the image's keyframe."""
+        """Return the pose at the image's time stamp, from the pose ``guess`` when the image was taken (the camera's
+        time offset later). ``keyframe``: the number of the image's keyframe."""
         return self._moved(keyframe, guess, graph, -1.0)
 
     def pose(self, keyframe: int, graph: Graph) -> Array:
-        """Return the current estimate (3,) of the pose of a keyframe, by number, at the time when its image was taken."""
+        """Return the estimated pose (3,) of the keyframe with this number, at the time when its image was taken."""
         pose = graph.current(graph.keyframes[keyframe].key)
         return self._moved(keyframe, (pose, np.zeros((3, 3))), graph, 1.0)[0]
 
@@ -293,7 +291,7 @@ class KeyframeCameras:
 
         ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the sightings of the points
         that are adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch. Returns None
-        if points of the graph determine the newest keyframe already, or if the adjustment fails.
+        if points of the graph determine the pose of ``newest`` already, or if the adjustment fails.
         """
         if self.anchored[newest.index]:
             return None

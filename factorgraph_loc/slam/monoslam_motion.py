@@ -40,7 +40,7 @@ class RobotState:
     rate: Array
 
     def plus(self, error: Array) -> RobotState:
-        """Return the state perturbed by an ``error`` (12,) of the error state."""
+        """Return the state perturbed by ``error`` (12,), a vector of the error state."""
         return RobotState(
             self.position + self.rotation @ error[SHIFT],
             orthonormal(self.rotation @ exp(error[TURN])),
@@ -121,7 +121,7 @@ def standstill(robot: RobotState) -> Step:
 
 
 def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: Array, dt: float) -> Step:
-    """Return the step of a robot that moves as measured by odometry. The odometry also sets its velocity and turn rate.
+    """Return the step of a robot that moves as measured by odometry, with the velocity and turn rate of the odometry.
 
     ``robot``: the state at the start. ``delta`` (3,): pose of the end in the frame of the start, as x [m], y [m],
     heading [rad]. ``covariance`` (3, 3): of a perturbation of the end in its own frame. ``by_constants`` (3, P): the
@@ -144,10 +144,12 @@ def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: A
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
-    """Return ``step`` with height, roll and pitch then drawn back towards zero. Valid on a floor with small tilts.
+    """Return ``step`` followed by a decay of height, roll and pitch towards zero, for a robot on a floor with small
+    tilts.
 
-    Height, roll and pitch follow a stationary process about zero and have no velocity. ``height_sigma`` [m] and ``tilt_sigma``
-    [rad] are its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: the duration of ``step``.
+    Height, roll and pitch are a stationary process with mean zero and without velocity. ``height_sigma`` [m] and
+    ``tilt_sigma`` [rad] are its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: duration of
+    ``step``.
     """
     keep = math.exp(-dt / settling)
     robot = step.robot
@@ -187,7 +189,7 @@ def seen_from_above(robot: RobotState, covariance: Array) -> tuple[Array, Array]
 
 
 def tilt_of(robot: RobotState) -> Array:
-    """Roll and pitch (2,) [rad] of a robot that is nearly level."""
+    """Return roll and pitch (2,) [rad] of a robot that is nearly level."""
     return log(heading_of(robot).T @ robot.rotation)[:2]
 
 

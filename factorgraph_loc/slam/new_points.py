@@ -47,8 +47,8 @@ def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Point
 
 @dataclass(frozen=True)
 class ChosenSightings:
-    """N sightings from a keyframe. ``rows``: their rows in the measurement. ``names``: the name of each point, or the
-    number of its track. ``pixels`` (N, 2): the observed pixels."""
+    """N sightings from a keyframe. ``rows``: their indices in the image's measurement. ``names``: the name of each
+    point, or the number of its feature track. ``pixels`` (N, 2): the observed pixels."""
 
     rows: list[int]
     names: list[Hashable]
@@ -121,11 +121,10 @@ class NewPoints:
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
-        """Triangulate the points ``names``. The sightings of a triangulated point are returned and no longer collected.
+        """Return the points among ``names`` that can be triangulated: name, point, and consistent sightings.
 
-        ``places``: a function that returns the camera pose of a keyframe by number, or None for a keyframe that accepts
-        no factors. ``most``: the largest number of results. Returns for each triangulated point its name, the point,
-        and the consistent sightings.
+        The sightings of a returned point are no longer collected. ``places``: a function that returns the camera pose
+        of a keyframe by number, None if its sightings must not be used. ``most``: the largest number of results.
         """
         determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}

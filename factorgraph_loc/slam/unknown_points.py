@@ -291,8 +291,10 @@ class UnknownPoints(Mapper):
         return forgotten
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
-        """Return a map of all stored points, including those removed from the graph. If a point has several keys, the first is
-        used. ``values``, ``covariances``: estimates by key, of points and keyframes. Returns None if there are no points."""
+        """Return a map of all stored points, including points removed from the graph. Returns None if there are none.
+
+        ``values``, ``covariances``: estimates of points and keyframes, by key.
+        """
         keys: dict[str, int] = {}
         for point in sorted((*self._points.values(), *self._astray, *self._gone), key=lambda point: point.key):
             if point.key in values:
@@ -337,7 +339,9 @@ class UnknownPoints(Mapper):
         observed = positions[recent], pixels[recent], covariances[recent], noise[recent]
         guess = unless_slipped(replace(model, tilt=sigma), keyframe, guess, graph.motion.slip, observed)
         since = moved_since(graph.keyframes, keyframe, keyframe.t - RECENT, HORIZON)
-        near = guess if since is None else (guess[0], since)  # with the covariance of the odometry since RECENT
+        near = (
+            guess if since is None else (guess[0], since)
+        )  # with the covariance of the odometry of the last RECENT seconds
         camera, right, placed, tilt = lifted(model, *guess), known.copy(), guess, LEVEL
         # a named point needs one other point that confirms it
         revisited = max(2 if named else REVISITED, math.ceil(LEAST_INLIERS * np.count_nonzero(~recent & ~known)))
