@@ -71,10 +71,8 @@ class Cloud:
         return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
-        """Return the cloud with a block ``name`` of constants added, drawn from a Gaussian.
-
-        ``mean`` (d,), ``covariance`` (d, d): of the Gaussian.
-        """
+        """Return the cloud with a block ``name`` of constants added, drawn from a Gaussian. ``mean`` (d,),
+        ``covariance`` (d, d): of the Gaussian."""
         first = self.constants.shape[1]
         drawn = mean + positive.draws(covariance, len(self.poses), rng)
         parts = {**self.parts, name: slice(first, first + len(mean))}

@@ -272,10 +272,8 @@ class Ekf(Filter):
         return self._start(self._search.brought(pose, self._odometry))
 
     def _jump(self, best: PosePrior, refuted: Refuted) -> None:
-        """Continue at the pose ``best``, without correlation with the rest of the state.
-
-        The sensor constants are reset to their estimates from before ``refuted.since``, when the estimated pose became wrong.
-        """
+        """Continue at the pose ``best``, without correlation with the rest of the state. The sensor constants are reset
+        to their estimates from before ``refuted.since``, when the estimated pose became wrong."""
         self._search.begin_track(by_search=True)
         for sensor in self._sensors.values():
             sensor.restart(refuted.since)

@@ -269,9 +269,7 @@ class ParticleFilter(Filter):
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
         """Move the particles of ``cloud`` by an odometry increment, with their own constants and body-frame ``noise``.
-
-        Returns the poses (N, 3), and the Jacobian (3, 3+P) of the pose by body-frame perturbation and constants.
-        """
+        Returns the poses (N, 3), and the Jacobian (3, 3+P) of the pose by body-frame perturbation and constants."""
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
         part = cloud.parts.get(MOTION)

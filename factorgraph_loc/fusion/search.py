@@ -180,10 +180,8 @@ class Search:
 
     @property
     def _leading(self) -> Finder | Population | None:
-        """The source of the present result, None if no source has a result. A finder uses one sensor alone.
-
-        The order of preference is: a finder that needs only one measurement, the particles, any other finder.
-        """
+        """The source of the present result, None if no source has a result. A finder uses one sensor alone. The order
+        of preference is: a finder that needs only one measurement, the particles, any other finder."""
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):

@@ -87,9 +87,7 @@ def _adjusted(
     model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
 ) -> tuple[Sequence[Array], Array, Truths]:
     """Return adjusted poses (3,) and tilts (N, 2) of N keyframes, and a mask (M,) of the sightings that fit the result.
-
-    ``often``: the sightings of each point, M in all. If the adjustment fails, poses and tilts are the initial ones.
-    """
+    ``often``: the sightings of each point, M in all. If the adjustment fails, poses and tilts are the initial ones."""
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]
     points = []
@@ -140,10 +138,8 @@ class LocalBundle:
         return float(of_pixels + 0.5 * np.sum(tilts**2) / self.model.tilt**2) + self.odometry.cost(poses, np.zeros(0))
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """Return the state after a Levenberg-Marquardt step, and the largest component of the step.
-
-        ``damping``: this factor times the Hessian's diagonal is added to the Hessian. Returns None if it is singular.
-        """
+        """Return the state after a Levenberg-Marquardt step, and the largest component of the step. ``damping``: this
+        factor times the Hessian's diagonal is added to the Hessian. Returns None if the sum is singular."""
         poses, tilts, points = state
         residual, jacobian, _ = self.linearize(state)
         jacobian = jacobian[..., :CONSTANTS]

@@ -90,9 +90,7 @@ class UpdateRecord:
 
 def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
     """Smooth each record with all later records (Rauch, Tung, Striebel, 1965), and return the smoothed records.
-
-    Velocity and turn rate do not influence later records and are not smoothed.
-    """
+    Velocity and turn rate do not influence later records and are not smoothed."""
     results = list(records[-1:])
     for next_record, record in zip(records[:0:-1], records[-2::-1], strict=True):
         results.append(record if next_record.relocalized else _smoothed(record, next_record, results[-1]))
@@ -256,10 +254,8 @@ class Monoslam(Filter):
         return self._matcher.unless_slipped(m, state, eye, *slip)
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Return the state after a Kalman update of ``prior`` with the matched pixels ``match``.
-
-        In a known map, the update is iterated with Huber weights. The noise of a pixel outside the gate is increased.
-        """
+        """Return the state after a Kalman update of ``prior`` with the matched pixels ``match``. In a known map, the
+        update is iterated with Huber weights. The noise of a pixel outside the gate is increased."""
         known = match.mapped, match.points, match.covariances
         zero = np.zeros(len(prior.covariance))
         sights = eye.all(prior, *known)

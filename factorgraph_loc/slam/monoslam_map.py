@@ -65,10 +65,8 @@ def settled(state: SlamState, eye: Eye) -> SlamState:
 
 
 def counted(state: SlamState, expected: Sequence[int], matched: Collection[int], t: float) -> SlamState:
-    """Return the state with the matches of an image at time ``t`` [s] counted in its points.
-
-    ``expected``: indices of the points that should be visible. ``matched``: indices of the points that were matched.
-    """
+    """Return the state with the matches of an image at time ``t`` [s] counted in its points. ``expected``: indices of
+    the points that should be visible. ``matched``: indices of the points that were matched."""
     points = list(state.points)
     for i in expected:
         hit = i in matched

@@ -80,11 +80,8 @@ class Step:
         return result
 
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
-        """Return this step followed by another step, as one step.
-
-        ``transition``, ``noise`` (12, 12): of the other step, which must not depend on the constants of the odometry.
-        ``robot``: the state after the other step.
-        """
+        """Return this step followed by another step, as one step. ``transition``, ``noise`` (12, 12): of the other
+        step, which must not depend on the constants of the odometry. ``robot``: the state after the other step."""
         return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
 
 
@@ -173,10 +170,8 @@ def heading_of(robot: RobotState) -> Array:
 
 
 def seen_from_above(robot: RobotState, covariance: Array) -> tuple[Array, Array]:
-    """Return the planar pose (3,) of a robot, as x, y and heading, and its covariance (3, 3).
-
-    ``covariance`` (6, 6): the covariance of the robot's pose in space, in the robot's frame.
-    """
+    """Return the planar pose (3,) of a robot, as x, y and heading, and its covariance (3, 3). ``covariance`` (6, 6):
+    the covariance of the robot's pose in space, in the robot's frame."""
     rotation = robot.rotation
     x, y = rotation[0, 0], rotation[1, 0]
     jacobian = np.zeros((3, 6))

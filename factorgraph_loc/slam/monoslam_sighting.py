@@ -310,10 +310,8 @@ def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
 
 
 def _slip(match: Match, state: SlamState, eye: Eye, added: Array) -> float:
-    """Return the log-likelihood ratio of the matched pixels for slip of the wheels, relative to no slip.
-
-    ``added`` (3, 3): the covariance of x, y and heading that slip adds.
-    """
+    """Return the log-likelihood ratio of the matched pixels for slip of the wheels, relative to no slip. ``added`` (3,
+    3): the covariance of x, y and heading that slip adds."""
     sights = eye.all(state, match.mapped, match.points, match.covariances)
     covariance = Innovation.of(sights, state.covariance).total(sights.noise)
     # a common error of all depths: points of unknown depth have the same initial depth, so their errors resemble slip

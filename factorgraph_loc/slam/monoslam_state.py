@@ -305,10 +305,8 @@ def squared(residual: Array, covariance: Array) -> Array:
 
 
 def starting(sigmas: Array) -> Array:
-    """Return the covariance (12 + P, 12 + P) of the error state at the start, with zeros for the pose.
-
-    ``sigmas`` (P,): the standard deviations of the odometry's constants.
-    """
+    """Return the covariance (12 + P, 12 + P) of the error state at the start, with zeros for the pose. ``sigmas`` (P,):
+    the standard deviations of the odometry's constants."""
     motion = np.array([0.0] * POSE + [VELOCITY_SIGMA] * 3 + [RATE_SIGMA] * 3)
     return np.diag(np.concatenate((motion, sigmas)) ** 2)
 

@@ -51,11 +51,8 @@ class MovingThings:
         return name not in self.moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
-        """Update the classification with a new image.
-
-        ``keyframe``: the keyframe of the image. ``names``: its K tracks. ``pixels`` (K, 2): their pixels. ``graph``:
-        supplies the odometry between keyframes.
-        """
+        """Update the classification with a new image. ``keyframe``: the keyframe of the image. ``names``: its K tracks.
+        ``pixels`` (K, 2): their pixels. ``graph``: supplies the odometry between keyframes."""
         new_pixels = dict(zip(names, pixels, strict=True))
         self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]
         for old_keyframe, old_pixels in reversed(self._images):

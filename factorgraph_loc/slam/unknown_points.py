@@ -292,9 +292,7 @@ class UnknownPoints(Mapper):
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
         """Return a map of all stored points, including points removed from the graph. Returns None if there are none.
-
-        ``values``, ``covariances``: estimates of points and keyframes, by key.
-        """
+        ``values``, ``covariances``: estimates of points and keyframes, by key."""
         keys: dict[str, int] = {}
         for point in sorted((*self._points.values(), *self._astray, *self._gone), key=lambda point: point.key):
             if point.key in values:

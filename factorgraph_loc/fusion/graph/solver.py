@@ -337,9 +337,7 @@ class LinearFactors:
 
     def _followed(self, estimates: Values) -> list[int]:
         """Return the keys of the variables with factors that must be linearised again, () if the map is known.
-
-        ``estimates``: the present estimates of all variables with a linearisation point that iSAM2 does not move.
-        """
+        ``estimates``: the present estimates of all variables with a linearisation point that iSAM2 does not move."""
         if all(map(is_pose, estimates)):
             return []
         for key in estimates:
