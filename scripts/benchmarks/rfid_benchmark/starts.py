@@ -49,7 +49,7 @@ def section(options: Options) -> Report:
         for (kind, name, estimator, deadline), trials in found.items()
         if any(not t.seconds <= deadline for t in trials)
     ]
-    report.say("These seeds were not right in time: " + ("; ".join(late) or "none") + ".")
+    report.say("Seeds of trials that were not right in time: " + ("; ".join(late) or "none") + ".")
     return report
 
 
