@@ -25,7 +25,8 @@ def policies(options: Options) -> Report:
     degrees = math.degrees(SETTINGS.heading_limit)
     report.say(
         f"A robot gives up after {SETTINGS.max_metres:.0f} m. The limits of a localized robot are "
-        f"{SETTINGS.position_limit:g} m and {degrees:.0f} degrees. Errors are medians at the end. *Planning* is the time of one step."
+        f"{SETTINGS.position_limit:g} m and {degrees:.0f} degrees. Errors are medians at the end. *Planning* is the time of "
+        "one step."
     )
     rows = compared(report, ("active_mcl",), POLICIES, WORLDS, options.count(200))
     # in the dense office robots are localized almost without driving
