@@ -116,7 +116,7 @@ def maximise(
 
     ``parameters``: P parameters with priors. ``likelihood``: returns the likelihood at parameter values (P,).
     ``start``: initial values by name. The default is the mean of the prior.
-    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas in the
+    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas of the
     parameters.
     """
     mean, sigma, low, high = (

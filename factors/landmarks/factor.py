@@ -36,9 +36,7 @@ from factors.update import CONVERGED, GATE, Correction
 NOTHING = np.zeros(0)  # the values of the sensor constants if the factor estimates no constants
 _NOWHERE, _EXACTLY = np.zeros(3), np.zeros((3, 3))  # placeholders for an offset or covariance that is None
 SMALL_BIAS = 1e-4  # m; step of the numerical derivative by a range bias: residuals are nearly linear
-LEAST_SINGULAR = (
-    1e-6  # minimum singular value of a Jacobian by a landmark, absolute [1/m] and relative to the largest one
-)
+LEAST_SINGULAR = 1e-6  # minimum singular value of a Jacobian by a landmark, in 1/m and relative to the largest one
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +51,8 @@ class BearingRangeFactor:
     ``point_covariances`` (K, 2, 2): covariances of the landmarks of an inexact map. They are added to the noise.
     ``estimated``: indices in :data:`PARAMETERS` of the P sensor constants that are estimated.
     ``free``: True if the position of the landmark is estimated. Then K is 1, and the estimate replaces ``points``.
-    ``biased``: True if a bias in the ranges is estimated.
-    ``twist`` (3,): the robot's body-frame velocity at the time of the measurement. Required if the time offset is
-    estimated.
+    ``biased``: True if a bias of the ranges is estimated.
+    ``twist`` (3,): the robot's body-frame velocity. Required if the time offset is estimated.
     ``simultaneous``: the number of all landmarks measured at this time, also by other factors. None means K. The
     covariance of ``offset`` is multiplied by this number, so that its error, common to all, does not average out.
 
@@ -178,7 +175,7 @@ class BearingRangeFactor:
         return error, blocks, slopes
 
     def _shortened(self, values: Sequence[Array]) -> Array:
-        """The ranges (K,) without their bias."""
+        """The ranges (K,) minus the range bias."""
         return self.ranges - values[1 + bool(self.estimated)][0] if self.biased else self.ranges
 
     def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
@@ -196,7 +193,7 @@ class BearingRangeFactor:
         return error, jacobian
 
     def _blocks(self, jacobian: Array) -> list[Array]:
-        """The columns (K, 2, d) of a Jacobian (K, 2, WIDTH) for each value of the factor except the range bias."""
+        """Split a Jacobian (K, 2, WIDTH) into the Jacobians (K, 2, d) by each value except the range bias."""
         blocks = [jacobian[..., :POINT]]
         if self.estimated:
             blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])

@@ -27,9 +27,9 @@ from factors.update import corrected, normalised
 
 # One measurement of K landmarks. The elements are, in this order:
 # - points (K, 2) or (K, 3), ranges (K,), bearings (K,);
-# - whether there is an offset (the motion from the pose variable to the measurement), and the offset (3,);
-# - whether the offset has a covariance, the covariance (3, 3), and the number of landmarks that have its error in common;
-# - whether the velocity is known, and the velocity (3,);
+# - True if there is an offset (the motion from the estimated pose to the measurement), and the offset (3,);
+# - True if the offset has a covariance, the covariance (3, 3), and the number of landmarks that share the error;
+# - True if the velocity is known, and the velocity (3,);
 # - covariances of the points (K, 2, 2), or (0, 2, 2) if the points are exact.
 Sighting = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Array, Array]
 
@@ -82,9 +82,7 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
                 uu, uv, vv = uu + count * a, uv + count * b, vv + count * d
             _widen(error[k], jacobian[k], uu, uv, vv)
         if displaced:
-            for i in range(
-                2
-            ):  # convert the derivative by the pose after the offset to the derivative by the estimated pose
+            for i in range(2):  # convert the derivative by the pose at the measurement to that by the estimated pose
                 u, v = jacobian[k, i, 0], jacobian[k, i, 1]
                 jacobian[k, i, 0], jacobian[k, i, 1] = u * c - v * s, u * s + v * c
                 jacobian[k, i, 2] += u * lever_x + v * lever_y
@@ -256,7 +254,7 @@ def updated(
 def weighted(
     model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
 ) -> tuple[Array, Array, Array]:
-    """The whitened residual (2K,) with robust weights, and its Jacobians by the pose (2K, 3) and by the estimated
+    """Return the whitened residual (2K,) with robust weights, and its Jacobians by the pose (2K, 3) and the estimated
     constants (2K, P). The arguments are those of :func:`updated`."""
     count, wide = len(packed[0]), len(indices)
     residual, jacobian, slope = np.empty((count, 2)), np.empty((count, 2, 3 + wide)), np.empty(count)

@@ -53,14 +53,14 @@ NONE = LateRanges()
 def mixture(
     error: float, slope: float, robust: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
-    """Return the negative log-likelihood of a range, its derivative by ``error``, and the information about ``error``.
+    """Return the negative log-likelihood of a range that may be late, its derivative by ``error``, and the information.
 
     ``error``: the predicted minus the measured range in standard deviations.
     ``slope``: the inverse of the standard deviation [1/m].
     ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``sigma``: those of :class:`LateRanges`.
 
-    The information is the mean information of a direct and a late range, minus the variance of the derivative (Louis,
-    Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
+    The information about ``error`` is the mean information of a direct and a late range, minus the variance of the
+    derivative (Louis, Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
     """
     widening = 1.0 + (slope * sigma) ** 2
     beyond = error + slope * mean
@@ -88,9 +88,9 @@ def moments(
     increased if a normalised innovation squared exceeds this limit. The other arguments are those of :func:`mixture`.
 
     Returns the error and the weight of the Gaussian measurement, and the expected normalised innovation squared. The
-    prediction corrected by a direct and by a late range is a mixture of two Gaussians. The measurement leads to its
-    mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian inference",
-    2001, 3.1).
+    posterior of a range that may be late is a mixture of two Gaussians. The Gaussian measurement leads to a posterior
+    with the same mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian
+    inference", 2001, 3.1).
     """
     widening = 1.0 + (slope * sigma) ** 2
     beyond = error + slope * mean

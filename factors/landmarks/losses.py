@@ -24,8 +24,9 @@ def slopes(error: Array, jacobian: Array, ranges: Array, bearings: Array, out: A
 
 @compiled
 def loss(model: Array, error: Array, slopes: Array) -> float:
-    """The sum of the losses of whitened residuals (K, 2). ``model`` (14,): the array ``packed`` of a
-    :class:`~factors.landmarks.model.BearingRangeModel`. ``slopes`` (K,): the output of :func:`slopes`."""
+    """Return the sum of the losses of K landmarks. ``model`` (14,): the array ``packed`` of a
+    :class:`~factors.landmarks.model.BearingRangeModel`. ``error`` (K, 2): the whitened residuals. ``slopes`` (K,): the
+    output of :func:`slopes`."""
     total = 0.0
     for k in range(len(error)):
         if slopes[k] > 0.0 and model[LATE] > 0.0:
@@ -51,8 +52,8 @@ def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
 
 @compiled
 def weigh(model: Array, error: Array, jacobian: Array, slopes: Array) -> None:
-    """Multiply residuals (K, 2) and their Jacobian (K, 2, D), in place, by the square roots of their weights.
-    Afterwards the product of both is the derivative of the loss. The other arguments are those of :func:`loss`."""
+    """Apply :func:`reweigh`, and multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D), in
+    place, by the square roots of the weights. The other arguments are those of :func:`loss`."""
     weights = np.empty(len(error))
     reweigh(model, error, slopes, weights)
     for k in range(len(error)):
@@ -79,7 +80,7 @@ def resolve(
     ``error``, ``weights`` and ``squared`` in place. Returns True if there are such ranges.
 
     ``error`` (K, 2), ``jacobian`` (K, 2, D): whitened residuals at the prediction, and their Jacobian. ``columns``
-    (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): of the state.
+    (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): covariance of the state.
     ``weights`` (K,): the weights of the squared residuals. ``squared`` (K,): the normalised innovations squared.
     ``gate``: see :func:`factors.landmarks.late.moments`. ``model`` and ``slopes`` are those of :func:`loss`.
     """

@@ -97,8 +97,8 @@ class OdometryChain:
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
         """Add the motion (dx, dy, dtheta) from the previous row until ``t``, in the robot frame at the previous row.
 
-        ``unknown`` [s]: the time of unknown motion since the previous row. If there is already
-        a motion until ``t``, the new motion is composed with it. Returns False if the row is too old and is ignored.
+        ``unknown`` [s]: the time of unknown motion since the previous row. A motion with the same ``t`` as an existing
+        row is composed with that row. Returns False if the row is too old and is ignored.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
@@ -191,7 +191,8 @@ class OdometryChain:
         """The robot's mean velocity (3,) in the :data:`TWIST_TIME` before ``t``, in the robot frame [m/s, m/s, rad/s].
         Raises ValueError if the rows of that time are deleted."""
         if t - TWIST_TIME < self.begin:
-            raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
+            needed = f"the velocity at {t:.3f} s needs odometry from {t - TWIST_TIME:.3f} s on"
+            raise ValueError(f"{needed}, but the odometry before {self.begin:.3f} s was deleted")
         return np.array(twist_at(self._knots, self._count, self._constants, t))
 
     def predicted(
@@ -207,11 +208,11 @@ class OdometryChain:
 
         ``pose`` (3,), ``covariance`` (S, S): the estimate at ``start``. The first three components of the error state
         are the pose. ``constants`` (P,): corrections of the estimated odometry constants. ``first``: the index of the
-        first of them in the error state.
+        first of these constants in the error state.
 
-        Returns five values: the odometry state at ``t``; the predicted pose (3,); the first three rows (3, S) of the
-        transition matrix, whose remaining rows equal an identity matrix; the covariance (3, 3) of the motion; the
-        predicted covariance (S, S).
+        Returns five values: the odometry state at ``t``, the predicted pose (3,), the first three rows (3, S) of the
+        transition matrix, the covariance (3, 3) of the motion, and the predicted covariance (S, S). The remaining rows
+        of the transition matrix are those of an identity matrix.
         """
         size = len(covariance)
         at, transition, noise, out = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
@@ -288,8 +289,8 @@ class OdometryChain:
 
 @compiled
 def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
-    """The integrated state at time ``t``, computed from the last of ``count`` knots (states at the odometry rows) before ``t``.
-    ``constants``: the model as an array. The elements of the result are the fields of :class:`~factors.motion.ChainState`."""
+    """Return the integrated state at time ``t``, with the fields of :class:`~factors.motion.ChainState`. ``knots``: the
+    states at ``count`` odometry rows. ``constants``: the model as an array."""
     if count == 0:
         return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
     i = np.searchsorted(knots[:count, T], t, side="right") - 1

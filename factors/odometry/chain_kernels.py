@@ -64,7 +64,8 @@ def append(
     constants: Array,
     horizon: float,
 ) -> int:
-    """Append velocities to the ``count`` existing rows, integrate them into ``knots`` (the state at each row), and delete old rows.
+    """Append velocities to the ``count`` existing rows, write the states at the new rows into ``knots``, and delete old
+    rows.
 
     ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the
     times. ``constants``: the model as an array. ``horizon`` [s]: as in :func:`without_old`. Returns the new count. If

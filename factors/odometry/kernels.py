@@ -71,7 +71,7 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 
 @compiled
 def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
-    """The motions between N pairs of states (N, 8) by :func:`relative`, corrected for changed constants by :func:`recalibrated`.
+    """Compute :func:`relative` for N pairs of states (N, 8), and correct the motions by :func:`recalibrated`.
 
     ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants.
     Returns the relative poses (N, 3) and their covariances (N, 3, 3).
@@ -195,7 +195,7 @@ def recalibrated(delta: Array, moving: float, constants: Array, indices: Integer
 
 @compiled
 def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Array]:
-    """Correct an increment for changed odometry constants. The increment counts as one arc, which is exact for constant curvature.
+    """Correct an increment for changed odometry constants. The increment is assumed to be an arc of a circle.
 
     ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: its time in motion.
     ``changes`` (4,): the relative changes of the scales of distance and rotation, the change of the heading-rate bias

@@ -167,7 +167,7 @@ class RfidLikelihood:
     """The likelihood of read counts as a function of the robot's pose.
 
     ``model``: the antennas and their detection models. ``tags``: the tags of the map, or the tags on the robot if the
-    antennas in the model are fixed in the world. ``parameters`` (Q,): adjustments of detection models, mounting and
+    antennas of the model are fixed in the world. ``parameters`` (Q,): adjustments of detection models, mounting and
     clock (:mod:`factors.rfid.parameters`), initially zero. With M detection models and A antennas, Q is 2 M + A + 2.
     """
 

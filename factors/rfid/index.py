@@ -108,8 +108,8 @@ class NearTags(NamedTuple):
 
 @compiled
 def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
-    """The lower and upper corner of a box that contains all points within ``reach`` [m] of poses (N, 3). The corners are rounded
-    outwards to a grid, so that slightly different poses select the same tags and sums have the same rounding errors."""
+    """Return the lower and upper corner of a box that contains all points within ``reach`` [m] of poses (N, 3), rounded
+    outwards to a grid. Slightly different poses then select the same tags, so that results are reproducible."""
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for n in range(len(poses)):
         low_x, high_x = min(low_x, poses[n, 0]), max(high_x, poses[n, 0])

@@ -207,7 +207,7 @@ class Places:
         return self._last[key]
 
     def _scan(self, counts: Counts) -> Scan:
-        """Convert counts to a :class:`Scan` of the exceptional tags, which were read or have other odds than most tags."""
+        """Convert counts to a :class:`Scan`, with the tags that were read or have other odds than most tags."""
         _, antennas, rounds, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
         rows = np.arange(len(odds))
         if len(odds) == len(self.points) > 0:
