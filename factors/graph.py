@@ -279,8 +279,7 @@ def frame_motions(values: Values) -> tuple[Array, list[int]]:
     """Return how all variables change when the whole solution moves in the world frame (the gauge freedom).
 
     The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to a
-    shift in x, a shift in y, and a rotation about the origin. The second result is the end row (exclusive) of each
-    variable.
+    shift in x, a shift in y, and a rotation about the origin. The second result has the end row of each variable.
     """
     parts = []
     for key, value in values.items():

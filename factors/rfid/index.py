@@ -182,9 +182,8 @@ def union(first: Integers, second: Integers) -> Integers:
 def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """Return the hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,). ``hits``, ``odds``, ``elsewhere``: the
-    values of the ``listed`` tags. Both arrays of tags are ascending. The values of a tag that is not listed are 0 hits,
-    ``unlisted_odds`` and 0."""
+    """Return the hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,), from the values of the ``listed`` tags.
+    Both arrays of tags are ascending. A tag that is not listed has 0 hits, ``unlisted_odds``, and 0 for elsewhere."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
     new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0

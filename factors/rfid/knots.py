@@ -12,9 +12,8 @@ Place = TypeVar("Place", float, Array)
 
 
 def linear(place: Array, count: int) -> tuple[Integers, Array]:
-    """Compute linear interpolation among the knots 0, 1, ... ``count`` - 1 at the positions ``place`` (N,). Returns the
-    indices (N, 2) of the neighbouring knots and their weights (N, 2), or (N, 1) if ``count`` is 1. Positions outside of
-    the knots are clipped."""
+    """Interpolate linearly between ``count`` knots at positions ``place`` (N,), clipped to 0 ... ``count`` - 1.
+    Returns the indices (N, 2) of the neighbouring knots and their weights (N, 2), or (N, 1) if ``count`` is 1."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -35,7 +34,7 @@ def cubic_weights(f: Place) -> tuple[Place, Place, Place, Place]:
 
 
 def cubic(place: Array, count: int) -> tuple[Integers, Array]:
-    """Compute cubic convolution, with the arguments of :func:`linear` (Keys, IEEE TASSP 29(6), 1981, eq. 4 and 6).
+    """Interpolate by cubic convolution, with the arguments of :func:`linear` (Keys, IEEE TASSP 29(6), 1981, eq. 4, 6).
     Returns the indices (N, 4) of the neighbouring knots and their weights (N, 4), or (N, 1) if ``count`` is 1."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))

@@ -24,7 +24,7 @@ NEGLIGIBLE_LOGIT = -14.0  # logit of a tag out of range
 NEAR = 1e-2  # m; is added in square to a squared distance, so that directions are defined at the antenna
 PARAMETERS = 12  # maximum number of parameters of a detection model in compiled code
 ALMOST_ONE = 1.0 - 1e-9  # maximum read probability of a beam model, because 1 has no logit
-# A beam model has fewer reads behind a tag: center (negated) and width of a sigmoid of the cosine of the tag's facing.
+# The sigmoid in :class:`BeamModel` that reduces reads from behind a tag: its negative center and its width.
 FRONT, SIDE = 0.25, 0.15
 
 
@@ -50,10 +50,10 @@ class DetectionModel(Protocol):
 class BeamModel:
     """A detection model of a beam with soft edges, the default of uncalibrated antennas.
 
-    ``p = p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with the distance r [m] to the tag and the
-    tag's bearing phi [rad] from the boresight. ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)`` depends on the cosine
-    c of the angle between the tag's facing and the direction to the antenna; c is 0 if the facing is unknown. ``behind`` is the
-    read probability from behind a tag relative to that from its front, 1 if tags are equally readable from all sides.
+    The read probability is ``p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with the
+    distance r [m] and the bearing phi [rad] of the tag. ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)``
+    depends on the cosine c of the angle between the tag's facing and the direction to the antenna (0 if unknown).
+    ``behind``: the read probability from behind a tag, divided by that from its front.
     """
 
     p0: float = 0.9
@@ -82,12 +82,10 @@ class BeamModel:
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """A detection model whose logit is linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients``
-    (11,): one for each feature.
-
-    The features are made of the horizontal distance r [m], w = 1 - cosine of the bearing, the height difference z [m], and c, the
-    cosine of the angle between the tag's facing and the direction to the antenna (0 if the facing is unknown).
-    """
+    """A detection model with a logit linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients``
+    (11,): one for each feature. The features depend on the horizontal distance r [m], w = 1 - cosine of the bearing,
+    the height difference z [m], and the cosine c of the angle between the tag's facing and the direction to the antenna
+    (0 if unknown)."""
 
     coefficients: Sequence[float]
     reach: float = 8.0
@@ -106,13 +104,13 @@ class LogisticModel:
 
 @dataclass(frozen=True, eq=False)
 class GridModel:
-    """A detection model with a grid of logits in the antenna's frame. ``logits`` (H, F, NX, NY): the logits of the read
-    probability at grid points ``cell`` [m] apart, the first at (``x0``, ``y0``).
+    """A detection model with a grid of logits in the antenna's frame.
 
-    ``heights`` (H,) [m]: heights of the tag above the antenna, ascending and evenly spaced. The F facings are evenly
-    spaced cosines from -1 to 1 of the angle between the tag's facing and the direction to the antenna; F is 1 if the
-    facing is irrelevant. Interpolation is by cubic convolution in the plane and in the facing (Keys, IEEE TASSP 29(6),
-    1981, eq. 4 and 6), and linear in height. The logit is constant from the edge of the grid up to ``reach``.
+    ``logits`` (H, F, NX, NY): the logits of the read probability at grid points that are ``cell`` [m] apart. The first
+    point is at (``x0``, ``y0``). ``heights`` (H,) [m]: heights of the tag above the antenna, ascending and evenly
+    spaced. The F facings are evenly spaced cosines from -1 to 1 of the angle between the tag's facing and the direction
+    to the antenna. F is 1 if the facing is irrelevant. Interpolation is linear in height, otherwise cubic. The logit is
+    constant from the edge of the grid up to ``reach``.
     """
 
     logits: Array

@@ -47,7 +47,7 @@ def reach_of(packed: Packed, offsets: Array) -> float:
 @compiled(inline="always")
 def place_measurements(packed: Packed, pose: Array, offsets: Array, antennas: Integers, out: Array) -> float:
     """Write the antenna of each measurement into ``out`` (K, 8): position and boresight in the frame of the tags, then
-    boresight and position in the frame of ``pose``. Returns the largest distance [m] from the pose to a read tag."""
+    boresight and position in the frame of ``pose``. Returns the largest distance [m] at which a tag can be read."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]

@@ -255,7 +255,7 @@ def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: Rs
 
 @compiled(inline="always")
 def _on_robot(offset: Array, x: float, y: float) -> tuple[float, float]:
-    """Transform a position (x, y) from the robot frame to a frame in which the robot is at ``offset`` (3,)."""
+    """Transform (x, y) from the robot frame to the reference frame, in which the robot is at ``offset`` (3,)."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * x - s * y, offset[1] + s * x + c * y
 
