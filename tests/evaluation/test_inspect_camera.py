@@ -63,7 +63,7 @@ def test_a_rig_without_camera(log):
     problems = inspect(replace(log, rig=log.rig.model_copy(update={"camera": None}))).problems
     assert tuple(map(str, problems)) == (
         "the log has images, which are not used, because its rig has no [camera]",
-        "the log has identified pixels, which are not used, because its rig has no [camera]",
+        "the log has named points, which are not used, because its rig has no [camera]",
     )
 
 

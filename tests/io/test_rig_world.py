@@ -36,7 +36,7 @@ BAD_RIGS = {
     ),
     "folded lens": (
         "[camera]\nfx = 500\nfy = 500\ncx = 320\ncy = 240\ndistortion = [-0.3, 0, 0, 0]\n",
-        "the distortion (-0.3, 0.0, 0.0, 0.0) cannot be inverted at the pixel (-0.5, -0.5), expected a lens that neither folds",
+        "the distortion (-0.3, 0.0, 0.0, 0.0) cannot be inverted at the pixel (-0.5, -0.5), expected coefficients",
     ),
 }
 

@@ -34,7 +34,7 @@ from factorgraph_loc.vision.keypoints import Integers
 from factorgraph_loc.vision.tracks import FeatureTracker
 from factors.camera.model import CameraModel
 
-# source files of factorgraph_loc.vision that cached features depend on, and those that cached tracks depend on in addition
+# source files of factorgraph_loc.vision on which cached features depend; cached tracks also depend on TRACK_CODE
 FEATURE_CODE = (
     "colour_features.py",
     "descriptor.py",
@@ -57,7 +57,7 @@ class _ImageFile:
     """An image file and the result of feature detection.
 
     ``key``: the cache key. ``found``: the features, None if not computed yet. ``fault``: the error message of an
-    unusable file. ``other_size``: the size of an image that differs from that of the rig's camera, otherwise None.
+    unusable file. ``other_size``: the size of the image if it is not the size of the rig's camera, otherwise None.
     """
 
     file: Path
@@ -70,7 +70,7 @@ class _ImageFile:
 def with_features(
     log: Log, settings: FrontendSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Log, tuple[Notice, ...]]:
-    """Replace the images of a log by features and tracks. Returns the log and warnings.
+    """Replace the images of a log by features and tracks. Returns the changed log and warnings.
 
     An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without
     features. ``progress`` is called with the completed fraction. A log without images is returned unchanged. Raises
@@ -123,8 +123,8 @@ def _features(
 
 
 def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
-    """Read an image's features from the cache ``kept``. The cache key depends on the bytes of the image ``file`` and on
-    the text ``about``."""
+    """Read the features of an image from the cache ``kept``. Returns them with the cache key, a hash of the bytes of
+    ``file`` and of the text ``about``."""
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:
@@ -154,7 +154,7 @@ _thread = threading.local()
 
 
 def _extractor(settings: FrontendSettings) -> Extractor:
-    """Return the feature extractor of this thread. An extractor reuses its memory, so threads cannot share one."""
+    """Return the feature extractor of the current thread. Threads cannot share one, because it reuses its memory."""
     if getattr(_thread, "settings", None) != settings:
         _thread.settings = settings
         _thread.extractor = extractor(settings.feature, settings.count, everywhere=settings.everywhere)
@@ -163,7 +163,7 @@ def _extractor(settings: FrontendSettings) -> Extractor:
 
 
 def _nothing(settings: FrontendSettings) -> ImageFeatures:
-    """Return the result of an image without features."""
+    """Return the (empty) features of an image without features."""
     return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
 
 
@@ -175,7 +175,7 @@ def _tracks(
     camera: CameraModel,
     kept: FeatureCache,
 ) -> list[Integers]:
-    """Return the track numbers (K,) of each image's K features, from the cache ``kept`` if possible."""
+    """Return, for each image, the track numbers (K,) of its K features, from the cache ``kept`` if possible."""
     order = np.argsort(stream.t, kind="stable").tolist()
     about = f"tracks {settings.feature} {camera.intrinsics().tolist()} {code_version(TRACK_CODE)} "
     key = hashlib.sha256(
@@ -197,7 +197,7 @@ def _tracks(
 
 
 def _require_calibrated(log: Log, images: list[_ImageFile], camera: CameraModel) -> None:
-    """Raise InputError if images can be decoded, but none has the size that the camera is calibrated for."""
+    """Raise InputError if images are readable, but none has the size that the camera is calibrated for."""
     sizes = [image.other_size for image in images if image.other_size is not None]
     if sizes and not any(image.found for image in images):
         width, height = sizes[0]
@@ -208,7 +208,7 @@ def _require_calibrated(log: Log, images: list[_ImageFile], camera: CameraModel)
 
 
 def _doubts(log: Log, images: list[_ImageFile]) -> tuple[Notice, ...]:
-    """Return warnings about images that cannot be read, have another size, or show no features."""
+    """Return warnings about images that cannot be read, have a wrong size, or show no features."""
     doubts = []
     for kind, what, faults in (
         (
@@ -231,8 +231,8 @@ def _doubts(log: Log, images: list[_ImageFile]) -> tuple[Notice, ...]:
 
 @cache
 def code_version(names: tuple[str, ...]) -> str:
-    """Return a hash of source files of :mod:`factorgraph_loc.vision`, by name, and of the versions of the libraries
-    they use."""
+    """Return a hash of the source files ``names`` of :mod:`factorgraph_loc.vision`, and of the versions of the
+    libraries that these files use."""
     package = resources.files("factorgraph_loc.vision")
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     for name in names:
@@ -241,14 +241,14 @@ def code_version(names: tuple[str, ...]) -> str:
 
 
 CODE = ("fiducials.py", "images.py")  # source files that cached markers depend on
-Marked = list[tuple[int, list[list[float]]]]  # the markers in an image: number, and pixels of the four corners
+Marked = list[tuple[int, list[list[float]]]]  # the markers in an image: (number, pixels of the four corners)
 
 
 def with_markers(log: Log, family: MarkerFamily) -> Log:
-    """Detect markers in the images of a log. Add their corners to the log as the stream ``sightings``, with names
-    ``FAMILY-NUMBER/CORNER``.
+    """Return the log with a new stream ``sightings``: the corners of all markers of ``family`` detected in its images.
 
-    Results are cached. Raises InputError if the log has no images, or already has sightings.
+    Corners have names ``FAMILY-NUMBER/CORNER``. Results are cached. Raises InputError if the log has no images, or
+    already has sightings.
     """
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream) or not len(stream.t):
@@ -301,7 +301,7 @@ def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
 
 
 class LiveFrontend:
-    """Detects and tracks the features of one image after the other. Not thread-safe."""
+    """Detects and tracks features in the images of a live camera, one image after the other. Not thread-safe."""
 
     def __init__(self, settings: FrontendSettings, camera: CameraModel) -> None:
         self._feature, self._camera = settings.feature, camera
@@ -309,10 +309,10 @@ class LiveFrontend:
         self._tracker = FeatureTracker(camera)
 
     def frame(self, t: float, image: object) -> CameraFrame:
-        """Return the features of an image that was taken at ``t`` [s]. ``image``: an array as in
-        :func:`~factorgraph_loc.vision.images.as_image`.
+        """Return the features of an image that was taken at ``t`` [s].
 
-        Raises InputError if ``image`` is no such array, or has another size than the camera is calibrated for.
+        ``image``: an array, see :func:`~factorgraph_loc.vision.images.as_image`. Raises InputError if the array is
+        invalid, or if the camera is calibrated for another image size.
         """
         pixels = as_image(image, f"CameraImage at {t:.3f} s")
         height, width = pixels.shape[:2]

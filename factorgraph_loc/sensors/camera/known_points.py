@@ -1,4 +1,4 @@
-"""Turns camera measurements into factors of points of the map. Points are identified by name or by matching features."""
+"""Converts camera measurements to factors of points of the map, identified by name or by matching features."""
 
 from __future__ import annotations
 
@@ -27,31 +27,28 @@ from factors.camera import update_kernels as pixel_kernels
 from factors.camera.factor import ReprojectionFactor
 from factors.camera.model import FOCAL, TIME_OFFSET, CameraModel, TiltScale
 from factors.motion import Increment, propagate
-from factors.se2 import Array
+from factors.se2 import Array, Integers
 
-# reason for the rejection of a point, as written to the diagnostics
 DISAGREES = "camera: point disagrees with the other points of the image"
-FEW_SHARE = 0.3  # an image misses named points if a smaller fraction of them are inliers
-FEW, MANY = 6, 20  # an image misses matched points if fewer than FEW are inliers, although MANY or more are expected
-UNSURE = 1.0  # m; with a larger standard deviation of the prediction, FEW alone decides if points are missing
-MOST = 100  # points used per image; more points add little, because errors of neighbouring points are correlated
+FEW_SHARE = 0.3  # points are missing in an image if the inliers are a smaller fraction of its named points
+FEW, MANY = 6, 20  # points are missing in an image if fewer than FEW features match, although MANY are expected
+UNSURE = 1.0  # m; if the predicted position is less accurate than this, MANY is not required
+MOST = 100  # maximum number of points used per image; errors of more points would be correlated
 STEEPEST = 0.06  # rad; an image that requires a larger tilt of the robot is rejected
-# a named point is exact if its survey sigma is below the fraction EXACT_SURVEY of a pixel error at the distance NEAR [m]
+# the survey of a named point is exact if its error is below the fraction EXACT_SURVEY of a pixel at the distance NEAR [m]
 EXACT_SURVEY, NEAR = 0.2, 3.0
-EXACT = 0.1  # a map is exact if its errors are below this fraction of a pixel error at a distance of 1 m
-# pixels are so precise that one linearisation at a poor prediction does not reach the optimum
-ITERATIONS, SETTLED = 8, 1e-3  # number of iterations; m, rad: iterations end if the step is smaller
+EXACT = 0.1  # a map is exact if all its errors are below this fraction of a pixel at a distance of 1 m
+ITERATIONS, SETTLED = 8, 1e-3  # number of iterations of a correction; it ends if a step [m, rad] is smaller
 
 NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """The current estimate, with which the points of an image are predicted.
+    """The current estimate of the state, from which the positions of points in an image are predicted.
 
-    ``pose`` (3,) with body-frame ``covariance`` (3, 3): the pose of the robot that the image's factor depends on.
-    ``constants`` (P,) with covariance ``spread`` (P, P): the estimates of the P camera constants that are estimated,
-    relative to the rig. None if P is 0.
+    ``pose`` (3,) with body-frame ``covariance`` (3, 3): the pose of the robot. ``constants`` (P,) with covariance
+    ``spread`` (P, P): estimated corrections of P camera constants in the rig, None if no constants are estimated.
     """
 
     pose: Array
@@ -61,11 +58,11 @@ class Predicted:
 
 
 class KnownPoints:
-    """Turns camera measurements into factors of known points. Points that the map lacks are counted as ignored,
-    outliers as rejected.
+    """Converts camera measurements to factors of points in the map. The diagnostics count points that are not in the
+    map as ignored, and outliers as rejected.
 
-    ``estimated``: the camera's constants that are estimated. ``use``: how the map is used, see
-    :class:`~factorgraph_loc.sensors.landmarks.sensor.KnownLandmarks`. ``name``: the name of the sensor in the diagnostics.
+    ``estimated``: the camera's constants that are estimated. ``use``: "unknown" to ignore the map, "extended" if points
+    that are not in the map are estimated elsewhere, otherwise "known". ``name``: the name of the sensor.
     """
 
     def __init__(
@@ -80,15 +77,13 @@ class KnownPoints:
         self.name = name
         self.model: CameraModel = replace(settings.model(), tempering=1.0)
         self.floor = TiltScale.guessed(self.model.tilt)
-        self._tempering = settings.tempering  # exponent of the likelihood of matched points; named points have none
+        self._tempering = settings.tempering  # exponent of the likelihood of matched points; it is 1 for named points
         self.map = PointMap.of((), np.empty((0, 3)))
         if setup.world.points is not None and use != "unknown":
             self.map = without_common(setup.world.points)
         self._others_matter = use != "known"
-        self.used = np.empty(
-            0, dtype=np.int64
-        )  # indices of the features of the last image that match points of the map
-        self.names: tuple[str, ...] = ()  # names of the points of the last factor; () for matched features
+        self.used: Integers = np.empty(0, dtype=np.int64)  # features of the last image that match points of the map
+        self.names: tuple[str, ...] = ()  # names of the points in the last factor; () for matched features
         self._estimated = estimated
         self._diagnostics = diagnostics
         self.associator: Associator | None = None
@@ -110,8 +105,8 @@ class KnownPoints:
         return TIME_OFFSET in self._estimated.indices
 
     def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
-        """Return the detected points whose survey is inexact, grouped by point or marker. Each value has the names of
-        the detected points of the group, and the covariance (3, 3) of their common displacement."""
+        """Return the points in ``m`` with an inexact survey, grouped by marker, by the name of the point or marker. A
+        value contains the names of the points, and the covariance (3, 3) of the survey error that they share."""
         inexact: dict[str, tuple[list[str], Array]] = {}
         if not isinstance(m, PixelSightings) or not self._inexact.any():
             return inexact
@@ -123,8 +118,8 @@ class KnownPoints:
         return inexact
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
-        """Return a factor of all named points that are in the map, without outlier rejection, on the pose at the time
-        of the image. Returns None without such points."""
+        """Return the factor of all points in ``m`` that are in the map, or None without such points. It depends on the
+        pose at the time of ``m``. Outliers are not removed."""
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:
@@ -143,12 +138,12 @@ class KnownPoints:
         twist: Array | None = None,
         displaced: Mapping[str, tuple[Array, Array]] = NOT_DISPLACED,
     ) -> ReprojectionFactor | None:
-        """Return the factor of the known points in an image after outliers are removed, or None if no points remain.
+        """Return the factor of the points in ``m`` that are in the map, without outliers, or None if no points remain.
 
-        ``predicted``: the predicted pose and constants of the camera, at which outliers are detected. ``offset``: the
-        motion from the pose that the factor depends on to the image, None if the times are equal. ``twist`` (3,): the
-        robot's velocity at the image. It is required if the camera's time offset is estimated. ``displaced``: by point
-        name, the displacement (3,) of a point from the map, and the covariance (3, 3) of its position.
+        ``predicted``: the estimate at which outliers are detected. ``offset``: the motion from the pose that the factor
+        depends on to the image, None if the times are equal. ``twist`` (3,): the robot's velocity at the image,
+        required if the camera's time offset is estimated. ``displaced``: by the name of a point, its estimated
+        displacement (3,) from the map, and the covariance (3, 3) of its position.
         """
         self.used = np.empty(0, dtype=np.int64)
         factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
@@ -186,8 +181,8 @@ class KnownPoints:
         return levelled
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
-        """Return the robot's pose at an image, found without a prediction, and the number of points that the image
-        should show. The pose is None if it is not found."""
+        """Find the robot's pose at an image without a prediction. Returns the pose, or None, and the number of points
+        of the map that are expected in the image."""
         model = self.model
         if not len(self.map):
             return None, 0
@@ -209,8 +204,8 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """Return a factor without points. The caller adds matches. Returns None if the features cannot be matched
-        with the map."""
+        """Return a factor without points, to which the caller adds matches. Returns None if the features cannot be
+        matched with the map."""
         self.names = ()
         if self.associator is None:
             if not self._others_matter:
@@ -224,8 +219,8 @@ class KnownPoints:
     def _matched(
         self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
     ) -> ReprojectionFactor | None:
-        """Match the features of a frame with the map near the predicted ``camera`` pose. Returns ``factor`` with the
-        matched points, or None without matches. ``focal``: standard deviation of the logarithm of the focal length."""
+        """Match the features of the image ``m`` with the map. Returns ``factor`` with the matched points, or None
+        without matches. ``camera``: the predicted pose. ``focal``: relative standard deviation of the focal length."""
         assert self.associator is not None
         matches = self.associator.guided(m, camera, model, focal)
         self.used = matches.features
@@ -244,12 +239,12 @@ class KnownPoints:
     def _levelled(
         self, factor: ReprojectionFactor, expected: ReprojectionFactor, predicted: Predicted
     ) -> ReprojectionFactor | None:
-        """Update the learnt standard deviation of the robot's tilt by an image, and return ``factor`` with this value.
+        """Estimate the tilt of the robot from an image. Returns ``factor`` with a new standard deviation of the tilt.
 
-        ``expected``: the same factor with fixed constants. Returns None if the image requires a tilt above
-        :data:`STEEPEST`, because it is probably wrong.
+        ``expected``: the same factor with fixed constants. Returns None if the tilt exceeds :data:`STEEPEST`, because
+        the matches are then probably wrong.
         """
-        if expected.estimated:  # errors of the constants would be mistaken for a tilt
+        if expected.estimated:  # errors of the constants have the same effect as a tilt
             return factor
         pose, covariance = (np.ascontiguousarray(part, dtype=float) for part in (predicted.pose, predicted.covariance))
         tilt, noise = pixel_kernels.leaning(expected.packed(), pose, covariance)
@@ -259,8 +254,8 @@ class KnownPoints:
         return replace(factor, model=replace(factor.model, tilt=sigma))
 
     def _camera(self, expected: ReprojectionFactor, predicted: Predicted) -> CameraPose:
-        """Return the pose of the camera at the image of the factor ``expected``, predicted from the robot's pose in
-        ``predicted``. Its covariance includes the uncertainty of the mounting and of the time offset."""
+        """Return the predicted pose of the camera at the image of the factor ``expected``. Its covariance includes the
+        uncertainty of the mounting and of the time offset."""
         pose, covariance = predicted.pose, predicted.covariance
         if expected.offset is not None:
             noise = np.zeros((3, 3)) if expected.offset_covariance is None else expected.offset_covariance
@@ -282,15 +277,15 @@ class KnownPoints:
 
 
 def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
-    """Return the pose in space of a robot's camera. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the robot's pose.
-    ``model``: the mounting, and the standard deviation of the robot's tilt, which the covariance of the result includes."""
+    """Return the 3-D pose of the camera of a robot, with covariance. ``pose`` (3,) with body-frame ``covariance`` (3,
+    3): the robot's pose. The tilt of the robot is added to the covariance."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (pose, covariance))
     return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
 
 
 def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
-    """Return a mask (K,) of the points of ``expected`` that are inliers for a camera near the predicted pose ``camera``. All K
-    points are inliers if there are too few to decide. ``focal``: standard deviation of the logarithm of the focal length."""
+    """Return a mask (K,) of the points of ``expected`` that are inliers, all True if there are too few points to
+    decide. ``camera``: the predicted pose. ``focal``: relative standard deviation of the focal length."""
     model, count = expected.model, len(expected.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)
@@ -307,6 +302,6 @@ def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) ->
 
 
 def rows_of(factor: ReprojectionFactor, rows: Truths) -> ReprojectionFactor:
-    """Return the factor with only the selected ``rows`` of its points."""
+    """Return a copy of ``factor`` with only those of its K points that the mask ``rows`` (K,) selects."""
     covariances = None if factor.point_covariances is None else factor.point_covariances[rows]
     return replace(factor, points=factor.points[rows], pixels=factor.pixels[rows], point_covariances=covariances)

@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from factorgraph_loc.files.tables import TableRows
 
 
-CAMERAS = ("camera", "sightings")  # channels of the camera: images with their features, and named points in images
+CAMERAS = ("camera", "sightings")  # channels of a camera: images (or their features), and named points in images
 
 
 @dataclass(frozen=True, slots=True)
 class PixelSightings:
-    """K named points in an image at the time ``t`` [s]. ``points``: their names. ``pixels`` (K, 2): their positions
-    [px], x to the right, y down."""
+    """K named points in an image at the time ``t`` [s]. ``points``: the names. ``pixels`` (K, 2): the positions in the
+    image [px], x to the right, y down."""
 
     sensor: ClassVar[str] = "sightings"
     modality: ClassVar[str] = "camera"
     is_motion: ClassVar[bool] = False
-    frame: ClassVar[None] = None  # this measurement has no features
+    frame: ClassVar[None] = None  # a CameraFrame has features here
     t: float
     points: tuple[str, ...]
     pixels: Array
@@ -54,8 +54,8 @@ class PixelSightings:
 
 @dataclass(frozen=True, slots=True)
 class CameraImage:
-    """An image that a program pushes. ``pixels``: an array (H, W) or (H, W, 3) in the order BGR, see
-    :func:`factorgraph_loc.vision.images.as_image`."""
+    """An image for the live localizer, taken at the time ``t`` [s]. ``pixels``: an array (H, W) or (H, W, 3) in the
+    order BGR, see :func:`factorgraph_loc.vision.images.as_image`."""
 
     sensor: ClassVar[str] = "camera"
     modality: ClassVar[str] = "camera"
@@ -71,8 +71,8 @@ Pixels = PixelSightings | CameraFrame  # measurements of a camera that estimator
 
 @dataclass(frozen=True)
 class SightingStream(Stream):
-    """All named points in images of a log, one per row: name ``point`` and position ``u``, ``v`` [px]. Rows with equal
-    timestamps form one measurement."""
+    """All named points in images of a log, one per row. ``point``: the names. ``u``, ``v`` (N,): the positions [px].
+    Rows with equal timestamps form one measurement."""
 
     kind: ClassVar[type[Any]] = PixelSightings
     point: Sequence[str]
@@ -88,7 +88,7 @@ class SightingStream(Stream):
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
-    """The N images of a log as files. :mod:`factorgraph_loc.sensors.camera.frontend` turns them into features."""
+    """The N images of a log. ``file``: the paths of the images. Feature detection is not done yet."""
 
     kind: ClassVar[type[Any]] = CameraImage
     file: Sequence[Path]
@@ -99,7 +99,7 @@ class ImageStream(Stream):
 
 @dataclass(frozen=True)
 class FeatureStream(Stream):
-    """The features of a log's N images. The timestamps ``t`` of the stream are used, not the timestamps of each ``frame``."""
+    """The features ``frame`` of N images of a log, taken at ``t`` (N,) [s]. The timestamps in ``frame`` are ignored."""
 
     kind: ClassVar[type[Any]] = CameraFrame
     frame: Sequence[CameraFrame]
@@ -125,7 +125,7 @@ SIGHTINGS = Table(
     stream="factorgraph_loc.sensors.camera.measurement:SightingStream",
     is_scan=True,
 )
-# fields of features that a program pushes
+# fields of features that a program passes to the live localizer
 FEATURES = Table(
     "features",
     (
@@ -143,11 +143,11 @@ FOLDER = "camera"
 
 
 def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Path | None = None) -> ImageStream:
-    """Return the stream of the images that ``table`` lists. Of images with the same timestamp the last is kept.
+    """Return the stream of the images that ``table`` lists. If images have the same timestamp, only the last is kept.
 
-    ``t0_ns``: the time zero of the log [ns]. ``warnings``: receives a warning about missing images, which are skipped.
-    ``folder``: the folder of the images, by default ``camera`` next to the table. Raises InputError if a path leaves the
-    folder or is no regular file, or if a timestamp is more than 0.5 s older than that of an earlier row.
+    ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list to append a warning about missing images to.
+    ``folder``: the folder of the images, by default ``camera`` next to the table. Raises InputError if a path is
+    outside of the folder or is no regular file, or if a timestamp is more than 0.5 s before that of an earlier row.
     """
     latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings, rules=table.rules).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
@@ -163,13 +163,13 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Pa
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
-    """Return the stream of images of a log in the native format."""
+    """Return the images of a log in the native format as a stream. ``rows``: the rows by table name."""
     return make_images(rows["camera"], reading.t0_ns, reading.warnings)
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """Return the rows of an image stream, and copy the images to the folder. Raises InputError for features, which
-    cannot be written."""
+    """Return the columns of the table "camera", and copy the images to ``writing.folder``. Raises InputError if
+    ``stream`` consists of features instead of images."""
     if not isinstance(stream, ImageStream):
         raise InputError(f"{writing.log}: the stream camera has features, expected the images they were computed from")
     return {
@@ -178,7 +178,7 @@ def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
 
 
 def write_images(files: Sequence[Path], folder: Path) -> list[str]:
-    """Copy the images into a new folder ``camera`` in ``folder`` and return their new names, which are numbers. Raises
+    """Copy images into a new folder ``camera`` in ``folder``. Returns their new names, which are numbers. Raises
     InputError if an image is missing."""
     target = folder / FOLDER
     target.mkdir()
@@ -209,15 +209,15 @@ BYTE = replace(FEATURES["descriptors"], kind="whole", low=0.0, high=255.0)
 
 
 def check_sightings(m: PixelSightings, where: str) -> dict[str, Any]:
-    """Return the validated fields of named points. Raises InputError with the first invalid field. ``where``: the
-    measurement's name in messages."""
+    """Return the validated fields of ``m`` by name. Raises InputError for the first invalid field. ``where``: the name
+    of the measurement in error messages."""
     points = values.names(where, "points", m.points)
     return {"points": points, "pixels": values.within(where, PAIRS, m.pixels, (len(points), 2))}
 
 
 def check_frame(m: CameraFrame | CameraImage, where: str) -> dict[str, Any]:
-    """Return the validated fields of an image's features. Raises InputError with the first invalid field. Returns {}
-    for an image, which is checked when its features are detected. ``where``: the measurement's name in messages."""
+    """Return the validated fields of ``m`` by name, {} for a :class:`CameraImage`. Raises InputError for the first
+    invalid field. ``where``: the name of the measurement in error messages."""
     if isinstance(m, CameraImage):
         return {}
     pixels = values.numbers(where, "pixels", m.pixels)
@@ -234,7 +234,8 @@ def check_frame(m: CameraFrame | CameraImage, where: str) -> dict[str, Any]:
 
 
 def _descriptors(where: str, value: object, count: int | None, feature: str) -> Any:
-    """Return validated descriptors (K, D) of K = ``count`` features: bytes for a binary feature, otherwise floats."""
+    """Return ``value`` as validated descriptors (``count``, D): bytes if ``feature`` is a binary feature, otherwise
+    floats. ``where``: the name of the measurement in error messages."""
     rows = values.numbers(where, "descriptors", value)
     if rows.ndim != 2 or len(rows) != count:
         raise InputError(f"{where}: descriptors has shape {rows.shape}, expected ({count}, D)")

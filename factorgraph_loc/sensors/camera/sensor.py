@@ -33,17 +33,17 @@ from factors.motion import ChainState, propagate
 from factors.se2 import Array
 from factors.update import Correction
 
-PASS = 10.0  # s; sightings of a point within this time have the same survey error, so their noise is enlarged
-SOLVE_EVERY = 0.45  # s between updates of a graph's solver; other images only update the newest pose, as in a filter
+PASS = 10.0  # s; the survey noise of a point is multiplied by the number of its sightings within this time
+SOLVE_EVERY = 0.45  # s between solutions of a graph; other images only correct the newest pose, as in a filter
 
 
 @dataclass(frozen=True)
 class PixelObservation(ResidualObservation):
     """The observation of points in one image.
 
-    ``seen``: the factor of the points. It depends on the pose, and possibly on constants of the camera and
-    displacements of points. ``expected`` (3,): the pose that was predicted when the points were identified.
-    ``held``: estimates (P,) and covariance (P, P) of the camera's constants if the observation depends on the pose only.
+    ``seen``: the factor of the points. It may also depend on constants of the camera and on displacements of points.
+    ``expected`` (3,): the predicted pose with which the points were identified. ``held``: the values (P,) and the
+    covariance (P, P) of the camera's constants if :meth:`on_pose` has fixed them, otherwise None.
     """
 
     iterations: ClassVar[int] = ITERATIONS
@@ -54,7 +54,8 @@ class PixelObservation(ResidualObservation):
 
     @classmethod
     def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
-        """Return the observation of a factor ``seen`` on the pose and on ``blocks``. ``expected`` (3,): predicted pose."""
+        """Return the observation with the factor ``seen``, which depends on the pose and on the state ``blocks``.
+        ``expected`` (3,): the predicted pose."""
         return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(
@@ -81,14 +82,14 @@ class PixelObservation(ResidualObservation):
                 if factor.twist is not None:
                     by_constants[..., TIME_OFFSET] = by_pose @ factor.twist
                 by_constants = by_constants[..., list(factor.estimated)]
-                # the error of the constants is common to all pixels, so it must not average out
+                # all pixels share the error of the constants: multiply by their number, so that it does not average out
                 common = by_constants @ self.held[1] @ by_constants.transpose(0, 2, 1)
                 covariances = covariances + len(common) * common
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, covariances)
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """Return the observation as a function of the pose only. The camera's constants and displacements of points are
-        fixed at ``values``, and their covariances ``spreads`` are added to the noise."""
+        """Return an observation that depends on the pose only. The camera's constants and the displacements of points
+        are fixed at ``values``, with covariances ``spreads``, which are added to the noise."""
         if not self.blocks:
             return self
         seen, held, blocks = self.seen, None, self.blocks
@@ -98,7 +99,7 @@ class PixelObservation(ResidualObservation):
             assert seen.point_covariances is not None
             points, noise = seen.points.copy(), seen.point_covariances.copy()
             for row, which in enumerate(seen.moved_by):
-                if which >= 0:  # points with a common displacement have the same error, so it must not average out
+                if which >= 0:  # multiply by the number of points that share the error, so that it does not average out
                     points[row] += values[blocks[which]]
                     noise[row] = seen.moved_by.count(which) * spreads[blocks[which]]
             seen = replace(seen, points=points, point_covariances=noise, moved_by=())
@@ -106,7 +107,7 @@ class PixelObservation(ResidualObservation):
 
 
 class CameraSensor(Sensor):
-    """A camera that observes points of the map. ``points``: identifies points and rejects outliers."""
+    """A camera in a run. The attribute ``points`` identifies points of the map and rejects outliers."""
 
     modality = "camera"
     lost = "points in images were not where they were expected"
@@ -119,14 +120,13 @@ class CameraSensor(Sensor):
         self.constants = constants if binding.calibration == "all" else NOTHING
         self._carries = binding.calibration != "particles"  # particles cannot estimate displacements of points
         self.points = KnownPoints(binding.setup, self._diagnostics, constants, binding.points, self.name)
-        # times [s] of recent sightings of each inexactly surveyed point or marker whose displacement is not estimated
+        # by point or marker, the times [s] of its recent sightings; only if its survey error is treated as noise
         self._looks: dict[str, list[float]] = defaultdict(list)
-        self._before: deque[tuple[float, TiltScale]] = deque()  # the learnt tilt before each image
+        self._before: deque[tuple[float, TiltScale]] = deque()  # the estimated tilt before each image
         self._shared = (self.name,) if constants.names else ()
         if len(self.points.map):
             self.finder = PixelFinder(self.points, motion)
-            # pixels of known points determine the pose well, so a graph is not solved for each image, unless the camera's
-            # mounting is estimated
+            # the prediction between solutions is accurate enough, unless constants of the camera are estimated
             self.solve_every = 0.0 if constants.names else SOLVE_EVERY
 
     def observe(self, m: Pixels, view: View) -> Iterator[PixelObservation | NewVariable]:
@@ -163,8 +163,8 @@ class CameraSensor(Sensor):
         yield observation if self.constants.names or moving else observation.on_pose(values, spreads)
 
     def _looks_now(self, name: str, t: float) -> int:
-        """Record a sighting of a point or marker at ``t`` [s]. Returns the number of its sightings within :data:`PASS`
-        seconds."""
+        """Record a sighting of the point or marker ``name`` at ``t`` [s]. Returns the number of its sightings in the
+        last :data:`PASS` seconds."""
         times = [*(earlier for earlier in self._looks[name] if earlier > t - PASS), t]
         self._looks[name] = times
         return len(times)
@@ -187,9 +187,8 @@ class CameraSensor(Sensor):
 
 
 def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFactor:
-    """Return a factor that also depends on displacements of points. ``which`` (K): for each point the number of its
-    displacement among the values, or -1 for none. A point with a displacement has no survey noise, because the
-    displacement accounts for it."""
+    """Return a copy of ``factor`` that also depends on displacements of points from the map. ``which`` (K): the number
+    of the displacement of each point, or -1 for none. The displacement replaces the survey noise of the point."""
     covariances = factor.point_covariances
     if covariances is not None:
         covariances = np.where(np.array(which)[:, None, None] < 0, covariances, 0.0)
@@ -197,27 +196,26 @@ def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFa
 
 
 def bind(binding: Binding) -> CameraSensor | None:
-    """Return the camera sensor of a run, or None if the run does not use it. The particle filter does not estimate the
-    camera's constants; their uncertainty is added to the noise."""
+    """Return the camera sensor of a run, or None if the run does not use it."""
     setup = binding.setup
     if setup.rig.find(CameraSettings) is None or not any(sensor in setup.sensors for sensor in CAMERAS):
         return None
     return CameraSensor(binding, NOTHING if binding.calibration == "none" else setup.rig.estimated("camera"))
 
 
-CLEAR, CLEAR_SHARE = 8, 0.5  # a single image is sufficient if it has this number and fraction of inliers
-AGREEING = 3  # number of images that must agree if no single image is sufficient
+CLEAR, CLEAR_SHARE = 8, 0.5  # minimum number and fraction of inliers in an image that alone determines the pose
+AGREEING = 3  # number of images that must agree on the pose if no single image determines it
 KEPT = 5.0  # s; older images are discarded
 APART = 25.0  # two poses disagree if their squared Mahalanobis distance is larger
-LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m^2, m^2, rad^2; added to covariances of poses by images
-POOR_FRAMES, POOR_TIME = 3, 0.3  # number of images and time [s] with missing points that make a track suspicious
-SEARCH_INTERVAL = 1.0  # s between unsuccessful searches
+LEAST = np.diag((0.05, 0.05, 0.03)) ** 2  # m^2, m^2, rad^2; added to the covariances of poses from images
+POOR_FRAMES, POOR_TIME = 3, 0.3  # number of images and time [s] with missing points that make a pose suspicious
+SEARCH_INTERVAL = 1.0  # s; minimum time between unsuccessful searches
 
 
 @dataclass(frozen=True)
 class _Fix:
     """The ``pose`` (3,) of the robot from one image, with body-frame ``covariance`` (3, 3). ``odometry``: the odometry
-    state at the image. ``clear``: True if this image alone is sufficient to localize the robot."""
+    state at the image. ``clear``: True if this image alone determines the pose reliably."""
 
     odometry: ChainState
     pose: Array
@@ -226,25 +224,25 @@ class _Fix:
 
 
 class PixelFinder:
-    """Finds the pose from images without a prediction. It implements :class:`~factorgraph_loc.sensors.base.Finder`."""
+    """Global localization by images. It implements :class:`~factorgraph_loc.sensors.base.Finder`."""
 
     at_once = True
 
     def __init__(self, points: KnownPoints, motion: Motion) -> None:
         self._points, self._motion = points, motion
-        self.start: KnownPosition | None = None  # known start position while the heading is sought
+        self.start: KnownPosition | None = None  # the start position if only the heading is unknown
         self._fixes: list[_Fix] = []
         self._stamps: list[tuple[float, bool]] = []
         self._fruitless = -np.inf
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry state at the last image with a pose, or None."""
+        """The odometry state at the last image from which a pose was found, or None."""
         return self._fixes[-1].odometry if self._fixes else None
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
-        """The pose from the last image as the only hypothesis, or () if no image has determined a pose."""
+        """The pose from the last image as the only hypothesis, or () if no pose was found."""
         if not self._fixes:
             return ()
         last = self._fixes[-1]
@@ -252,14 +250,14 @@ class PixelFinder:
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last image if it is unambiguous or if other images agree, otherwise None."""
+        """The pose from the last image if it is reliable or if previous images agree with it, otherwise None."""
         if not self._fixes or not (self._fixes[-1].clear or self._agree()):
             return None
         last = self._fixes[-1]
         return PosePrior(last.odometry.t, last.pose, se2.body_to_world(last.pose, last.covariance))
 
     def _suspicious_since(self) -> float | None:
-        """Return the time [s] since which images do not show points at their predicted positions, or None."""
+        """Return the time [s] since which points are missing in all images, or None if this time is too short."""
         poor: list[float] = []
         for t, missed in reversed(self._stamps):
             if not missed:
@@ -269,13 +267,13 @@ class PixelFinder:
         return poor[-1] if enough else None
 
     def follow(self, observation: object, odometry: ChainState, view: object) -> None:
-        """Do nothing, because :meth:`refuted_since` judges the track by missing points."""
+        """Do nothing, because :meth:`refuted_since` needs no earlier observations."""
 
     def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """Return the time [s] since which the track must have been wrong, or None. Call this after an image was processed.
+        """Return the time [s] since which the estimated pose has been wrong, or None if the estimate may be right.
 
-        The track is wrong if points have been missing since that time, and the last images agree on a pose other than ``pose``
-        (3,). The covariance of the track is not used. A large covariance would excuse a track that misses points.
+        Call this after an estimator has processed the image ``m``. The estimated ``pose`` (3,) at ``odometry`` is wrong
+        if points of the map are missing in the last images, and if these images agree on another pose.
         """
         self._stamps = [s for s in self._stamps if s[0] < m.t]
         self._stamps.append((m.t, self._points.missed))
@@ -290,7 +288,7 @@ class PixelFinder:
         return since if self._agree() else None
 
     def look(self, m: Pixels, odometry: ChainState) -> bool:
-        """Find the pose from an image ``m`` at the odometry state ``odometry``. Returns False if no pose is found."""
+        """Find the pose from the image ``m``, taken at the odometry state ``odometry``. Returns False if this fails."""
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
@@ -307,23 +305,23 @@ class PixelFinder:
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` poses (N, 3) that are sampled around the pose from the last image."""
+        """Return ``count`` random poses (N, 3), drawn from the Gaussian of the pose from the last image."""
         last = self._fixes[-1]
         body = last.covariance + LEAST
         return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))
 
     def clear(self) -> None:
-        """Discard the images. Call this if the estimated trajectory starts again, or if it is known to be right."""
+        """Discard all poses from images. Call this if the estimated pose was replaced or confirmed."""
         self._fixes, self._stamps = [], []
 
     @staticmethod
     def _is_not_from(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
-        """True if a robot that started at the known position ``start`` cannot be at the pose ``fix``, which one image
-        determined. ``now``: the odometry state at the image."""
+        """Return True if the pose ``fix`` from an image contradicts the known start position and the odometry. ``now``:
+        the odometry state at the image."""
         return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
-        """True if the poses from the last images agree, after each is moved to the last image by the odometry."""
+        """Return True if the poses from the last images agree with each other and with the odometry between them."""
         if len(self._fixes) < AGREEING:
             return False
         *others, last = self._fixes[-AGREEING:]
@@ -335,7 +333,6 @@ class PixelFinder:
 
 
 def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
-    """Return the squared Mahalanobis distance between ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the pose
-    of ``fix``, which one image determined."""
+    """Return the squared Mahalanobis distance between a pose (3,) with body-frame covariance (3, 3) and ``fix``."""
     error = se2.log(se2.between(pose, fix.pose))
     return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

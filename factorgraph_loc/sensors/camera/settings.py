@@ -43,7 +43,7 @@ class FrontendSettings(FileModel):
 
 
 class CameraUncertainty(FileModel):
-    """Standard deviations of the camera's constants before a run. A constant is estimated if its value is above 0."""
+    """Standard deviations of the camera's calibration constants before a run. Constants above 0 are estimated."""
 
     x: Distance = 0.0
     """standard deviation of the camera's x"""
@@ -121,8 +121,8 @@ class CameraSettings(SensorSettings):
         pixel = reprojection.folded(self.model())
         if pixel is not None:
             raise ValueError(
-                f"the distortion {self.distortion} cannot be inverted at the pixel ({pixel[0]:g}, {pixel[1]:g}), expected a lens "
-                f"that neither folds its image nor sees more than {WIDEST_ANGLE:.0f} degrees off its axis"
+                f"the distortion {self.distortion} cannot be inverted at the pixel ({pixel[0]:g}, {pixel[1]:g}), expected "
+                f"coefficients that can be inverted in the whole image, up to {WIDEST_ANGLE:.0f} degrees off the axis"
             )
         return self
 

@@ -20,7 +20,7 @@ OBLIQUE = math.radians(75.0)  # a point is detected if the angle between line of
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the named points that the camera detects on a simulated drive. The result is empty without points in the world."""
+    """Return the simulated detections of named points on a drive, which are empty if the world has no points."""
     if ride.world.points is None:
         return Simulated()
     settings, camera = ride.settings.pixels, ride.rig.of(CameraSettings)
@@ -30,8 +30,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"points": the largest number of simulated detections per second}. Raises ValueError if the world has
-    points, but the rig has no camera."""
+    """Return {"points": N}, where N is the maximum number of simulated detections per second. Raises ValueError if the
+    world has points, but the rig has no camera."""
     if settings.world.points and settings.rig.find(CameraSettings) is None:
         raise ValueError("the world has points, expected a rig with a camera")
     return {"points": settings.pixels.rate * settings.world.points}
@@ -40,10 +40,10 @@ def looks(settings: Any) -> dict[str, float]:
 def pixel_stream(
     model: CameraModel, world: World, times: Array, poses: Array, settings: PixelSettings, rng: np.random.Generator
 ) -> SightingStream:
-    """Simulate the points that the camera detects at ``times`` (N,) [s] from robot ``poses`` (N, 3).
+    """Return simulated detections of points in images taken at ``times`` (N,) [s] from robot ``poses`` (N, 3).
 
-    A point is visible if it is inside the image, within range, not on a surface that is seen too obliquely, and not
-    occluded. Walls and furniture occlude points at any height.
+    A point is detected if it is inside the image, within range, not occluded, and not on a surface that the camera
+    views too obliquely. Walls and furniture occlude points at any height. ``rng``: draws noise and outliers.
     """
     points = world.points
     assert points is not None, "the world has points"
@@ -71,8 +71,8 @@ def pixel_stream(
 
 
 def surface_normals(world: World, places: Array) -> Array:
-    """Return the unit normal (K, 2) of the wall nearest to each position in ``places`` (K, 2). It points to the side of
-    the position. Without walls it is 0."""
+    """Return the unit normals (K, 2) of the walls nearest to ``places`` (K, 2), on the side of these positions. Returns
+    zeros if the world has no walls."""
     if not world.walls:
         return np.zeros((len(places), 2))
     walls = np.array(world.walls, dtype=float).reshape(-1, 2, 2)[nearest_walls(world, places)[1]]
@@ -83,8 +83,8 @@ def surface_normals(world: World, places: Array) -> Array:
 
 
 def _at_most(count: int, frames: Array, rng: np.random.Generator) -> Array:
-    """Return sorted indices of at most ``count`` random rows per frame. ``frames`` (K,): the sorted frame number of
-    each row."""
+    """Select at most ``count`` rows of each image at random. Returns the sorted indices of the rows. ``frames`` (K,):
+    the image number of each row, sorted."""
     shuffled = np.lexsort((rng.random(len(frames)), frames))
     starts = np.searchsorted(frames, frames)
     return np.sort(shuffled[np.arange(len(frames)) - starts < count])

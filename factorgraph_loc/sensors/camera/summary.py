@@ -28,16 +28,17 @@ from factorgraph_loc.vision.matching import match
 from factors import se2
 from factors.se2 import Array
 
-LOOKED_AT = 40  # number of images that are examined, evenly over the log
+LOOKED_AT = 40  # maximum number of images that are examined, evenly over the log
 SHOWN = 5  # number of names that a warning lists
 
 
 @dataclass(frozen=True)
 class ImageSummary:
-    """A summary of the images of a log. ``images``: their number. The other fields describe the ``looked_at`` examined images.
+    """A summary of the images of a log. ``images``: the number of images. ``looked_at``: the number of examined images.
 
-    ``readable``: number of readable images. ``sizes``: number of images by size WIDTHxHEIGHT. ``feature``: kind of the
-    features. ``features``: their median number per image. ``fault``: the first error message, or None.
+    For the examined images: ``readable``: the number of readable images. ``sizes``: the number of images of each size
+    WIDTHxHEIGHT. ``feature``: the kind of features. ``features``: the median number of features per image. ``fault``:
+    the first error message, or None.
     """
 
     images: int
@@ -53,8 +54,9 @@ class ImageSummary:
 class PixelSummary:
     """A summary of the named points in images of a log.
 
-    ``rows``: number of sightings. ``frames``: number of timestamps. ``known``: number of different points that are in the map.
-    ``unknown``: number of sightings of each name that the map lacks. ``outside``: number of sightings outside of the image.
+    ``rows``: the number of sightings. ``frames``: the number of images. ``known``: the number of sighted points that
+    are in the map. ``unknown``: the number of sightings of each name that is not in the map. ``outside``: the number of
+    sightings with a position outside of the image.
     """
 
     rows: int
@@ -65,8 +67,8 @@ class PixelSummary:
 
 
 def summarize(log: Log) -> Summary:
-    """Return a summary with warnings. Its entries are ``images``, an :class:`ImageSummary`, and ``pixels``, a
-    :class:`PixelSummary`. An entry is None if the log lacks the stream."""
+    """Return the summary of the camera in a log, with warnings. Its entry ``images`` is an :class:`ImageSummary` or
+    None, its entry ``pixels`` a :class:`PixelSummary` or None."""
     images, pixels = summarize_images(log), summarize_pixels(log)
     text = []
     if images is not None:
@@ -78,14 +80,14 @@ def summarize(log: Log) -> Summary:
     if pixels is not None:
         unknown = f"{len(pixels.unknown)} others" if pixels.unknown else "no others"
         text.append(
-            f"identified pixels: {pixels.rows} in {pixels.frames} images, of {pixels.known} points of the map and {unknown}"
+            f"named points: {pixels.rows} in {pixels.frames} images, of {pixels.known} points of the map and {unknown}"
         )
     problems = camera_problems(log, images, pixels) + mounting_problems(log)
     return Summary({"images": images, "pixels": pixels}, {}, problems, tuple(map(Paragraph, text)))
 
 
 def summarize_images(log: Log) -> ImageSummary | None:
-    """Return a summary of the stream ``camera`` from some of its images, or None if the log has no images."""
+    """Return a summary of the images of a log, or None if it has none. Only some images are examined."""
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return None
@@ -108,7 +110,7 @@ def summarize_images(log: Log) -> ImageSummary | None:
 
 
 def summarize_pixels(log: Log) -> PixelSummary | None:
-    """Return a summary of the stream ``sightings``, or None if the log lacks it."""
+    """Return a summary of the named points in images of a log, or None if it has none."""
     stream = log.streams.get("sightings")
     if not isinstance(stream, SightingStream):
         return None
@@ -128,13 +130,13 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
 
 
 def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[Notice]:
-    """Return warnings about a log's images and named points, such as unreadable images and points that the map lacks.
+    """Return warnings about the images and named points of a log, such as unreadable images.
 
-    ``images``, ``pixels``: the summaries of the streams ``camera`` and ``sightings``, None if the log lacks the stream.
+    ``images``, ``pixels``: the results of :func:`summarize_images` and :func:`summarize_pixels`.
     """
     out = list[Notice]()
     if log.rig.find(CameraSettings) is None:
-        streams = [name for name, summary in (("images", images), ("identified pixels", pixels)) if summary is not None]
+        streams = [name for name, summary in (("images", images), ("named points", pixels)) if summary is not None]
         sentence = "the log has {stream}, which are not used, because its rig has no [camera]"
         out += [notice("unused_camera", sentence, name) for name in streams]
     if images is not None:
@@ -160,7 +162,7 @@ def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary 
 
 
 def _calibration(log: Log, images: ImageSummary) -> list[Notice]:
-    """Return a warning if no examined image has the size that the camera is calibrated for."""
+    """Return a list with a warning if no examined image has the size that the camera is calibrated for, else []."""
     camera = log.rig.find(CameraSettings)
     if camera is None or not images.sizes:
         return []
@@ -172,15 +174,15 @@ def _calibration(log: Log, images: ImageSummary) -> list[Notice]:
     return []
 
 
-PAIRS, FEWEST_PAIRS = 12, 5  # largest and smallest number of pairs of consecutive images that are compared
-TURNS = (0.03, 0.6)  # rad; bounds of the robot's rotation between two compared images
+PAIRS, FEWEST_PAIRS = 12, 5  # maximum and minimum number of pairs of successive images that are compared
+TURNS = (0.03, 0.6)  # rad; minimum and maximum rotation of the robot between two compared images
 FEATURE, COUNT, FEWEST_MATCHES = "orb", 400, 12
-APART = 0.5  # a larger difference between the downward components of the optical axis in images and in the rig causes a warning
+APART = 0.5  # maximum difference of the downward component of the optical axis (a unit vector) from that in the rig
 
 
 def mounting_problems(log: Log) -> list[Notice]:
-    """Return a warning if the rotation of the images contradicts the mounting of the camera in the rig, otherwise []. The check
-    needs a camera in the rig, a reference with headings, and enough usable images. Without these it returns []."""
+    """Return a list with a warning if images rotate differently than by the mounting of the camera in the rig. Returns
+    [] otherwise, and if the log lacks a camera, reference headings, or enough usable images."""
     stream, camera = log.streams.get("camera"), log.rig.find(CameraSettings)
     if not isinstance(stream, ImageStream) or camera is None or log.reference is None or not log.reference.has_heading:
         return []
@@ -188,7 +190,7 @@ def mounting_problems(log: Log) -> list[Notice]:
     ratios = [turned / turn for turn, turned in _turns(log, stream)]
     if len(ratios) < FEWEST_PAIRS:
         return []
-    share = float(np.clip(np.median(ratios), -1.0, 1.0))  # 1 if the camera points straight down
+    share = float(np.clip(np.median(ratios), -1.0, 1.0))  # downward component of the optical axis
     expected = -float(model.rotation[2, 2])
     if abs(share - expected) <= APART:
         return []
@@ -201,8 +203,8 @@ def mounting_problems(log: Log) -> list[Notice]:
 
 
 def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
-    """Yield the rotations [rad] of robot and image between pairs of consecutive images with large rotations. Pairs
-    are skipped if the rotation of the images cannot be estimated."""
+    """Yield (rotation of the robot, rotation of the image) [rad] for pairs of successive images between which the robot
+    rotates much. Pairs are skipped if the rotation of the image cannot be estimated."""
     assert log.reference is not None
     headings = log.reference.at(stream.t + log.rig.time_offset("camera"))[:, 2]
     turns = se2.wrap(np.diff(headings))
@@ -214,8 +216,8 @@ def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
 
 
 def _turned(files: Sequence[Path]) -> float | None:
-    """Return the rotation [rad] of the second of two images relative to the first, positive from right to down. Returns
-    None if it cannot be estimated."""
+    """Return the rotation [rad] of the image content from the first to the second of two images, or None if it cannot
+    be estimated. A positive rotation turns the right side of the image downwards."""
     finder = extractor(FEATURE, COUNT)
     features = []
     for file in files:
@@ -238,7 +240,7 @@ JPEG_QUALITY = 90
 
 
 def draw(log: Log) -> Marks:
-    """Return what a viewer shows of the camera: the points of the map."""
+    """Return the marks of the points of the map for plots and viewers."""
     points = log.world.points
     positions = np.empty((0, 3)) if points is None else points.positions
     return Marks(
@@ -247,12 +249,12 @@ def draw(log: Log) -> Marks:
 
 
 def has_pictures(log: Log) -> bool:
-    """True if the log has images or named points in images."""
+    """Return True if the log has images or named points in images."""
     return "camera" in log.streams or "sightings" in log.streams
 
 
 def images(log: Log) -> Iterator[tuple[float, bytes]]:
-    """Yield time [s] and JPEG bytes of each image of the camera. Raises InputError at an image that cannot be read."""
+    """Yield the time [s] and the JPEG bytes of each image of a log. Raises InputError if an image cannot be read."""
     stream = log.streams.get("camera")
     if not isinstance(stream, ImageStream):
         return
@@ -261,7 +263,7 @@ def images(log: Log) -> Iterator[tuple[float, bytes]]:
 
 
 def sightings(log: Log) -> Iterator[tuple[float, tuple[str, ...], Array]]:
-    """Yield time [s], names (K) and pixels (K, 2) of the named points in each image."""
+    """Yield the time [s] of each image of a log, and the names (K) and pixels (K, 2) of its K named points."""
     stream = log.streams.get("sightings")
     if not isinstance(stream, SightingStream):
         return

@@ -30,9 +30,11 @@ if TYPE_CHECKING:
 
 
 def check(use: Use) -> Use:
-    """Return the run. If the map has no points for the camera, change the setting ``landmarks`` to ``unknown``, so that
-    the points are estimated, and add a warning. The setting is changed only if the user has not set it, the estimator
-    can estimate points, and no other sensor of the run needs a map."""
+    """Return the run ``use``, changed so that points are estimated if the map has no points for the camera.
+
+    The change is the setting ``landmarks`` = "unknown" and a warning. It is only made if the user has not set
+    ``landmarks``, the estimator can estimate points, and the run has no other exteroceptive sensors.
+    """
     motion = moving(use.sensors, TURN)
     unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use)
     if "landmarks" in use.given or not unmapped or any(name not in (*CAMERAS, *motion) for name in use.sensors):
@@ -44,12 +46,13 @@ def check(use: Use) -> Use:
 
 
 def review(use: Use, _ending: Ending) -> Review:
-    """Return the warnings about the camera's use of the map in a run."""
+    """Return the camera's review of a run: warnings if the points of the map cannot be used as the settings require."""
     return Review(tuple(_doubts(use)))
 
 
 def _doubts(use: Use) -> Iterator[Notice]:
-    """Yield a warning if the estimator needs points that the map lacks, or if it uses a map that the settings exclude."""
+    """Yield a warning if the run needs points and the map has none, or if the settings ask for points to be estimated
+    and the estimator cannot do this."""
     landmarks = getattr(use.settings, "landmarks", "known")
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:
@@ -66,7 +69,7 @@ def _uses_camera(use: Use) -> bool:
 
 
 def _has_points(use: Use) -> bool:
-    """True if the run uses the camera, and the map has points that the camera can identify."""
+    """Return True if the run uses the camera and the map has points that the camera can identify."""
     points = use.log.world.points
     if points is None or not _uses_camera(use):
         return False
@@ -75,8 +78,8 @@ def _has_points(use: Use) -> bool:
 
 @dataclass(frozen=True)
 class PreparedLog:
-    """A ``log`` whose images are replaced by features. ``images``: number of images whose features were computed or
-    loaded from the cache. ``seconds``: the time that this took."""
+    """A log with features instead of images. ``images``: the number of images in which features were detected.
+    ``seconds``: the duration of feature detection. Both are 0 if no features were needed."""
 
     log: Log
     warnings: tuple[Notice, ...] = ()
@@ -85,10 +88,9 @@ class PreparedLog:
 
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
-    """Return the settings of feature detection. The kind of feature is the kind that the map's points have. If the map
-    has no points, it is the kind in the settings of the rig's camera.
+    """Return the settings of feature detection in ``rig``, with the kind of feature of the points in the map ``world``.
 
-    Without a map, features are spread over the image, because most of the strongest features may be on a moving object.
+    If the map has no points, features are spread over the image, because the strongest may be on a moving object.
     """
     camera = rig.find(CameraSettings)
     settings = FrontendSettings() if camera is None else camera.frontend
@@ -98,8 +100,8 @@ def frontend_of(rig: Rig, world: World) -> FrontendSettings:
 
 
 def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
-    """Return timestamps (N,) [s] and features of a log's images after feature detection. Raises InputError if the log
-    has no images."""
+    """Return the timestamps (N,) [s] and the features of the N images of a log. Raises InputError if the log has no
+    images, or if their features are not detected yet."""
     stream = log.streams.get("camera")
     if not isinstance(stream, FeatureStream):
         raise InputError(f"{log.name}: has no images (camera), so there are no points to map")
@@ -107,7 +109,8 @@ def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
 
 
 def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
-    """Replace the images of a log by features if the run uses them, otherwise by frames without features."""
+    """Return the log of a run with features instead of images. If the estimator does not use images, no features are
+    detected. ``progress`` is called with the completed fraction."""
     log, stream = use.log, use.log.streams.get("camera")
     if "camera" not in use.sensors or not isinstance(stream, ImageStream):
         return PreparedLog(log)
@@ -121,18 +124,18 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
 
 
 def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
-    """Replace images by frames without features, and add a warning. Their timestamps still begin and end the run."""
+    """Return the log with an empty list of features for each image, and a warning that ``estimator`` ignores images."""
     nothing = CameraFrame(0.0, "", np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64))
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
     sentence = "{log}: {estimator} does not use images: all {images} are ignored"
     warning = (notice("unused_images", sentence, log.name, estimator, len(stream.t)),)
-    is_obvious = estimator == "dead_reckoning"  # its name says that it uses odometry only
+    is_obvious = estimator == "dead_reckoning"  # no warning, because dead reckoning uses only odometry
     return PreparedLog(replace(log, streams={**log.streams, "camera": frames}), () if is_obvious else warning)
 
 
 class CameraIntake(Intake):
-    """Detects and tracks features in pushed images. It checks that descriptors have the same length as the descriptors
-    of the map, or, without a map, as the descriptors of the first frame."""
+    """Detects features in images for the live localizer. Also checks that all descriptors have the same length as those
+    in the map, or as the first ones if the map has none."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         points = world.points
