@@ -103,7 +103,7 @@ def descended(
     state: State,
     max_iterations: int = MAX_ITERATIONS,
 ) -> tuple[State, float, int]:
-    """Find a local minimum of a cost whose steps the caller computes.
+    """Find a local minimum of a cost. The caller computes the steps.
 
     ``cost_of(state)``: returns the cost.
     ``moved(state, damping)``: returns the state after one damped step, and the largest absolute component of the step.

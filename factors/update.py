@@ -144,7 +144,7 @@ def _informed(prior: Array) -> _Solver:
 
 
 def _rooted(root: Array) -> _Solver:
-    """Make a solver of linearised updates in square-root form, whose covariance is always positive definite. ``root``
+    """Make a solver of linearised updates in square-root form. Its covariances are always positive definite. ``root``
     (S, S): lower Cholesky root of the covariance of the prediction."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:

@@ -36,9 +36,9 @@ def triangulated(
     [rad]: the smallest allowed angle between the outermost rays. ``nearest`` [m]: the smallest allowed depth.
     ``robust``: the scale of Huber's loss in standard deviations, infinite for least squares.
 
-    Returns four values: False if the parallax is too small or the point too uncertain, otherwise True; the point (3,)
-    in the world; its covariance (3, 3); and the squared norms (M,) of its whitened residuals. These are infinite if the
-    point is not at least ``nearest`` in front of all cameras.
+    Returns four values: True if the parallax is large enough and the point certain enough, the point (3,) in the world,
+    its covariance (3, 3), and the squared norms (M,) of its whitened residuals. The norms are infinite if the point is
+    not at least ``nearest`` in front of all cameras.
 
     The start is the point nearest to all rays. Gauss-Newton steps on the reprojection error follow (Hartley and
     Zisserman, "Multiple View Geometry", 2004, chapter 12).
@@ -58,7 +58,7 @@ def triangulated(
             squared[:] = np.inf
             return True, point, covariance, squared
         covariance = inverse(information)
-        # the limit is twice as large for the initial point, whose covariance is less accurate
+        # the limit is twice as large here, because the covariance of the initial point is less accurate
         if not _is_below(covariance, ((2.0 if iteration == 0 else 1.0) * largest_sigma * depth) ** 2):
             return False, point, covariance, squared
         if iteration < ITERATIONS:

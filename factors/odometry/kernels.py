@@ -93,7 +93,7 @@ def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indice
 
 @compiled
 def carried(covariance: Array, delta: Array, noise: Array) -> Array:
-    """Propagate the body-frame ``covariance`` (3, 3) of a pose over the motion ``delta`` (3,), whose covariance is
+    """Propagate the body-frame ``covariance`` (3, 3) of a pose over the motion ``delta`` (3,) with the covariance
     ``noise`` (3, 3). Returns the body-frame covariance (3, 3) of the pose after the motion."""
     c, s = math.cos(delta[2]), math.sin(delta[2])
     x, y = s * delta[0] - c * delta[1], c * delta[0] + s * delta[1]

@@ -77,7 +77,7 @@ class RfidFactor:
     ``likelihood``: a likelihood of read counts, signal strengths or phases.
     ``reads``: :class:`~factors.rfid.detection.TagReadCounts` for an :class:`~factors.rfid.detection.RfidLikelihood`,
     otherwise :class:`~factors.rfid.signals.RssiReads` or :class:`~factors.rfid.signals.PhaseReads`.
-    ``estimated`` (P,): indices of the parameters (:mod:`factors.rfid.parameters`) that are estimated; read counts only.
+    ``estimated`` (P,): indices of the estimated parameters (:mod:`factors.rfid.parameters`). Only for read counts.
 
     Methods with ``values`` take a list of the pose (3,) and, if P > 0, the parameters (P,). For any number of reads
     there are 4 + P residuals. Half the sum of their squares has the value, the gradient and the Fisher information of
@@ -175,7 +175,7 @@ class RfidFactor:
 class RfidTagFactor:
     """The read counts of one tag as a factor on the robot's pose and on the tag's position.
 
-    ``likelihood``: its map has the height and facing of the tag; the position in that map is not used.
+    ``likelihood``: its map has the tag. The height and facing in the map are used, but not the position.
     ``tag``: the index of the tag in the map. ``counts``: reads that list all tags of the map.
 
     The methods take a list of the pose (3,) and the tag's position (2,) in the world. For any number of reads there are

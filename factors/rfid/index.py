@@ -27,7 +27,7 @@ class TagIndex(NamedTuple):
     """A spatial index of T tags in square cells.
 
     ``corner`` (2,) [m]: the lower corner of the first cell. ``cell`` [m]: the size of a cell. ``columns``: the number
-    of cells in a row; the C cells are numbered row by row.
+    of cells in a row. The C cells are numbered row by row.
     ``order`` (T,): the indices of the tags in the map, cell by cell, and ascending within a cell.
     ``start`` (C + 1,): the index in ``order`` of the first tag of each cell.
     """

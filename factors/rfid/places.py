@@ -39,7 +39,7 @@ class RobotTables(NamedTuple):
     """The responses of A antennas to a tag, by the tag's position in the robot frame. q is the read probability of one round.
 
     A table has S x S cells of ``cell`` [m], for each of H heights and each of F facings of the tag. The last facing is
-    for tags whose facing is unknown or irrelevant.
+    for tags with an unknown or irrelevant facing.
     ``gain`` (A, H, F, S, S): log q - log(1 - q).
     ``missed`` (A, H, F, S, S): log(1 - q) minus its value out of reach.
     ``level`` (T,): the index of each tag's height. ``none`` (A, 2): log q and log(1 - q) out of reach.
