@@ -13,12 +13,12 @@ from typing import Any
 
 # maximum sizes of displayed texts
 MESSAGE = 300  # characters of a message
-NAME = 120  # characters of a name, a path or a message of another library
-VALUE = 80  # characters of a value
-LISTED = 10  # names of a list
-ITEMS = 5  # items of a value that is a list or a table
-DEPTH = 3  # nesting levels of a value
-LONG_NUMBER = 40  # digits of an integer; larger ones are described
+NAME = 120  # maximum characters of a name, a path or a message of another library
+VALUE = 80  # maximum characters of a value
+LISTED = 10  # maximum names of a list
+ITEMS = 5  # maximum displayed items of a value that is a list or a table
+DEPTH = 3  # maximum displayed nesting levels of a value
+LONG_NUMBER = 40  # maximum digits of a displayed integer; larger integers are described
 CUT = "..."  # replaces the middle of a text that is too long
 
 

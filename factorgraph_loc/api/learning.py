@@ -34,7 +34,8 @@ def calibrate(
 ) -> calibration.Calibration:
     """Calibrate a rig from logs, and write it to ``out`` (``NAME.rig.toml``), with a report ``NAME.report.html`` next to it.
 
-    All logs must have a reference, or all must have none. ``progress`` is called with the numbers of done and of all steps.
+    Either all logs or none must have a reference trajectory. ``progress`` is called with the number of steps that are
+    done and the number of all steps.
     """
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = load_all(logs, rig, world)

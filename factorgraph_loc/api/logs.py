@@ -66,10 +66,10 @@ def convert(
 
 
 def manifest(log: str | Path) -> Proposal:
-    """Propose a manifest for a folder of tables or a ROS bag, which states which file or topic is which sensor.
+    """Propose a manifest: a TOML file that assigns the files of a folder, or the topics of a ROS bag, to sensors.
 
-    Write its ``text`` to a file in its ``folder`` and check it. That file can then be read as a log. Raises InputError
-    if the folder or the bag cannot be read.
+    Write the ``text`` of the proposal to a file in its ``folder``, and check it. Then the file can be given as a log.
+    Raises InputError if the folder or the bag cannot be read.
     """
     path = Path(log)
     propose = manifest_of_folder if path.is_dir() and not is_bag(path) else manifest_of_bag

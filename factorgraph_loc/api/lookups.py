@@ -134,7 +134,7 @@ def new_rig(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Rig:
-    """Return a first rig of a robot with some sensors. If ``out`` is given, the rig is also written to this file, with comments.
+    """Return a rig, the settings of a robot and its sensors, with typical values. ``out``: a file to write it to.
 
     ``odometry``: the drive. ``imu``: True if the robot has a gyro. ``landmarks``: standard deviation of ranges to landmarks
     [m], or a dict of values by sensor name. ``antennas``: number or names of RFID antennas. ``camera``: width and

@@ -47,7 +47,7 @@ def calibrate(
     from factorgraph_loc.api import learning
     from factorgraph_loc.calibration import report
 
-    page = learning.report_beside(out, overwrite=overwrite)  # checked before the logs are read, which takes longer
+    page = learning.report_beside(out, overwrite=overwrite)  # checked before the logs are read, which is slow
     loaded = source.load(logs)
     show.first_use()
     with show.progress("calibrating", counted=True) as progress:
@@ -127,7 +127,7 @@ def map_(
     from factorgraph_loc.api import learning
     from factorgraph_loc.experiments import maps
 
-    picture = maps.plot_path(out, overwrite=options.overwrite)  # checked before the log is read, which takes longer
+    picture = maps.plot_path(out, overwrite=options.overwrite)  # checked before the log is read, which is slow
     loaded = source.load_one(log)
     settings = parse_settings(set_ or (), [options.estimator], [maps.POINTS])
     with show.progress("mapping", counted=False) as report:

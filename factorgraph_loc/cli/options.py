@@ -178,7 +178,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
             values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
         command(**values)
 
-    expanded.__signature__ = given.replace(parameters=parameters)  # type: ignore[attr-defined] # what Typer reads
+    expanded.__signature__ = given.replace(parameters=parameters)  # type: ignore[attr-defined] # Typer reads it
     expanded.__annotations__ = {p.name: p.annotation for p in parameters}
     return expanded
 
@@ -232,7 +232,7 @@ def key_and_value(text: str, option: str) -> tuple[str, Any]:
 
 
 def _scalar(text: str) -> Any:
-    """Parse a value of TOML. Text that is not TOML, and a date, is returned unchanged."""
+    """Parse a value of TOML. Return the text of a date, and a text that is not TOML, unchanged."""
     from factorgraph_loc.files.models import parse_toml
 
     try:

@@ -74,7 +74,7 @@ def run(
     from factorgraph_loc.io.results import FILES
 
     check_names([estimator])
-    require_free(out, FILES, overwrite=options.overwrite)  # checked before the log is read, which takes longer
+    require_free(out, FILES, overwrite=options.overwrite)  # checked before the log is read, which is slow
     settings = parse_settings(options.set_ or (), [estimator])
     loaded = source.load_one(log)
     show.first_use()
@@ -135,7 +135,7 @@ def compare(
     names = parse_list(estimators)
     check_names(names)
     if out is not None:
-        require_free(out, FINISHED, overwrite=options.overwrite)  # checked before the logs are read, which takes longer
+        require_free(out, FINISHED, overwrite=options.overwrite)  # checked before the logs are read, which is slow
     settings = parse_settings(options.set_ or (), names)
     chosen = parse_seeds(seeds)
     loaded = source.load(logs)

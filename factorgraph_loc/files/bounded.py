@@ -19,18 +19,17 @@ from typing import BinaryIO
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.text import error_text, plain, quoted
 
-# maximum sizes of what is read
-SETTINGS = 16 * 2**20  # bytes of a TOML or JSON file
-YAML = 2**16  # bytes of a YAML file, which is a hundred times slower to read than TOML
-DEFINITION = 2**20  # characters of the definition of a ROS message, which is compiled to functions
-DATA = 2**30  # bytes of a table, a text or a MATLAB file, compressed and uncompressed
-IMAGE = 2**28  # bytes of an image file
-GRID = 2**26  # bytes of an uncompressed occupancy grid
-PIXELS = 2**26  # pixels of an image; the limit of OpenCV is 2^30
-CELLS = 2**27  # rows times columns that a Parquet file declares
+SETTINGS = 16 * 2**20  # maximum bytes of a TOML or JSON file
+YAML = 2**16  # maximum bytes of a YAML file, which is a hundred times slower to read than TOML
+DEFINITION = 2**20  # maximum characters of the definition of a ROS message
+DATA = 2**30  # maximum bytes of a table, a text or a MATLAB file, compressed and uncompressed
+IMAGE = 2**28  # maximum bytes of an image file
+GRID = 2**26  # maximum bytes of an uncompressed occupancy grid
+PIXELS = 2**26  # maximum pixels of an image; the limit of OpenCV is 2^30
+CELLS = 2**27  # maximum product of the numbers of rows and columns of a Parquet file
 MEMORY, MEMORY_PER_BYTE = 2**30, 32  # reading a file of N bytes may take MEMORY + MEMORY_PER_BYTE * N bytes of memory
 CHECK_INTERVAL = 0.01  # s between checks of the memory
-LARGEST_POINTER = 1024  # bytes of a pointer file of Git LFS, by its specification
+LARGEST_POINTER = 1024  # maximum bytes of a pointer file of Git LFS, by its specification
 
 _limited = threading.Event()  # set if this process limits the memory that reading a file takes
 POINTER = b"version https://git-lfs.github.com/spec/v1"  # first line of a pointer file of Git LFS
@@ -51,8 +50,8 @@ class NoFileNameError(InputError):
 def kind(path: Path, source: object = None) -> str:
     """Return the kind of a path: "a file", "a folder", "a named pipe", "a socket", "a device", or "" if nothing exists there.
 
-    ``source``: the file or option that contains the path, for messages; None for the path itself. Raises
-    NoFileNameError if no file can have that name, and InputError if access is denied.
+    ``source``: the file or option that contains the path, for messages. Raises NoFileNameError if no file can have
+    this name, and InputError if access is denied.
     """
     try:
         return _kind(path.stat())
@@ -146,7 +145,7 @@ def limit_memory() -> None:
 
 @contextmanager
 def limited_memory(source: object, size: int) -> Iterator[None]:
-    """End the process with one line on stderr if this block takes too much memory. No effect without :func:`limit_memory`.
+    """End the process with a message on stderr if this block takes too much memory, if :func:`limit_memory` was called.
 
     ``source``: the file that the block reads. ``size``: its size in bytes. The limit is :data:`MEMORY` plus
     :data:`MEMORY_PER_BYTE` times ``size``. A compressed file of a few kilobytes may unpack to gigabytes. The limits of
@@ -195,7 +194,7 @@ def _require_file(path: Path, kind: str) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Discard all output to descriptor 2 (stderr) in this block. No effect outside of the main thread.
+    """Discard all output to descriptor 2 (stderr) in this block, if it runs in the main thread.
 
     Messages that other threads print in the meantime are discarded too, so keep the block short.
     """

@@ -62,7 +62,7 @@ class Cells:
         return [str(cell) for cell in self.columns[name]]
 
     def names(self, name: str, column: Column) -> list[str]:
-        """Return the N names in a field. Raises InputError at the first empty cell, with the description of ``column``."""
+        """Return the N names in a field. Raises InputError at the first empty cell. ``column``: describes the field."""
         texts, faults = self._names(name, column)
         self.require(faults)
         return texts
@@ -235,9 +235,9 @@ class Cells:
         text = text.replace(self.decimal, ".")
         whole, _, fraction = text.partition(".")
         if len(whole) <= MOST_DIGITS and len(fraction) <= power and (whole + fraction).isdecimal():
-            return int(whole + fraction + "0" * (power - len(fraction)))  # several times as fast as Decimal
+            return int(whole + fraction + "0" * (power - len(fraction)))  # faster than Decimal
         number = Decimal(text)
-        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # checked before the digits are expanded
+        if not number.is_finite() or number.adjusted() > MOST_DIGITS:  # 1e999999 has a million digits
             raise OverflowError
         return round(number.scaleb(power))
 

@@ -81,7 +81,7 @@ def read_mapped(
     optional: Collection[str] = (),
     either: Collection[str] = (),
 ) -> Cells:
-    """Read the columns of the file ``path`` that ``mapping.columns`` assigns to fields.
+    """Read the columns of the file ``path`` that ``mapping.columns`` assigns to fields. Return the cells by field.
 
     ``shapes``: alternative sets of fields. The mapping must have all fields of one set.
     ``optional``: further fields that the mapping may have. The file may lack their columns.
@@ -154,9 +154,9 @@ class TableFolder:
         return inside(self.path, name, self.path)
 
     def read(self, mapping: TimedMapping, shapes: Sequence[Collection[str]], columns: Mapping[str, Column]) -> Cells:
-        """Read the file of a mapping by :func:`read_mapped` with ``shapes``, and pass the cells to :meth:`noted`.
+        """Read the file that a mapping names. Return the valid cells as :meth:`noted` does.
 
-        ``columns``: the description of each field.
+        ``shapes``: alternative sets of fields, as in :func:`read_mapped`. ``columns``: the description of each field.
         """
         return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
 
@@ -242,7 +242,7 @@ def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]
         chosen = ((row, parts) for row, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
         first_row, first = next(chosen, body[0])
         header = _numbers(len(first))
-        if (rules := _rules(mapping)) is not None and rules.bad_rows == "skip":  # then use the length of most rows
+        if (rules := _rules(mapping)) is not None and rules.bad_rows == "skip":  # the first row may be cut off
             lengths = Counter(len(parts) for _, parts in body if _is_chosen(parts, _numbers(len(parts)), where))
             header = _numbers(lengths.most_common(1)[0][0] if lengths else len(first))
     _require_columns(path, mapping, needed, header, first_row)
@@ -278,7 +278,7 @@ def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, st
 
 def parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Split the numbered ``lines`` of a CSV file at ``separator``. Yield the line number and the cells of each row."""
-    if separator == " ":  # stands for any number of blanks
+    if separator == " ":  # any number of blanks separates columns
         return ((row, line.split()) for row, line in lines)
     rows = csv_rows(path, lines, delimiter=separator, skipinitialspace=True)
     return ((row, [part.strip() for part in parts]) for row, parts in rows)

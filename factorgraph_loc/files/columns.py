@@ -83,7 +83,7 @@ class Column:
 
     @property
     def unit(self) -> str:
-        """The unit of values after conversion. Empty for dimensionless numbers and names."""
+        """The unit of values after conversion, "" for dimensionless numbers and names."""
         return "" if self.units is PURE else next(iter(self.units), "")
 
     @property
@@ -197,7 +197,7 @@ def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Intege
         raise bad_field(source, "stamp", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
-# the unit of a timestamp since 1970 is the first one with a bound below the timestamp, which is correct after 1973
+# minimum timestamp since 1970 in each unit, finest unit first; timestamps after 1973 exceed it
 SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
 
 

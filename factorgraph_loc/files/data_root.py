@@ -29,9 +29,9 @@ def find_data_root(data_root: str | Path | None, source: object) -> Path:
 def named_path(folder: Path, name: str, source: object, data_root: str | Path | None, expected: str = EXPECTED) -> Path:
     """Resolve the path ``name`` that a manifest or an experiment file contains.
 
-    ``source``: that file. ``folder``: its folder. The path must lead below ``folder`` or below the data folder
-    ``data_root``; None stands for the environment variable FGLOC_DATA. The path need not exist. ``expected``: end of
-    the message if the path leads elsewhere. Raises InputError as :func:`~factorgraph_loc.files.models.inside`.
+    ``source``: the file that contains ``name``. ``folder``: the folder of ``source``. The path must lead below
+    ``folder`` or below ``data_root``, which is the environment variable FGLOC_DATA by default. The path need not
+    exist. ``expected``: end of the message if the path leads elsewhere. Raises InputError if it does.
     """
     data = os.environ.get(DATA_ROOT) if data_root is None else data_root
     folders = [Path(data)] if data and Path(data).is_dir() else []

@@ -24,8 +24,8 @@ from factorgraph_loc.files import bounded
 from factorgraph_loc.files.temporary import temporary_file
 from factorgraph_loc.text import LISTED, NAME, error_text, listed, plain, quoted, well_formed
 
-LONGEST_FILE = 100  # bytes of a generated file name
-DEEPEST = 64  # nesting levels of tables or lists, and parts of a key
+LONGEST_FILE = 100  # maximum bytes of a generated file name
+DEEPEST = 64  # maximum nesting levels of tables or lists, and maximum parts of a key
 MOST_NAMES = 1000  # maximum number of names that are compared with a misspelt name
 MOST_ENTRIES = 1_000_000  # maximum number of values in a TOML or JSON file
 MOST_DIGITS = 40  # maximum number of digits of an integer in JSON; an EPC of 96 bits has 29
@@ -42,13 +42,12 @@ class FileModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy with the values of ``update``. Numbers are clipped to the bounds of their fields, so that a
-        file with the copy can be read again."""
+        """Return a copy with the values of ``update``. Numbers are clipped to the bounds of their fields."""
         return super().model_copy(update={k: _within(type(self), k, v) for k, v in (update or {}).items()}, deep=deep)
 
     @classmethod
     def bounded(cls, **values: Any) -> Self:
-        """Return a model of computed values. Numbers are clipped to the bounds of their fields."""
+        """Return an instance with the field values ``values``. Numbers are clipped to the bounds of their fields."""
         return cls(**{key: _within(cls, key, value) for key, value in values.items()})
 
 
@@ -190,7 +189,7 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
             raise InputError(f"{source}: unknown key {key}{hint}{more}") from error
         if first["type"] == "missing":
             raise InputError(f"{source}: {key} is missing{more}") from error
-        # the message does not contain the value if it is a table, which is too long
+        # a table is too long for the message
         if first["type"] == "value_error" and isinstance(first["input"], (Mapping, BaseModel)):
             table = f"{key}: " if key else ""
             raise InputError(f"{source}: {table}{first['ctx']['error']}{more}") from error
@@ -208,7 +207,7 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
         if isinstance(part, int):  # index in a list of models
             continue
         field = kind.model_fields.get(str(part))
-        if field is None:  # the part is the user's name of one of several sensors
+        if field is None:  # the user has given this name to a sensor
             continue
         nested = field.annotation
         if get_origin(nested) is dict:
@@ -251,7 +250,7 @@ def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Return the values in the nested tables ``content`` with their paths: ``prefix`` and keys, such as ``a.b.c``."""
+    """Yield each value in the nested tables ``content`` and its path: ``prefix`` and the keys, such as ``a.b.c``."""
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{key}.")
@@ -331,7 +330,7 @@ def write_toml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
-    """Return the values in the nested tables and lists ``content`` with their keys, except floats.
+    """Yield each value in the nested tables and lists ``content`` and its key. Floats are omitted.
 
     Raises InputError if there are more than :data:`MOST_ENTRIES` values, or they are nested deeper than :data:`DEEPEST`.
     """

@@ -79,7 +79,7 @@ def settings_in(model: type[BaseModel], prefix: str = "", default: BaseModel | N
             known = settings.get(setting.key)
             if known is None:
                 settings[setting.key] = setting
-            elif known.choices and setting.choices:  # the choices select a model, and each model has one choice
+            elif known.choices and setting.choices:  # alternative models share this key
                 choices = dict.fromkeys((*known.choices, *setting.choices))
                 settings[setting.key] = replace(known, choices=tuple(choices))
     return list(settings.values())

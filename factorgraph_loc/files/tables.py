@@ -28,7 +28,7 @@ KINDS = {"stamp": pl.Int64, "whole": pl.Int64, "number": pl.Float64, "name": pl.
 
 
 def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Iterator[tuple[int, list[str]]]:
-    """Parse CSV and return the line number and the cells of each row.
+    """Parse CSV. Yield the line number and the cells of each row.
 
     ``lines``: the lines with their numbers. ``form``: arguments of :func:`csv.reader`. Raises InputError if a line is not CSV.
     """
@@ -153,7 +153,7 @@ def text_column(table: pl.DataFrame, name: str, source: object) -> list[str]:
         raise InputError(f"{source}: {name} is of type {kind}, expected texts")
     with foreign(source, f"{name} is no column of texts"):
         texts = column.cast(pl.String)
-        # the estimated size contains a shared text only once
+        # the exact length is computed only if this upper bound of it exceeds the limit
         if len(texts) * texts.estimated_size() > DATA:
             length = int(texts.str.len_bytes().sum())
             require_size(source, f"the length of all texts of {name}", length, DATA)

@@ -26,7 +26,7 @@ MARK = ".fgloc-"
 _NAME = re.compile(rf"\..*{re.escape(MARK)}([0-9a-f]{{8}})-([1-9][0-9]*)-[0-9a-f]{{8}}(\.[^.]*)?", re.DOTALL)
 _NAMED, _SUFFIX = 150, 60  # maximum bytes kept of a target's name and of its suffix; file systems allow 255 in total
 _MACHINE = f"{zlib.crc32(socket.gethostname().encode()):08x}"
-MAX_AGE = 7 * 86_400.0  # s after which a file of another machine is removed; whether its process runs is unknown
+MAX_AGE = 7 * 86_400.0  # s; maximum age of a file of another machine
 _swept: set[Path] = set()  # folders that this process has cleared of old temporary files
 _own: set[Path] = set()  # paths created by this process and not yet removed
 
@@ -47,7 +47,7 @@ def of_system(name: str) -> Path:
 
 
 def sweep(folder: Path) -> None:
-    """Remove the temporary files of this user in ``folder`` whose process has ended."""
+    """Remove temporary files and folders that ended processes of this user have left in ``folder``."""
     with suppress(OSError):  # if the folder does not exist
         for entry in os.scandir(folder):
             with suppress(OSError):  # if another process has removed the file
@@ -108,7 +108,7 @@ def _created(path: Path, name: str, suffix: str, *, folder: bool) -> Iterator[Pa
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on the file ``path`` in this block. No effect if the file system does not support locks.
+    """Hold an exclusive lock on the file ``path`` in this block, if the file system supports locks.
 
     The file is created if it is missing, and is not removed.
     """

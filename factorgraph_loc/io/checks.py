@@ -53,7 +53,7 @@ def _require(where: str, column: Column, t: Array, values: Array) -> None:
 
 
 def require_one_span(log: Log) -> None:
-    """Raise InputError if a timestamp of a log or of its start is too far from the others, because the clocks of sensors disagree.
+    """Raise InputError if two timestamps of a log, or of its start pose, are too far apart. Then clocks disagree.
 
     The limit is :data:`~factorgraph_loc.files.columns.MAX_SPAN`.
     """
@@ -117,7 +117,7 @@ def without_false_headings(log: Log) -> Log:
 
 
 def log_warnings(log: Log) -> list[Notice]:
-    """Return warnings about gaps in the odometry, rows before the odometry, and landmarks that the map lacks.
+    """Return warnings about gaps in the odometry, measurements before it, and landmarks that the map lacks.
 
     Raises InputError if the log has measurements but no odometry.
     """

@@ -43,7 +43,7 @@ FIELDS = {
 }
 POSITIONS = re.compile("uwb|gps|gnss|position|(^|[-_.])(fix|ble)", re.IGNORECASE)  # in names of tables of positions
 MAPS = ("tags", "landmarks")
-WINDOW = 1.0  # s: the resolution in time at which distances are summed
+WINDOW = 1.0  # s: the sampling interval of the positions between which distances are summed
 TICK, TRACK, RADIUS = 0.001, 0.5, 0.1  # m per encoder count, m, m: examples of sizes that no file states
 SIGMA = 0.1  # m: an example of the noise of a range or a position
 APART = 5.0  # s: maximum gap between the time spans of two tables; at a larger gap, a clock offset is proposed
@@ -51,14 +51,14 @@ APART = 5.0  # s: maximum gap between the time spans of two tables; at a larger 
 
 @dataclass
 class _Roles:
-    """The proposed roles of tables. ``tables``: by role, such as ``odometry``. ``remarks``: sentences for the user."""
+    """The proposed roles of tables. ``tables``: by role, such as ``odometry``. ``remarks``: hints for the user."""
 
     tables: dict[str, Guess] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
 
 
 def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
-    """Propose a manifest for the folder ``tables``.
+    """Propose a manifest, a TOML file that describes how to read a log, for the folder ``tables``.
 
     The manifest is to be saved in ``folder`` if ``tables`` is below ``folder``, else in the folder that contains
     ``tables``. Raises InputError if no file in ``tables`` is a table with times.

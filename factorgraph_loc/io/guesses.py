@@ -22,7 +22,7 @@ from factors.se2 import Array
 TRUTH = re.compile(
     r"truth|(^|[/_.])gt($|[/_.])|reference|mocap|vicon|optitrack|qualisys|total_station|leica", re.IGNORECASE
 )
-# by field of an RFID read: common names of columns or message fields, without separators and units
+# common names that other programs have for each field of an RFID read, without separators and units
 READ: dict[str, tuple[str, ...]] = {
     "epc": ("epc", "epchex", "tagepc", "tagid", "epcid", "uid", "tag", "serial", "tagserial"),
     "antenna": ("antenna", "antennaid", "antennaport", "antennaname", "ant", "port", "portnumber", "readerport"),
@@ -75,7 +75,7 @@ ENDS: dict[str, Mapping[str, str]] = {
 }
 TEXTS = ("epc", "antenna", "landmark")  # fields whose values need not be numbers
 FASTEST = 15.0  # m/s above which a speed is assumed to be in another unit
-# by field: possible units, each with the largest value that is plausible in it; the first plausible unit is used
+# possible units of each field, with the largest plausible value in the unit; the first plausible unit is used
 LARGER: dict[str, tuple[tuple[str, float], ...]] = {
     **dict.fromkeys(("heading", "bearing", "facing"), (("rad", 6.4), ("deg", np.inf))),
     "w": (("rad/s", 12.0), ("deg/s", np.inf)),
@@ -96,8 +96,8 @@ class Guess:
     ``separator``, ``decimal``: the separator of columns and the decimal mark.
     ``header``: True if the first row has the names of the columns.
     ``columns``: the texts of each column by its name, or by its number from 1 if the table has no header.
-    ``fields``: the guessed column of each field. ``units``: the guessed unit of each field.
-    ``reasons``: sentences for the user that explain each guess that follows from values instead of names.
+    ``fields``: the guessed column of each field, a quantity of this project such as ``t`` or ``epc``.
+    ``units``: the guessed unit of each field. ``reasons``: explanations of guesses that follow from values.
     """
 
     path: Path

@@ -22,8 +22,8 @@ from factorgraph_loc.text import Notice, notice
 from factors import se2
 from factors.se2 import Array, Integers
 
-# a motion is a jump if its rate exceeds FASTER times both the largest rate before it and SPEED [m/s] or TURN [rad/s]
-SPEED, TURN, FASTER = 1.0, 2.0, 3.0
+# a jump is a motion with a rate above FASTER times the largest previous rate, which is at least SPEED or TURN
+SPEED, TURN, FASTER = 1.0, 2.0, 3.0  # m/s, rad/s, dimensionless
 RESET_DISTANCE = 0.05  # m: maximum distance from the origin after a reset of the odometry
 ZERO = 1e-6  # m and rad: magnitude below which a value is zero
 NO_STAMPS = np.zeros(0, dtype=np.int64)
@@ -89,7 +89,7 @@ def wheels_of(left: str, count: int) -> tuple[str, ...]:
 def between_poses(
     source: object, t_ns: Integers, poses: Array, warnings: list[Notice], lost_ns: Integers = NO_STAMPS
 ) -> Array:
-    """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns].
+    """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns], in the previous body frame.
 
     Where the odometry is reset to the origin, the previous motion is continued, and a warning is appended to
     ``warnings``. ``lost_ns``: the timestamps at which the device had lost its pose.
@@ -133,16 +133,16 @@ def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Int
 
 
 def held(t_ns: Integers, velocities: Array) -> Array:
-    """Return the motions (N - 1, 3) between N timestamps [ns] of velocities (N, 2), forward and about the vertical.
+    """Integrate velocities (N, 2), forward [m/s] and about the vertical [rad/s]. Return motions (N - 1, 3).
 
-    A velocity is held until the next one, for at most :data:`HOLD_TIME`.
+    A velocity is constant until the next of the timestamps ``t_ns`` (N,), for at most :data:`HOLD_TIME`.
     """
     twists = np.column_stack((velocities[:-1, 0], np.zeros(len(velocities) - 1), velocities[:-1, 1]))
     return np.asarray(se2.exp(twists * np.minimum(np.diff(t_ns) / 1e9, HOLD_TIME)[:, None]))
 
 
 def after_rest(moves: Array) -> Array:
-    """Return motions (N - 1, 3) as increments (N, 3). The first row has no motion and only defines the start."""
+    """Return the motions (N - 1, 3) with a row of zeros in front (N, 3), which stands for the start."""
     return np.vstack((np.zeros((1, 3)), moves))
 
 
@@ -166,7 +166,7 @@ def between_wheels(
 ) -> Array:
     """Return the motions (N - 1, 3) of a robot from the distances of its wheels. ``sizes``: the sizes of the drive.
 
-    The other arguments are those of :func:`between_ways`.
+    For the other arguments see :func:`between_ways`.
     """
     return se2.exp(sizes.twists(source, between_ways(source, t_ns, distances, scales, warnings), warnings))
 

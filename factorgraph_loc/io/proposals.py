@@ -20,7 +20,7 @@ COMPANIONS = {
 
 @dataclass(frozen=True)
 class Proposal:
-    """A proposed manifest.
+    """A proposed manifest, which is a TOML file that describes how to read a log.
 
     ``content``: its keys and values. ``text``: the manifest as TOML, with ``remarks`` as comments. ``folder``: the
     folder to save it in; paths in the manifest are relative to this folder.

@@ -29,7 +29,7 @@ FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)
 
 @dataclass(frozen=True)
 class Estimates:
-    """The estimates of one kind, causal or final, from a stored run.
+    """The causal estimates of a stored run, or the final estimates, which use the whole log.
 
     ``trajectory``: N estimated poses. ``errors``: by the names in :data:`ERRORS`, the errors of position (N,) [m] and
     heading (N,) [rad], and the normalised estimation error squared (N,). An unknown error is NaN.
@@ -66,7 +66,9 @@ class ResultFiles:
     folder: Path = Path()
 
     def estimates(self) -> dict[str, Estimates]:
-        """Return the estimates of each of :data:`KINDS`. Causal estimates before the first localization are omitted."""
+        """Return causal and final estimates, by the names in :data:`KINDS`.
+
+        Causal estimates before the first localization are omitted."""
         source = self.folder / ESTIMATES
         table = parse_parquet(self.read(ESTIMATES), source, list(COLUMNS))
         with foreign(source, "is no table of estimates"):
@@ -79,7 +81,7 @@ class ResultFiles:
         first = int(localized[0]) if len(localized) else len(by_kind["causal"])
         by_kind["causal"] = by_kind["causal"][first:]
         try:
-            return {kind: Estimates.of(rows, t0_ns) for kind, rows in by_kind.items()}  # type: ignore[arg-type] # an integer
+            return {kind: Estimates.of(rows, t0_ns) for kind, rows in by_kind.items()}  # type: ignore[arg-type]
         except ValueError as error:
             raise InputError(f"{source}: contains no valid trajectory: {error_text(error)}") from error
 

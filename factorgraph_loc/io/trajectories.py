@@ -55,7 +55,7 @@ def read_trajectory(source: str | Path) -> PosePath:
 
 
 def _in_bag(text: str) -> tuple[Path, str] | None:
-    """Split ``text`` into the bag and the topic that it names. The topic is "" if it is left out. Returns None without a bag."""
+    """Split ``BAG:TOPIC`` into the path and the topic, which may be "". Returns None if ``text`` names no bag."""
     parts = text.split(TOPIC)
     for i in range(len(parts), 0, -1):
         path = Path(TOPIC.join(parts[:i]))
@@ -74,9 +74,9 @@ def _reference(log: str) -> PosePath:
 def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
     """Write a trajectory in TUM format, or in KITTI format if ``path`` ends with .kitti. Returns the written files.
 
-    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory. In KITTI format, times [s] are written to
-    ``NAME.times.txt``. The times of a planar trajectory are written relative to its t = 0. A pose in KITTI format is
-    the pose of the robot (x forward, z up), not of a camera, and it is not relative to the first pose.
+    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory, for TUM format. In KITTI format, times [s] since
+    t = 0 are written to ``NAME.times.txt``. Poses in KITTI format are poses of the robot (x forward, z up), not of a
+    camera, and not relative to the first pose.
     """
     path = Path(path)
     if path.suffix != ".kitti":
@@ -147,7 +147,7 @@ def to_ros(trajectory: Trajectory | PosePath, frame_id: str = "map", t0_ns: int 
 def from_ros(messages: Any) -> PosePath:
     """Return the poses of a ``nav_msgs/Path`` message, or of a sequence of messages.
 
-    Their types may be ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``, ``TransformStamped`` or
+    The messages may be ``PoseStamped``, ``PoseWithCovarianceStamped``, ``Odometry``, ``TransformStamped`` or
     ``PointStamped``, which has no rotation. Messages of rclpy and of rosbags are accepted. Times are from the
     headers. Raises InputError with the number of an invalid message.
     """

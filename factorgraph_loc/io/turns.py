@@ -18,7 +18,7 @@ OVERLAP = 0.9  # minimum fraction of the shorter table that must overlap the oth
 
 @dataclass(frozen=True)
 class Turns:
-    """The turns of a robot over time. ``t`` (N,): times [s]. ``angle`` (N,): an angle without wrapping, in any unit."""
+    """The turns of a robot over time. ``t`` (N,): times [s]. ``angle`` (N,): the unwrapped heading, in any unit."""
 
     t: Array
     angle: Array

@@ -66,7 +66,7 @@ def bound() -> None:
 
 
 def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
-    """Return ``data`` decompressed, frame by frame. ``make`` creates the decompressor of a frame.
+    """Return ``data`` decompressed. ``make`` creates a decompressor for each part of ``data`` compressed separately.
 
     Raises ValueError if the result is too large, or if ``data`` is truncated.
     """
@@ -89,7 +89,7 @@ def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
 
 
 class _File:
-    """A file that is decompressed while it is read. Reading raises ValueError if the file unpacks to more bytes than allowed.
+    """A file that is decompressed while it is read. Reading raises ValueError if its unpacked size exceeds a limit.
 
     ``file``: the compressed file. ``content``: the decompressing stream on it.
     """

@@ -33,9 +33,9 @@ NOT_MEASURED = re.compile(r"goal|cmd|command|target|plan|initialpose", re.IGNORE
 
 INITIAL_POSE = ("/initialpose", "geometry_msgs/msg/PoseWithCovarianceStamped")
 
-# by field of an RFID read: the unit that is assumed if the name of the message field implies none
+# units of the fields of an RFID read that are assumed if the names of the message fields imply none
 IF_UNSTATED = {"phase": "rad", "frequency": "Hz", "stamp": "us"}
-# by field of an RFID read: suffixes of names that imply a unit; the longest match is used
+# for each field of an RFID read: the unit that a suffix of the name implies; the longest suffix is used
 UNITS = {"phase": ANGLES, "frequency": ENDS["frequency"], "stamp": {unit: unit for unit in ("us", "ms", "ns")}}
 
 
@@ -45,7 +45,7 @@ class TopicUse:
 
     ``messages``: number of messages.
     ``rate``: messages per second, None if there are fewer than two.
-    ``use``: the sensor that the topic serves, or ``reference``. None if the manifest does not use the topic.
+    ``use``: the sensor that measured the messages, or "reference" for ground truth. None for an unused topic.
     """
 
     topic: str
@@ -67,7 +67,8 @@ class BagManifest(Proposal):
 class Uses:
     """The proposed uses of topics.
 
-    ``options``: the settings of the reader. ``uses``: the use of each topic by its name. ``remarks``: what the user should check.
+    ``options``: options of the reader of bags. ``uses``: the use of each topic by its name. ``remarks``: hints for the
+    user.
     """
 
     options: dict[str, Any] = field(default_factory=dict)
@@ -97,7 +98,7 @@ class Uses:
 
 
 def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
-    """Propose a manifest for a bag.
+    """Propose a manifest, a TOML file that describes how to read a log, for a bag.
 
     The manifest is to be saved in ``folder`` if the bag is below ``folder``, else in the folder that contains the bag.
     Raises InputError if the bag cannot be read.
@@ -348,9 +349,10 @@ def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[st
 
 
 def range_fields(paths: Sequence[str]) -> dict[str, str]:
-    """Return the path of the landmark's name and of the range, among the ``paths`` of the fields of a message type.
+    """Find the landmark's name and the range in a message type. Return the path of each by field.
 
-    Returns an empty dictionary if one of the two fields is missing. Fields are recognised by common names.
+    ``paths``: the paths of the fields of the message type. Fields are recognised by common names. Returns an empty
+    dictionary if one of the two is missing.
     """
     distances = {p.rpartition(".")[0]: p for p in paths if _plain(p) in RANGE and p.count(LIST) <= 1}
     named = [p for p in paths if _plain(p) in LANDMARK and p.rpartition(".")[0] in distances]
@@ -361,9 +363,9 @@ def range_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
-    """Return the path of each field of an RFID read, among the ``paths`` of the fields of a message type.
+    """Find the fields of an RFID read in a message type. Return the path of each by field.
 
-    Fields are recognised by common names. A field that the message type lacks is left out.
+    ``paths``: the paths of the fields of the message type. Fields are recognised by common names.
     """
     usable = [path for path in paths if path.count(LIST) <= 1 and not path.startswith("header.")]
     out = {}

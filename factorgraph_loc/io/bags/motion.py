@@ -157,7 +157,7 @@ class YawRates:
         self.add = self._rows.add
 
     def stream(self, reading: Reading) -> YawRateStream:
-        """Return the turn rates about the robot's z axis. An IMU axis that is perpendicular to the robot's z axis may be NaN.
+        """Return the turn rates about the robot's z axis. Rates about perpendicular axes of the IMU may be NaN.
 
         ``reading``: has the absolute time of t = 0 in the stream, and a list for warnings.
         """

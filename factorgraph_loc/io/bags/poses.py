@@ -101,7 +101,8 @@ def seven(pose: Any, position: str = "position", orientation: str = "orientation
 def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
     """Return the rotations (N, 3, 3) of a ``table`` (N, 7) of positions x, y, z and quaternions x, y, z, w.
 
-    Raises InputError, with ``source`` and the row of ``rows`` (N,), if a number is not finite or a norm is not 1.
+    Raises InputError if a number is not finite or a quaternion is not a unit quaternion. ``rows`` (N,): row numbers in
+    ``source``, for the message.
     """
     checks.require_finite(source, rows, SEVEN, table)
     return rotations_of(source, rows, table[:, 3:])
@@ -138,7 +139,7 @@ def upward(parents: Mapping[str, str], frame: str) -> list[str]:
 
 
 class StaticFrames:
-    """Collects static transforms.
+    """Collects the static transforms between the coordinate frames of a bag.
 
     ``base``: the frame of the robot. ``parents``: the parent of each frame. ``poses``: the pose (4, 4) of each frame in its parent.
     """

@@ -122,7 +122,7 @@ add_fields(
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """Return the log in a bag. Its t = 0 is the first odometry message.
+    """Read the log in a bag. Its t = 0 is the time of the first odometry message.
 
     Raises InputError with the bag, topic, message and field of an invalid value.
     """

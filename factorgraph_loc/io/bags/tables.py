@@ -180,7 +180,7 @@ class Reads(RowsOfTopic):
         self._antenna_of_message = None  # extracts the antenna name of a message without reads
         if options.antenna is None and LIST not in options.fields["antenna"]:
             self._antenna_of_message = Fields(bag, bag.topic(options.topic), {"antenna": options.fields["antenna"]})
-        self._number: list[int] = []  # by read: the index of its round
+        self._number: list[int] = []  # the index of the round of each read
         self._rounds: list[tuple[int, slice, str]] = []  # timestamp of the message [ns], rows of its reads, antenna
 
     def add(self, item: Stamped, t_ns: int) -> None:

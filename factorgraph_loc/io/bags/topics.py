@@ -51,7 +51,7 @@ class TopicSettings(FileModel):
 
 
 class RowTopic(TopicSettings, RowRules):
-    """The settings of topics whose messages may be skipped or sorted."""
+    """The settings of topics with optional skipping of invalid messages and sorting of late ones."""
 
 
 class Fields:
@@ -266,7 +266,7 @@ class Listeners:
         self._of: dict[str, list[tuple[Stamper | None, Gatherer]]] = {}
 
     def stamper(self, topic: str, clock: Clock | None) -> Stamper:
-        """Return the source of timestamps for a topic. ``clock``: the topic's setting, None for the clock of the bag."""
+        """Return the :class:`Stamper` of a topic. ``clock``: the setting of the topic, None for the setting of the bag."""
         return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
 
     def add(self, topic: str, gatherer: Gatherer, stamper: Stamper | None = None) -> None:

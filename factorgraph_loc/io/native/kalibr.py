@@ -50,10 +50,10 @@ def is_chain(text: str) -> bool:
 
 
 def read_camera(text: str) -> tuple[dict[str, Any], list[str]]:
-    """Return the section ``[camera]`` of a rig, and remarks on what the user has to check.
+    """Read a camera of a Kalibr camera chain. Return the section ``[camera]`` of a rig file, and remarks for the user.
 
-    ``text``: the file of the chain, as ``FILE:cam1`` with the name of one of several cameras. Raises InputError with
-    file and key if the file is invalid, or if the rig has no such lens.
+    ``text``: the file of the chain; ``FILE:cam1`` selects one of several cameras. Raises InputError if the file is
+    invalid or the lens model is not supported.
     """
     file, _, name = (text, "", "") if text.endswith(SUFFIXES) else text.rpartition(":")
     path = Path(file)
@@ -94,7 +94,7 @@ def _camera(path: Path, name: str, content: Mapping[str, Any]) -> ChainCamera:
 
 
 def _lens(path: Path, name: str, camera: ChainCamera) -> dict[str, Any]:
-    """Return the settings of a rig for the lens of ``camera``. Raises InputError if no lens of a rig has the camera's model."""
+    """Return the lens of ``camera`` as settings of a rig. Raises InputError if the lens model is not supported."""
     if camera.camera_model != MODEL:
         raise bad_field(path, f"{name}.camera_model", camera.camera_model, MODEL)
     if camera.distortion_model not in LENSES:

@@ -43,10 +43,10 @@ class Options(FileModel):
 
 
 class RunFile(RowRules):
-    """The content of ``run.toml``.
+    """The content of ``run.toml``, the main file of a log in the native format.
 
-    ``rig``, ``world``: a table, or a file name relative to the folder. ``has_heading``: False if the headings of the reference are
-    meaningless. ``start``: a known start. ``metadata``: further values of any kind, which are stored with the log.
+    ``rig``, ``world``: the robot and the map, as a table or a file name. ``has_heading``: False if the headings of the
+    reference trajectory are invalid. ``start``: a known start pose. ``metadata``: values that are stored with the log.
     """
 
     PLACE: ClassVar[str] = RUN_FILE
@@ -59,7 +59,7 @@ class RunFile(RowRules):
 
 
 def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every reader takes options
-    """Return the log in the folder ``path``. Its t = 0 is the first timestamp of the tables.
+    """Read a log in the native format from the folder ``path``. Its t = 0 is the first timestamp of the tables.
 
     Raises InputError with file, row and field of an invalid value.
     """

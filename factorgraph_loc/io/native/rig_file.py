@@ -40,7 +40,7 @@ UNCALIBRATED = {"scale_distance": 0.03, "scale_rotation": 0.05, "heading_drift":
 
 
 def default_rig(streams: Iterable[str]) -> Rig:
-    """Return the default rig for a log with these ``streams``. Several sensors of one kind have the same settings."""
+    """Return default settings of the robot and its sensors, for a log that describes none. ``streams``: its sensors."""
     named = [name for name in streams if kind_of(name) != name and DEFAULT_RIG.section(kind_of(name)) is not None]
     if not named:
         return DEFAULT_RIG
@@ -50,7 +50,7 @@ def default_rig(streams: Iterable[str]) -> Rig:
 
 
 def read_rig(path: str | Path) -> Rig:
-    """Read a rig from ``NAME.rig.toml``, and files that it names from the same folder.
+    """Read a rig, the settings of a robot and its sensors, from ``NAME.rig.toml`` and the files that it names.
 
     Raises InputError with the file, the key and the expected value.
     """

@@ -77,8 +77,8 @@ def load(
 ) -> list[Log]:
     """Return the logs that ``log`` refers to.
 
-    ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a log.
-    With ``reader``, any path that the reader can read.
+    ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a
+    ``Log``, which is returned. With ``reader``, any path that the reader can read.
     ``options``: options of the reader, overriding the manifest. A list, or a text with commas, gives one log
     per value. ``rig``, ``world``: values or files that replace the rig and the world of the log.
     ``data_root``: the folder of data sets; by default the environment variable FGLOC_DATA.

@@ -95,7 +95,7 @@ def is_present(manifest: Manifest, file: Path, data_root: str | Path | None) -> 
 
 
 def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]:
-    """Return a line about each file in the checksums of a manifest that is missing or modified."""
+    """Compare files with the checksums in a manifest. Return a line about each missing or modified file."""
     if not manifest.checksums:
         return []
     root = find_data_root(data_root, manifest.title)

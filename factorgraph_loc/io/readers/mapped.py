@@ -40,32 +40,32 @@ RATE = replace(IMU["w"], may_lack=True)  # turn rate about one of three axes, wh
 
 
 class NamesFile(ColumnMapping):
-    """A table that translates names. ``columns`` maps ``file_name``, a name in the table of a sensor, and ``name``, the
-    name in the map."""
+    """Settings of a table that translates names. The fields in ``columns`` are ``file_name``, a name in the table of a
+    sensor, and ``name``, the name in the map."""
 
 
 class NamedFile(TimedMapping):
-    """A table of a sensor whose rows name an object of the map, such as a landmark."""
+    """Settings of a table of a sensor. Each row of the table names an object of the map, such as a landmark."""
 
     names: NamesFile | None = None
     """table that translates the names in the file to those in the map; rows with names that it lacks are skipped"""
 
 
 class ImuFile(TimedMapping, Turned):
-    """The table of an IMU. ``columns`` maps t and w, the turn rate about the vertical axis; or t, wx, wy and wz, the
-    angular velocity in the frame of the IMU, whose orientation is given by ``axes`` and ``mounting``."""
+    """Settings of the table of an IMU. The fields in ``columns`` are t and w, the turn rate about the vertical axis; or
+    t, wx, wy and wz, the angular velocity in the IMU frame. ``axes`` and ``mounting`` give its orientation."""
 
 
 class ImageFile(TimedMapping):
-    """The table of images."""
+    """Settings of the table of images."""
 
     folder: str = "."
     """folder of the images, by default the folder of the log"""
 
 
 class Options(FileModel):
-    """The tables of a log. ``rfid`` describes the reads of one RFID reader. ``readers`` replaces it for several RFID
-    readers, each with a name that the user chooses."""
+    """Settings of all tables of a log. ``rfid``: the reads of one RFID reader. ``readers``: the reads of several RFID
+    readers, by names that the user chooses."""
 
     odometry: OdometryFile | None = None
     imu: ImuFile | None = None
@@ -94,7 +94,7 @@ add_fields(Options, {name: (_type_of(name), None) for name in OTHERS}, after="ca
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """Return the log in the folder ``path``. Its t = 0 is the first timestamp of the sensors.
+    """Read the log in the folder ``path``. Its t = 0 is the first timestamp of the sensors.
 
     Raises InputError with file, row and column of an invalid value.
     """
@@ -208,7 +208,7 @@ def _names(path: Path, naming: NamesFile) -> dict[str, str]:
 
 
 def _fields(table: Table, mapping: TimedMapping) -> tuple[str, ...]:
-    """Return the fields to read: those that a table requires, and optional ones that ``mapping`` maps."""
+    """Return the fields to read: all that ``table`` requires, and the optional ones that ``mapping`` has."""
     return "t", *(c.name for c in table.columns[1:] if not c.may_lack or c.name in mapping.columns)
 
 

@@ -87,7 +87,7 @@ class Channels(FileModel):
 
 @cache
 def presets() -> dict[str, dict[str, dict[str, str]]]:
-    """Return the ``columns`` and ``units`` of the files of known RFID tools, by the name of the preset."""
+    """Return the settings ``columns`` and ``units`` for the files of known RFID tools, by the name of the tool."""
     content: dict[str, dict[str, dict[str, str]]] = read_toml(shipped.readers()["mapped"])
     return content
 
@@ -266,7 +266,7 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[Notice]) -> TableRows:
     """Return the table with a second read, without a signal strength, for each row that summarizes several reads.
 
-    The second read is the last of the row. The number of reads that are lost in between is appended to ``warnings``.
+    The second read is the last of the row. A warning about the reads in between, which have no timestamps, is appended.
     """
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):

@@ -32,9 +32,9 @@ from factors.se2 import Array
 # number of columns by array of the file: odometry (DR), ranges (TD), ground truth (GT) and beacons (TL)
 FIELDS = {"DR": 3, "TD": 4, "GT": 4, "TL": 3}
 
-# by run: rad added to the heading of the reference, so that positive distances are forward
+# for each run: rad added to the heading of the reference, so that positive distances are forward
 HEADING_OFFSET = {1: 0.0, 2: math.pi}
-# by run: the reference of run 1 has no measured heading, because its heading is integrated from the odometry
+# for each run: whether the heading of the reference is measured; in run 1 it is integrated from the odometry
 HAS_HEADING = {1: False, 2: True}
 
 
@@ -131,7 +131,7 @@ def beacons(source: str, table: Array) -> World:
 
 def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> IncrementStream:
     """Return the rows ``driven`` of odometry as increments. If they begin after ``t0_ns``, a row without motion is
-    added at ``t0_ns``. Composed rows add a warning to ``warnings``."""
+    added at ``t0_ns``. If rows have equal timestamps, they are composed and a warning is appended to ``warnings``."""
     moves = np.column_stack((driven.numbers["dx"], np.zeros(len(driven.rows)), driven.numbers["dtheta"]))
     t_ns, moves = checks.increments_in_order(driven.path, driven.rows, driven.t_ns, moves, warnings)
     if t_ns[0] > t0_ns:

@@ -35,7 +35,7 @@ ROWS = {
     "EDGE_SE2": "t FROM TO x y theta cxx cxy cxt cyy cyt ctt",
     "EDGE_RANGE": "t POSE LANDMARK range variance",
 }
-DIFFERENT = 1.5  # maximum ratio of the largest to the smallest variance; above it, the use of their median is a warning
+DIFFERENT = 1.5  # a larger ratio of the largest to the smallest variance gives a warning that the median is used
 
 
 class Options(FileModel):
@@ -43,9 +43,9 @@ class Options(FileModel):
 
 
 def read(path: Path | None, _options: Options) -> Log:
-    """Return the log of a file. Its t = 0 is the first pose.
+    """Read a log from a PyFactorGraph file. Its t = 0 is the time of the first pose.
 
-    Raises InputError with file and row of an invalid value, and of a row that does not belong to one robot in the plane.
+    Raises InputError at an invalid value, and at a row that does not belong to a single robot in the plane.
     """
     if path is None:
         raise InputError("the reader pyfg needs the path of a file")
