@@ -25,23 +25,20 @@ from factors.rfid.detection import RfidLikelihood, TagReadCounts
 from factors.rfid.kernels import FAST
 from factors.se2 import Array
 
-COARSE = 3  # size of cells, in position and height, divided by the size of cells in the antennas' tables
-FACINGS = 24  # number of facing directions of tags
-UNREAD = (
-    1e-3  # a tag is out of range if no antenna has a probability of a read that is this much above that of a false read
-)
-MOST_LOOKS = 1 << 16  # largest number of measurements of a path; measurement k has the same random numbers on all paths
+COARSE = 3  # cell size of the tables, as a multiple of the cell size in the tables of the particle filter
+FACINGS = 24  # number of directions in which a tag can face
+UNREAD = 1e-3  # a tag is out of range if no read probability exceeds that of a false read by more than this
+MOST_LOOKS = 1 << 16  # maximum number of rounds on a path
 
 
 class ScanTables(NamedTuple):
-    """Tables of the response of A antennas to T tags, for simulated scans, made of :class:`~factors.rfid.places.RobotTables`.
+    """Probabilities that A antennas read a tag, in C cells of its pose in the robot frame, and the T tags of the map.
 
-    A table has C = H F S S cells: H heights, F facings (the last for an unknown one), and S x S positions in the robot
-    frame. ``read`` (C, A): probability q of a read. ``gain`` (A, C): log(q / (1 - q)).
-    ``missed`` (C,): sum over antennas of log(1 - q), minus its value for a tag out of range.
-    ``silent`` (C,): sum over antennas of log(1 - q), 0 out of range.
-    ``size``: S. ``layers``: F. ``cell``: size of a cell [m].
-    ``points`` (T, 2) [m] and ``facing`` (T,) [rad], NaN if unknown: the tags. ``first`` (T,): first cell of each tag's height.
+    The cells are H heights x F facings x S x S positions. The last facing is for tags with an unknown facing. ``read``
+    (C, A): the probability q of a read. ``gain`` (A, C): log(q / (1 - q)). ``missed`` (C,): the sum of log(1 - q) over
+    antennas, minus that sum for a tag out of range. ``silent`` (C,): the sum of log(1 - q), 0 if out of range.
+    ``size``: S. ``layers``: F. ``cell``: the size of a cell [m]. ``points`` (T, 2) [m]: positions of the tags.
+    ``facing`` (T,) [rad]: their facings, NaN if unknown. ``first`` (T,): the first cell of the height of each tag.
     """
 
     read: Array32
@@ -57,7 +54,7 @@ class ScanTables(NamedTuple):
 
 
 def make_tables(likelihood: RfidLikelihood) -> ScanTables:
-    """Return the tables of a detection model and its map of tags."""
+    """Return the tables of the detection model and of the map of tags in ``likelihood``."""
     tables, tags = likelihood.robot_tables(COARSE, FACINGS), likelihood.tags
     antennas, _, layers, size, _ = tables.gain.shape
     gain, missed = tables.gain.reshape(antennas, -1), tables.missed.sum(axis=0).ravel()
@@ -70,8 +67,8 @@ def make_tables(likelihood: RfidLikelihood) -> ScanTables:
 
 @compiled
 def _uniform(seed: np.uint64, number: int) -> float:
-    """Return a uniform random number that only depends on ``seed`` and its index ``number``, so that it is the same for
-    all candidate paths (SplitMix64: Steele, Lea, Flood, OOPSLA 2014)."""
+    """Return the uniform random number with the index ``number`` in the sequence of ``seed``. Source (SplitMix64):
+    Steele, Lea, Flood, OOPSLA 2014."""
     z = seed + np.uint64(number + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -81,8 +78,8 @@ def _uniform(seed: np.uint64, number: int) -> float:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
-    """Write the table cell of tag ``t`` at each of the robot's ``poses`` (M, 3) to ``out`` (M,). ``turns`` (2, M):
-    cosine and sine of the headings."""
+    """Compute the cell of tag ``t`` at each robot pose in ``poses`` (M, 3), and write it to ``out`` (M,). ``turns``
+    (2, M): cosines and sines of the headings."""
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
@@ -114,17 +111,18 @@ def log_weights(
     tempering: float,
     out: Array32,
 ) -> None:
-    """Simulate scans from the first J = ``scans`` particles on one path. Write to ``out[j, m]`` the tempered
-    log-likelihood of particle m, given the scans from particle j.
+    """Simulate the reads of each of the first J = ``scans`` particles, and compute how likely they are for all M
+    particles.
 
-    ``poses`` (S, M, 3): poses of M particles at S stops. ``rounds`` (S,): inventory rounds at each stop. ``stops`` (M,): number
-    of stops of each particle. ``out`` (J, M). ``seed``: determines the random reads. ``tempering``: exponent of the likelihood.
+    ``out`` (J, M): receives the log-likelihood of particle m for the reads of particle j. ``poses`` (S, M, 3): the
+    poses of the particles at S stations of a path. ``rounds`` (S,): the number of rounds at each station. ``stops``
+    (M,): the number of stations that each particle reaches. ``tempering``: exponent of the likelihood.
     """
     steps, count, _ = poses.shape
     tags = len(tables.points)
     missed = tables.missed
     cells = np.empty((steps, tags, count), np.int32)
-    # log-likelihood of scans without any read, cumulated over the stops
+    # log-likelihood of no reads at the first k stations
     silence = np.zeros((steps + 1, count), np.float32)
     turns = np.empty((2, count), np.float32)
     for k in range(steps):
@@ -149,8 +147,8 @@ def log_weights(
 def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
-    """Draw the random reads of each scan, and add their log-likelihoods to ``out``. ``cells``: the table cell of each
-    tag and pose. The other arguments are those of :func:`log_weights`."""
+    """Draw random reads, and add their log-likelihoods to ``out``. ``cells`` (S, T, M): the cell of each tag at each
+    pose. The other arguments are those of :func:`log_weights`."""
     steps, tags, count = cells.shape
     antennas = tables.read.shape[1]
     gain = tables.gain
@@ -165,7 +163,7 @@ def _add_reads(
                 if k >= stops[n] or silent == 0.0:
                     continue
                 left = _uniform(seed, (n * MOST_LOOKS + k) * tags + t)
-                # the first test avoids most calls of exp(x), which is at least 1 + x
+                # exp(x) >= 1 + x, so that the first test avoids most calls of exp
                 if left < 1.0 + silent or left < math.exp(silent):
                     continue
                 for a in range(antennas):
@@ -182,8 +180,8 @@ def _add_reads(
 
 @compiled
 def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
-    """Draw the number of ``count`` rounds that read a tag with probability ``q``, by inversion of ``uniform``. Also
-    returns what is left of ``uniform``, which is again uniform in 0 to 1."""
+    """Return a binomial random number for ``count`` trials with probability ``q``, by inversion of the uniform random
+    number ``uniform``. Also return a new uniform random number, which is independent of the result."""
     p = (1.0 - q) ** count
     k = 0
     while uniform >= p and k < count:
@@ -195,8 +193,8 @@ def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
 
 @dataclass(frozen=True, eq=False)
 class RfidForecast:
-    """Predicts the information of inventory rounds on candidate paths. It implements
-    :class:`~factorgraph_loc.sensors.interfaces.Forecast`. ``rounds_per_metre``: rounds of each antenna per metre of path."""
+    """Predicts the information of RFID reads on candidate paths. It implements
+    :class:`~factorgraph_loc.sensors.interfaces.Forecast`. ``rounds_per_metre``: rounds of each antenna per metre."""
 
     likelihood: RfidLikelihood
     rounds_per_metre: float = 4.0
@@ -211,8 +209,8 @@ class RfidForecast:
         return make_tables(self.likelihood)
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Return the expected information (N, 3, 3) at ``poses`` (N, 3). It is proportional to the number of rounds on
-        the path lengths ``ways`` (N,) [m]."""
+        """Return the expected Fisher information (N, 3, 3) of reads on ``poses`` (N, 3). ``ways`` (N,): the length [m]
+        of the path segment of each pose, to which the number of rounds is proportional."""
         count = len(self.likelihood.model.antennas)
         hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
         one_round = TagReadCounts(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
@@ -220,8 +218,8 @@ class RfidForecast:
         return np.asarray((self.rounds_per_metre * ways)[:, None, None] * score)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Add log-likelihoods of simulated scans to ``out``. The rounds of the path are distributed evenly over the
-        poses. See :class:`~factorgraph_loc.sensors.interfaces.Forecast`."""
+        """Simulate reads from particles, and add their log-likelihoods to ``out``. See
+        :meth:`~factorgraph_loc.sensors.interfaces.Forecast.add_log_weights`."""
         steps, total = len(poses), round(metres * self.rounds_per_metre)
         rounds = np.diff(np.arange(steps + 1) * total // steps).astype(np.int64)
         added = np.empty_like(out)
@@ -231,8 +229,8 @@ class RfidForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> RfidForecast | None:
-    """Return the forecast for a robot that drives at ``speed`` [m/s]. ``settings``: the settings of the simulation,
-    which include the rate of rounds. Returns None without antennas or tags."""
+    """Return the forecast for a robot that drives at ``speed`` [m/s], or None without antennas or tags. ``settings``:
+    settings of the simulation, which include the number of rounds per second."""
     if rig.find(RfidSettings) is None or not world.tags:
         return None
     likelihood = RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags)

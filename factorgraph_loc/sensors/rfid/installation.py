@@ -1,8 +1,8 @@
 """The antennas and tags of a run: antennas on the robot and tags in the map, or the reverse.
 
-The antennas of a reader may be fixed in the building, for example at gates. The map then has the antennas, and the rig has the
-tags on the robot. :func:`installed` puts these antennas into the rig and these tags into the world, where all modules of this
-package expect them. Antennas have their poses in the world then, and tags in the robot frame.
+The antennas of a reader may be fixed in the building, for example at gates. The map then has the antennas, and the rig
+has the tags on the robot. :func:`installed` puts these antennas into the rig and these tags into the world, where all
+modules of this package expect them. Antennas have their poses in the world then, and tags in the robot frame.
 """
 
 from collections.abc import Mapping
@@ -26,10 +26,11 @@ Run = TypeVar("Run", Log, Setup, Ride)
 
 
 def installed(run: Run) -> Run:
-    """Return a log, setup or ride whose rig has all antennas, and whose world has the tags that they may read.
+    """Return a copy of ``run`` that describes antennas in the building as antennas of the rig.
 
-    A rig with antennas of its own is not changed. Raises InputError if the map has no antennas, if an antenna has an unknown
-    detection model, or if a tag on the robot is also in the map.
+    If the tags are on the robot, the antennas of the map are added to the rig, and the tags of the rig become the tags
+    of the map. A rig with antennas on the robot is not changed. Raises InputError if the map has no antennas, if an
+    antenna has an unknown detection model, or if a tag on the robot is also in the map.
     """
     settings = run.rig.find(RfidSettings)
     if settings is None or not settings.tags or settings.antennas:
@@ -56,14 +57,14 @@ def installed(run: Run) -> Run:
 
 
 def is_fixed(rig: Rig) -> bool:
-    """True if the antennas are fixed in the building, and the tags are on the robot."""
+    """Return True if the antennas are fixed in the building, and the tags are on the robot."""
     settings = rig.find(RfidSettings)
     return settings is not None and bool(settings.tags)
 
 
 def check(use: Use) -> Use:
-    """Check the antennas of a log before a run. Raises InputError if a fixed antenna of the log is not in the map, or if the rig
-    has antennas of its own although those of the log are fixed."""
+    """Return ``use`` unchanged. Raises InputError if an antenna of the log is not in the map although the tags are on
+    the robot, or if it is in the map although the rig has antennas on the robot."""
     settings, stream = use.log.rig.find(RfidSettings), use.log.streams.get("rfid")
     if settings is None or "rfid" not in use.sensors or not isinstance(stream, RfidStream):
         return use
@@ -83,8 +84,8 @@ def check(use: Use) -> Use:
 
 
 def draw(log: Log) -> Marks:
-    """Return what a viewer shows, and the times of reads: the tags of the map after the rig's survey transform, or the fixed
-    antennas."""
+    """Return the marks of the tags of the map for plots and viewers, with the times of reads. If the tags are on the
+    robot, return the marks of the antennas in the building."""
     stream, fixed = log.streams.get("rfid"), is_fixed(log.rig)
     t, names = np.empty(0), tuple[str, ...]()
     if isinstance(stream, RfidStream):

@@ -30,21 +30,19 @@ from factors.rfid.signals import (
 from factors.rfid.tag_states import FARTHEST, TagStates, sigma_poses
 from factors.se2 import Array, Integers
 
-# s; a read changes the state of its tag only after this time, because a wrong track becomes suspicious earlier
-CONFIRMED = 1.0
-CLEAR = math.log(0.99 / 0.01)  # log-odds of a tag that is clearly dead, weak or moved
-WIDENED = 4.0  # factor of the pose's sigmas for evidence on tags, because consecutive scans share the pose error
+CONFIRMED = 1.0  # s; a read updates the state of a tag only after this time, in which a wrong pose is detected
+CLEAR = math.log(0.99 / 0.01)  # minimum log-odds of a tag that is clearly dead, weak or moved
+WIDENED = 4.0  # multiplies the standard deviations of the pose, because successive scans share its error
 STANDING = np.zeros(3)  # velocity of a robot at rest
-PASS_SIGMA = 0.1  # m; standard deviation of a pose that is determined by driving past one tag
-EXACT = 0.2  # a survey is treated as exact if its sigma is below this fraction of PASS_SIGMA
+PASS_SIGMA = 0.1  # m; standard deviation of the position estimated by driving past one tag
+EXACT = 0.2  # a survey is treated as exact if its standard deviation is below this fraction of PASS_SIGMA
 
 
 def trust(sigmas: Array) -> float:
-    """Return the exponent, at most 1, of the likelihood of tags whose surveyed positions have standard deviations
-    ``sigmas`` (T,) [m].
+    """Return an exponent, at most 1, by which the likelihood of reads accounts for survey errors of the tags.
 
-    The survey error of a tag is the same in all its reads, so it does not average out. Driving past a tag determines
-    the pose with the variance :data:`PASS_SIGMA` squared. With an inexact survey the variance is the sum of both.
+    ``sigmas`` (T,): standard deviations [m] of the surveyed positions. All reads of a tag share its survey error. The
+    variance after driving past a tag is therefore its survey variance plus the square of :data:`PASS_SIGMA`.
     """
     counted = np.where(sigmas > EXACT * PASS_SIGMA, sigmas, 0.0)
     return float(np.mean(1.0 / (1.0 + (counted / PASS_SIGMA) ** 2))) if len(sigmas) else 1.0
@@ -52,9 +50,8 @@ def trust(sigmas: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class TagMap:
-    """The T tags of a map. ``names``: their EPCs. ``tags``: positions and facings in the world frame, after the survey
-    transform. ``index``: the index of each EPC. ``sigmas`` (T,): standard deviations [m] of the surveyed positions
-    along an axis."""
+    """The T tags of a map. ``names``: the EPCs. ``tags``: positions and facings in the world frame. ``index``: the
+    index of each tag by its EPC. ``sigmas`` (T,): standard deviations [m] of the surveyed positions, per coordinate."""
 
     names: tuple[str, ...]
     tags: TagArray
@@ -63,8 +60,8 @@ class TagMap:
 
 
 def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None = None) -> TagMap:
-    """Return the tags of a map, or only the tags with an EPC in ``names``. ``survey``: the transform from the survey to
-    the world."""
+    """Return the tags of the map ``world``, or only the tags with the EPCs ``names``. ``survey``: the transform from
+    the frame of the survey to the world frame."""
     chosen = {name: tag for name, tag in world.tags.items() if names is None or name in names}
     points = np.array([(tag.x, tag.y, tag.z) for tag in chosen.values()]).reshape(-1, 3)
     facing = np.array([np.nan if tag.facing is None else tag.facing for tag in chosen.values()])
@@ -75,13 +72,13 @@ def tag_map(world: World, survey: SurveySettings, names: Collection[str] | None 
     return TagMap(tuple(chosen), tags, {name: i for i, name in enumerate(chosen)}, sigmas)
 
 
-MARGIN = 1.0  # m; largest distance of the robot from the bounding box of walls and tags
-MARGIN_OF_TAGS = 3.0  # m; largest distance of the robot from the bounding box of the tags if there are no walls
+MARGIN = 1.0  # m; maximum distance of the robot from the bounding box of walls and tags
+MARGIN_OF_TAGS = 3.0  # m; maximum distance of the robot from the bounding box of the tags if there are no walls
 
 
 def extent(world: World, places: Array) -> Array:
-    """Return the area where the robot may be, as lower and upper corner (2, 2) [m]: the bounding box of walls and ``places`` (N,
-    2) with a margin. ``places`` are the tags of the map or the fixed antennas. Both corners are zero without walls and places."""
+    """Return the lower and the upper corner (2, 2) [m] of the area where the robot may be. This is the bounding box of
+    walls and ``places`` (N, 2) with a margin, or zeros without walls and places."""
     ends = np.array(world.walls).reshape(-1, 2)
     margin = MARGIN if len(ends) else MARGIN_OF_TAGS
     points = np.concatenate((ends, places))
@@ -97,11 +94,11 @@ def whole_scans(log: Log) -> list[RfidScan]:
 
 @dataclass(frozen=True, eq=False)
 class TagEvidence:
-    """The evidence of a scan on the states of tags: as surveyed, weak, moved or dead.
+    """Evidence from a scan for the state of each of U tags, which may be as surveyed, weak, moved or dead.
 
-    ``tags`` (U,): indices in the map. ``log_likelihoods`` (U, S): log-likelihoods of the scan's reads and misses for S
-    hypotheses of each tag's state, see :meth:`~factors.rfid.tag_states.TagStates.expect`. ``is_read`` (U,): True for
-    tags that the scan read.
+    ``tags`` (U,): indices of the tags in the map. ``log_likelihoods`` (U, S): the log-likelihood of the reads and
+    misses of each tag if it is in each of S states, see :meth:`~factors.rfid.tag_states.TagStates.expect`. ``is_read``
+    (U,): True for tags that were read.
     """
 
     tags: Integers
@@ -110,11 +107,11 @@ class TagEvidence:
 
 
 class KnownTags:
-    """Turns scans into read counts of the map's tags. Unknown tags and antennas are counted as ignored in the diagnostics.
-    ``setup``: the result of :func:`~factorgraph_loc.sensors.rfid.installation.installed`.
+    """Converts scans to counts of reads of the tags in the map, and estimates if tags are dead, weak or moved.
 
-    It also estimates the ``states`` of the tags. A read shows that a tag is not dead. All other evidence of a scan requires a
-    known pose (:meth:`weigh_states`, :meth:`learn`). Tags that are probably dead, weak or moved are listed in the diagnostics.
+    ``setup``: the result of :func:`~factorgraph_loc.sensors.rfid.installation.installed`. ``diagnostics``: counts reads
+    that are ignored because the tag or antenna is unknown, and lists tags that are probably dead, weak or moved.
+    ``states``: the estimated states of the tags. They are updated by :meth:`learn`, which requires a known pose.
     """
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics) -> None:
@@ -125,13 +122,12 @@ class KnownTags:
         model, self.trust = settings.model(), trust(self.map.sigmas)
         self._tempering = model.tempering
         self.likelihood = RfidLikelihood(replace(model, tempering=model.tempering * self.trust), self.map.tags)
-        moved = 0.0 if model.fixed else settings.moved_tags  # a tag on the robot is where the rig has it
+        moved = 0.0 if model.fixed else settings.moved_tags  # tags on the robot do not move
         self.states = TagStates(len(self.map.names), settings.dead_tags, settings.weak_tags, moved)
-        self._sources = (
-            ("map", "on the robot") if model.fixed else ("rig", "in the map")
-        )  # of the antennas and of the tags
-        self._excluded: set[int | None] = set()  # indices of antennas that are dead
-        self._waiting: deque[tuple[float, Integers, Array]] = deque()  # evidence of reads younger than CONFIRMED
+        # for messages: where the antennas are listed, and where the tags are
+        self._sources = ("map", "on the robot") if model.fixed else ("rig", "in the map")
+        self._excluded: set[int | None] = set()  # indices of dead antennas
+        self._waiting: deque[tuple[float, Integers, Array]] = deque()  # evidence from reads in the last CONFIRMED s
 
     @property
     def antennas(self) -> Sequence[str]:
@@ -140,12 +136,12 @@ class KnownTags:
 
     @property
     def surveyed(self) -> Array:
-        """The positions (N, 2) [m] of the tags of the map, or of the fixed antennas."""
+        """The positions (N, 2) [m] of the tags in the building, or of the antennas if the tags are on the robot."""
         model = self.likelihood.model
         return np.array([(a.x, a.y) for a in model.antennas]) if model.fixed else self.map.tags.points[:, :2]
 
     def exclude(self, antenna: int) -> str:
-        """Ignore the rounds of a dead antenna until it reads a tag. Returns its name."""
+        """Ignore the rounds of the antenna with this index until it reads a tag. Returns the name of the antenna."""
         self._excluded.add(antenna)
         self._rounds = {}
         return self.antennas[antenna]
@@ -157,11 +153,11 @@ class KnownTags:
             self.likelihood = self.likelihood.tempered(new)
 
     def read_counts(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
-        """Return reads and misses of the map's tags by the rig's antennas, relative to the pose at the scan's time.
-        Returns None if the map has no tags or no antenna is known.
+        """Return the reads and misses of a scan, as a function of the pose at the time of the scan. Returns None if the
+        map has no tags, or if the rig has none of the antennas.
 
-        ``twist`` (3,): velocity of the robot. ``count``: False if the scan will be processed again. Ignored reads are
-        not counted then.
+        ``twist`` (3,): the velocity of the robot. ``count``: False if the same scan will be processed again, so that
+        the diagnostics must not count its ignored reads.
         """
         diagnostics = self._diagnostics if count else Diagnostics()
         if self._excluded:
@@ -179,7 +175,7 @@ class KnownTags:
             return None
         reads: list[tuple[int, int]] = []
         unknown = 0
-        # a tag that was read several times in one round counts once
+        # several reads of a tag in one round count as one
         for number, name in dict.fromkeys(zip(m.antenna.tolist(), m.tags, strict=True)):
             place = self.map.index.get(name)
             if place is None:
@@ -195,30 +191,30 @@ class KnownTags:
         hits = np.zeros((len(used), len(tags)), dtype=np.int64)
         np.add.at(hits, (at, np.searchsorted(tags, places)), 1)
         odds = self.states.odds[tags]
-        # reads of a tag that has probably moved have no information on an unknown pose
+        # the read of a tag that has probably moved (odds above 0) gives no information on an unknown pose
         elsewhere = np.where(hits.any(axis=0) & (odds <= 0.0), -np.inf, 0.0)
         prior = self.states.prior
         twists = np.tile(twist, (len(used), 1))
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """Return the evidence of reads and misses ``counts`` on the states of tags in range.
+        """Return the evidence from the reads and misses ``counts`` for the states of the tags in range.
 
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the predicted pose of the robot. ``parameters`` (Q,):
-        estimated parameters of the likelihood.
+        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimated pose before the scan corrects it.
+        ``parameters`` (Q,): the estimated parameters of the likelihood.
         """
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
         return TagEvidence(*self.likelihood.displaced(poses, counts, *places))
 
     def with_states(self, counts: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
-        """Return the counts with the probabilities of dead, weak and moved tags. ``evidence``: the evidence of the same
-        scan."""
+        """Return a copy of ``counts`` with the present probabilities that tags are dead, weak or moved. ``evidence``:
+        the result of :meth:`weigh_states` for the same scan."""
         elsewhere = self.states.expect(evidence.tags, evidence.log_likelihoods)
         return counts.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
-        """Return ``reads`` without the effect of tags that are clearly dead, weak or moved."""
+        """Return a copy of ``reads`` in which tags that are clearly dead, weak or moved have no effect."""
         clear = self.states.odds[reads.tags] > CLEAR
         if not clear.any():
             return reads
@@ -227,8 +223,8 @@ class KnownTags:
         )
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
-        """Update the states of tags by the evidence of a scan at ``t`` [s]. Misses are used immediately. Reads are used
-        after :data:`CONFIRMED` seconds."""
+        """Update the states of tags with the evidence from a scan at ``t`` [s]. Evidence from reads is only used after
+        :data:`CONFIRMED` seconds."""
         is_read, tags, log_likelihoods = evidence.is_read, evidence.tags, evidence.log_likelihoods
         self.states.learn(t, tags[~is_read], log_likelihoods[~is_read])
         self._waiting.append((t, tags[is_read], log_likelihoods[is_read]))
@@ -237,13 +233,13 @@ class KnownTags:
         self._report_suspects()
 
     def forget(self, since: float) -> None:
-        """Undo all updates of the tags' states since the time ``since`` [s]."""
+        """Undo all updates of the states of tags since the time ``since`` [s]."""
         self.states.forget(since)
         self._waiting = deque(row for row in self._waiting if row[0] < since)
         self._report_suspects()
 
     def silent(self) -> None:
-        """Undo all updates of the tags' states since the last read, because the reader or all tags have failed."""
+        """Undo all updates of the states of tags since the last read, because the reader or all tags have failed."""
         self.forget(math.nextafter(self.states.last_read, math.inf))
 
     def _report_suspects(self) -> None:
@@ -253,11 +249,8 @@ class KnownTags:
             self._diagnostics.doubted[f"{state}_tags"] = dict(zip(names, tags.values(), strict=True))
 
     def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
-        """Return three lists: the row in the read counts of each active antenna in ``names``, and the antenna index and
-        the number of rounds of each row. The row is -1 for an unknown or dead antenna.
-
-        The result is cached, because consecutive scans have the same antennas.
-        """
+        """Return the row of each antenna in ``names`` in a table of counts, or -1 for unknown and dead antennas. Also
+        return the antenna index and the number of rounds of each row of the table. The last result is cached."""
         if names not in self._rounds:
             antennas = [self._antennas.get(name, -1) for name in names]
             antennas = [-1 if antenna in self._excluded else antenna for antenna in antennas]
@@ -268,8 +261,8 @@ class KnownTags:
         return self._rounds[names]
 
     def places(self, m: RfidScan) -> tuple[Integers, Integers]:
-        """Return the antenna index and the tag index of each read of a scan. An index is -1 if the rig or the map lacks
-        the element. A tag that is probably dead, weak or moved also has -1."""
+        """Return the antenna index (R,) and the tag index (R,) of each of R reads in a scan. The index is -1 for
+        unknown antennas and tags, and for tags that are probably dead, weak or moved."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
         tags[(tags >= 0) & (self.states.odds[tags] > 0.0)] = -1
@@ -281,17 +274,18 @@ Row = tuple[float, int, int, float, float]  # time of the read, antenna, tag, ph
 
 
 class TagSignals:
-    """Turns scans into signal strengths and windows of phases, if the run uses the sensors ``rssi`` and ``phase``.
+    """Converts scans to signal strengths and to time windows of phases, if a run uses the sensors "rssi" and "phase".
 
-    A window has the phases of the rig's last ``window`` seconds. Two windows end at least ``step`` seconds apart.
+    A window contains the phases of the last ``window`` seconds. A new window ends at least ``step`` seconds after the
+    previous one. Both are settings of the rig.
     """
 
     def __init__(self, setup: Setup, tags: KnownTags) -> None:
         settings, self._tags = setup.rig.of(RfidSettings), tags
         self.strength: RssiLikelihood | None = None
         self.phase: PhaseLikelihood | None = None
-        self._rows: deque[tuple[float, Row]] = deque()  # reads with a phase, each with the time of its scan
-        self._ended: deque[float] = deque()  # times [s] at which windows ended
+        self._rows: deque[tuple[float, Row]] = deque()  # reads with a phase, each after the time of its scan
+        self._ended: deque[float] = deque()  # end times [s] of windows
         self._window = self._step = 0.0
         self._newest = -np.inf
         antennas = tags.likelihood.model.antennas
@@ -302,7 +296,8 @@ class TagSignals:
             self._window, self._step = settings.phase.window, settings.phase.step
 
     def strengths(self, m: RfidScan) -> RssiReads | None:
-        """Return the reads with a signal strength, relative to the pose at the scan's time, or None without any."""
+        """Return the signal strengths of the reads in a scan, as a function of the pose at the time of the scan.
+        Returns None without signal strengths."""
         if self.strength is None:
             return None
         antennas, tags = self._tags.places(m)
@@ -312,7 +307,7 @@ class TagSignals:
         return RssiReads(np.zeros((len(rows), 3)), antennas[rows], tags[rows], m.rssi[rows])
 
     def keep(self, m: RfidScan) -> bool:
-        """Store the phases of a scan. Returns True if a window ends with this scan."""
+        """Store the phases of the reads in a scan. Returns True if a window ends with this scan."""
         if self.phase is None:
             return False
         antennas, tags = self._tags.places(m)
@@ -333,11 +328,9 @@ class TagSignals:
         return np.array([row[0] for row in self._of_window()])
 
     def phases(self, offsets: Array, pose: Array) -> RfidFactor | None:
-        """Return the phases of the current window as a factor on the robot's pose. Returns None if too few reads are
-        near their tags.
-
-        ``pose`` (3,): the predicted pose. ``offsets`` (R, 3): the robot's poses at the reads, relative to that pose.
-        """
+        """Return the phases in the current window as a factor on the robot's pose, or None if too few of the reads are
+        near their tags. ``pose`` (3,): the predicted pose. ``offsets`` (R, 3): poses at the reads, relative to
+        ``pose``."""
         if self.phase is None:
             return None
         _, antennas, tags, phase, frequency = (np.array(column) for column in zip(*self._of_window(), strict=True))
@@ -346,8 +339,7 @@ class TagSignals:
         return RfidFactor(self.phase, reads) if len(reads.phase) else None
 
     def forget(self, since: float) -> None:
-        """Delete the scans since the time ``since`` [s], because they will be processed again. ``since`` is at most
-        :data:`GOING_BACK` before the last scan."""
+        """Delete all reads in scans since the time ``since`` [s], because these scans will be processed again."""
         while self._rows and self._rows[-1][0] >= since:
             self._rows.pop()
         while self._ended and self._ended[-1] >= since:

@@ -30,10 +30,10 @@ TAGS = Table(
 
 
 class Tag(FileModel):
-    """An RFID tag of the map: its surveyed position [m], and the direction ``facing`` of its front [rad], None if unknown.
+    """An RFID tag of the map: its surveyed position [m], and the direction ``facing`` [rad] of its front or None.
 
-    ``sigma``: standard deviation of the surveyed x and y [m]. ``covariance``: may be given instead of ``sigma``, as
-    (xx, xy, yy) [m^2].
+    ``sigma``: standard deviation [m] of the surveyed x and y. ``covariance``: the elements (xx, xy, yy) [m^2] of the
+    covariance of the survey, as an alternative to ``sigma``.
     """
 
     x: Coordinate
@@ -49,15 +49,15 @@ class Tag(FileModel):
 
 
 class TagsFile(ColumnMapping):
-    """The mapping of a foreign table of tags to the fields epc, x, y and optionally z, facing, sigma. ``epc_case``: a
-    conversion of the EPCs, such as upper case, so that they equal the EPCs of the reads."""
+    """Assigns the columns of a foreign table of tags to the fields epc, x, y and optionally z, facing, sigma.
+    ``epc_case``: the conversion of EPCs to upper or lower case, if their case differs from that of the reads."""
 
     epc_case: EpcCase = "as written"
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """Return the section ``tags`` of a world file. If its ``content`` names a native table, or maps a foreign table,
-    read the tags from that table in ``folder``. ``source``: the world file for messages."""
+    """Return the tags of a world file. If its section ``tags``, ``content``, names a table, the tags are read from this
+    table in ``folder``. ``source``: the name of the world file in messages."""
     if isinstance(content, str):
         return read_tags(inside(folder, content, source))
     if isinstance(content, dict) and isinstance(content.get("file"), str):
@@ -67,8 +67,8 @@ def read_layer(content: Any, source: object, folder: Path) -> Any:
 
 
 def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
-    """Write tags as a table next to the world file ``base``, and return the name of the table. Returns None and writes
-    nothing if there are no tags, or if a tag has a covariance, which has no column."""
+    """Write tags to a table next to the world file ``base``. Returns the name of the table. If there are no tags, or if
+    a tag has a covariance, nothing is written and None is returned."""
     if not tags or any(tag.covariance is not None for tag in tags.values()):
         return None
     write_tags(tags, base.with_name(base.name + TAGS_SUFFIX))
@@ -76,7 +76,7 @@ def write_layer(tags: Mapping[str, Tag], base: Path) -> str | None:
 
 
 def read_tags(path: Path, mapping: TagsFile | None = None) -> dict[str, Tag]:
-    """Read tags from a native table ``NAME.tags.csv``, or from a foreign table by a ``mapping``.
+    """Return the tags in a table, by EPC. ``mapping``: the columns of a foreign table, None for a native table.
 
     A native table has the columns epc, x, y, z, facing (may be empty) and optionally sigma. Raises InputError with
     file, row and field for an invalid value or a duplicate EPC.

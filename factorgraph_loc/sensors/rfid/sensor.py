@@ -33,7 +33,7 @@ from factors.rfid.signals import PhaseLikelihood
 from factors.se2 import Array
 from factors.update import Correction
 
-PLACED = 5.0  # m; with a larger standard deviation of the position, a scan is no evidence on the states of tags
+PLACED = 5.0  # m; maximum standard deviation of the position for a scan that gives evidence for the states of tags
 SCAN = 50  # computing time of a scan without tags, relative to the time for one tag
 # messages of events
 DEAD_ANTENNA = "antenna {antenna} reads no tag although reads are expected: it is ignored until it reads a tag"
@@ -46,21 +46,21 @@ class TagObservation:
     """An observation of RFID reads: of reads and misses, of signal strengths, or of phases.
 
     ``factor``: the likelihood, which depends on the pose and on estimated parameters of the detection models.
-    ``found``: number of reads. ``blocks``: the name of the block of the estimated parameters, or ().
+    ``found``: number of reads. ``blocks``: the name of the state block with these parameters, or ().
     """
 
     t: float
     factor: RfidFactor
     found: int
-    here: TagReadCounts | None = None  # reads and misses at the pose of the scan's time; None for strength and phase
-    rounds: int = 0  # number of antenna rounds of reads and misses
+    here: TagReadCounts | None = None  # reads and misses relative to the pose at ``t``; None for strength and phase
+    rounds: int = 0  # number of antenna rounds
     blocks: tuple[str, ...] = ()
-    states: TagEvidence | None = None  # evidence of the scan on the states of tags
+    states: TagEvidence | None = None  # evidence from the scan for the states of tags
     iterations: ClassVar[int] = ITERATIONS
 
     @property
     def is_judged(self) -> bool:
-        """True for an observation of reads and misses."""
+        """True if this is an observation of reads and misses."""
         return self.here is not None
 
     @property
@@ -74,8 +74,8 @@ class TagObservation:
         return frozenset(reads.read_tags.tolist()) if isinstance(reads, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
-        """Return the reads and misses on the pose at their own time, with the detection models of the rig instead of estimated
-        ones, which a wrong track may have corrupted. Returns None for strength and phase (multimodal likelihoods)."""
+        """Return an observation that depends only on the pose at the time ``t``, with the detection models of the rig
+        instead of estimated models. Returns None for strength and phase."""
         likelihood = self.factor.likelihood
         if self.here is None or not isinstance(likelihood, RfidLikelihood):
             return None
@@ -94,8 +94,7 @@ class TagObservation:
         columns: Mapping[str, slice],
         iterations: int = 1,
     ) -> Correction:
-        """Correct the pose and the estimated parameters by Fisher scoring. Other components of the state are corrected
-        through their correlation. See :meth:`.Observation.correct`."""
+        """Return the correction of a Gaussian estimate, by Fisher scoring. See :meth:`.Observation.correct`."""
         at, prior = [0, 1, 2], NO_VALUES
         for name in self.blocks:  # there is at most one block
             at, prior = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
@@ -111,19 +110,19 @@ class TagObservation:
         return self.factor.log_likelihood(poses, *(values[name] for name in self.blocks))
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        """Return the observation on the pose only, with the detection models fixed at the estimates ``values``. The
-        covariances ``spreads`` of the estimates are not used."""
+        """Return an observation that depends on the pose only, with the parameters of the detection models fixed at
+        ``values``. ``spreads`` is ignored."""
         if not self.blocks:
             return self
         return replace(self, factor=self.factor.fixed(values[self.blocks[0]]), blocks=())
 
 
 class TagSensor(Sensor):
-    """The RFID sensor, bound to a run.
+    """The RFID reader in a run.
 
-    Each scan yields an observation of reads and misses, and one of signal strengths. Once per second, the recent phases
-    yield another one. Missing reads by a failure of the reader (:class:`.SilenceMonitor`) are no evidence. A search for
-    the pose only uses reads and misses, because strength and phase have multimodal likelihoods.
+    Each scan yields an observation of reads and misses, and an observation of signal strengths. Windows of phases yield
+    further observations. Scans are rejected while the reader has failed (:class:`.SilenceMonitor`). Global localization
+    only uses reads and misses, because the likelihoods of strength and phase are multimodal.
     """
 
     modality = "rfid"
@@ -146,8 +145,8 @@ class TagSensor(Sensor):
         self._monitor, self._silence = ScanMonitor(), SilenceMonitor()
         self._bursts = BurstMonitor(len(self.tags.antennas), len(self.tags.map.names))
         self._consistency = ConsistencyMonitor(self.tags.antennas)
-        self._heard = -math.inf  # time [s] of the last scan that the silence monitor has processed
-        self._confirmed = -math.inf  # time [s] after which a new track is trusted, so that states and models are learnt
+        self._heard = -math.inf  # time [s] of the last scan of the silence monitor
+        self._confirmed = -math.inf  # time [s] after which states of tags and models are estimated with a new pose
 
     def observe(self, m: RfidScan, view: View) -> Iterator[TagObservation]:
         twist = self._wheels.twist(m.t) if "time_offset" in self.constants.names else STANDING
@@ -177,13 +176,13 @@ class TagSensor(Sensor):
                     yield TagObservation(m.t, window, 1)
 
     def _learns(self, t: float) -> bool:
-        """True if detection models and states of tags are learnt at ``t`` [s]. They are not learnt on a track that is
-        suspicious, has just begun, or slips."""
+        """Return True if detection models and states of tags may be estimated at ``t`` [s]. They must not if the pose
+        is new or suspicious, or if the wheels slip."""
         return not self._wheels.is_slipping and self.suspicious_since is None and t >= self._confirmed
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, counts: TagReadCounts) -> TagObservation:
-        """Return the observation of the reads and misses of a scan. ``counts``: the reads and misses, relative to the pose at the
-        scan's time. ``moved``: the same reads and misses, relative to the pose that the observation depends on."""
+        """Return the observation of reads and misses of the scan ``m``. ``counts``: the reads and misses, relative to
+        the pose at the scan. ``moved``: the same, relative to the pose that the observation must depend on."""
         factor = RfidFactor(self.tags.likelihood, moved, self.constants.indices)
         return TagObservation(m.t, factor, int(counts.hits.sum()), counts, len(m.antennas), self._blocks)
 
@@ -203,8 +202,8 @@ class TagSensor(Sensor):
         return True
 
     def _count(self, observation: TagObservation, view: View) -> None:
-        """Compare reads and misses with their expectation. Adapt the tempering to their correlation, exclude dead
-        antennas, and report models that contradict the reads."""
+        """Compare reads with predicted reads. This adapts the tempering of the likelihood, excludes dead antennas, and
+        reports detection models that contradict the reads."""
         assert isinstance(observation.factor.reads, TagReadCounts)
         t, measured, states = observation.t, observation.factor.reads, self.tags.states
         reads = self.tags.likelihood.expected(view.pose, measured, self._estimated(view))
@@ -212,8 +211,7 @@ class TagSensor(Sensor):
         self._bursts.add(t, measured, reads, surveyed)
         self.tags.temper(1.0 / self._bursts.overdispersion)
         if np.trace(view.covariance[:2, :2]) < KNOWN**2:
-            # tags that have probably moved are counted if they were read, because with a wrong model most tags seem to have
-            # moved
+            # tags that were read are also counted if they seem to have moved, because a wrong model has the same effect
             counts = (reads.p > POSSIBLE) & (surveyed | states.were_read(reads.tags))
             overdispersion = 1.0 / self.tags.likelihood.model.tempering
             doubted = self._consistency.doubted
@@ -226,22 +224,22 @@ class TagSensor(Sensor):
                 self._diagnostics.event(t, "doubted_model", DOUBTED_MODEL, shares=self._consistency.shares)
 
     def _values(self, view: View) -> dict[str, Array]:
-        """Return the estimated parameters (P,) of the detection models by the name of their block, or {} if none is
-        estimated."""
+        """Return the estimated parameters (P,) of the detection models by the name of their state block, or {} if no
+        parameters are estimated."""
         value = view.value(self.name) if self._blocks else None
         return {} if value is None else {self.name: value}
 
     def _estimated(self, view: View) -> Array:
-        """Return all parameters (Q,) of the likelihood, with the current values of those that are estimated."""
+        """Return all parameters (Q,) of the likelihood, with current values of the estimated parameters."""
         out = self.tags.likelihood.parameters.copy()
         for value in self._values(view).values():
             out[list(self.constants.indices)] = value
         return out
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
-        """False if the reader or the tags have failed at the scan of this ``observation``. ``evidence``:
-        log-probability of the scan at the predicted pose."""
-        # a scan without reads that is processed again after a late measurement counts only once
+        """Return False if the reader or all tags have failed at the time of this observation, otherwise True.
+        ``evidence``: the log-probability of the scan at the predicted pose."""
+        # a scan without reads counts only once, even if it is processed again after a late measurement
         if observation.found or observation.t > self._heard:
             lasted = self._silence.lasts
             if self._silence.add(observation.found, evidence) and not lasted:
@@ -273,7 +271,8 @@ class TagSensor(Sensor):
         self._monitor.accept()
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
-        """Merge all reads and misses on one pose into one factor of a graph. Strengths and phases remain separate."""
+        """Return the graph factors of observations that depend on one pose: one factor for all reads and misses, and
+        one for each observation of strength or phase."""
         counts: list[TagReadCounts] = []
         terms: list[Term] = []
         for observation in observations:
@@ -291,9 +290,8 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return the factor without tags that are clearly dead, weak or moved. The probabilities of these states of the
-        other tags are not updated by the scan itself. Returns None for phases if ``width`` is above 1, because phases
-        have local optima centimetres apart."""
+        """Return a copy of ``factor`` in which tags that are clearly dead, weak or moved have no effect. Returns None
+        for phases if ``width`` is above 1, because their likelihood has local optima centimetres apart."""
         factor = cast(RfidFactor, factor)
         if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None
@@ -314,8 +312,8 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength or phase,
-    but the rig has no model of it or no antennas."""
+    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength
+    or phase, and the rig lacks their model or antennas on the robot."""
     settings, sensors = binding.setup.rig.rfid, binding.setup.sensors
     signals = [signal for signal in ("rssi", "phase") if signal in sensors]
     if settings is not None and settings.tags and signals:
@@ -327,7 +325,7 @@ def bind(binding: Binding) -> TagSensor | None:
             raise InputError(f"the rig has no [rfid.{signal}]: add it, or do not use the sensor {signal}")
     if settings is None or TagSensor.modality not in sensors:
         return None
-    # strength and phase use the mounting of the rig, so reads must not estimate another mounting
+    # the mounting is not estimated from reads if strength or phase is used, because these use the mounting in the rig
     setup = installed(binding.setup)
     settings = setup.rig.of(RfidSettings)
     constants = NOTHING if binding.calibration == "none" else settings.estimated(mounting=not signals)
