@@ -71,7 +71,7 @@ def calibrate(
             trials += trials_of(tests, start, unseen, run)
         report(i + 2, len(folds) + 1)
     refused = refusal(trials) if trials else "the logs are too short to hold out parts of them"
-    doubts = [*knowledge.notes, *_doubted(trials)]
+    doubts = [*knowledge.notes, *_map_warnings(trials)]
     if not has_heading(logs[0]):
         doubts.append(notice("no_headings", "The reference has no headings: only the range scale is learnt."))
     if len(logs) == 1:
@@ -84,7 +84,7 @@ def calibrate(
     )
 
 
-def _doubted(trials: Sequence[Trial]) -> list[Notice]:
+def _map_warnings(trials: Sequence[Trial]) -> list[Notice]:
     """Return a warning for each kind of error in the map, such as moved tags, with all names from the held-out logs."""
     doubted: dict[str, dict[str, None]] = {}
     for trial in trials:

@@ -66,7 +66,7 @@ def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
     """
     parts = list(zip(recordings(logs), logs, strict=True))
     if len({number for number, _ in parts}) == 1:
-        halves = [(half, _share(log, half / 2, (half + 1) / 2)) for half in range(2) for log in logs]
+        halves = [(half, _section(log, half / 2, (half + 1) / 2)) for half in range(2) for log in logs]
         parts = [(half, part) for half, part in halves if part is not None]
     return [
         (
@@ -168,7 +168,7 @@ def refusal(trials: Sequence[Trial]) -> str:
     return ""
 
 
-def _share(log: Log, begin: float, end: float) -> Log | None:
+def _section(log: Log, begin: float, end: float) -> Log | None:
     """Cut a section from a log. ``begin``, ``end``: fractions of the time span that odometry and reference have in common.
 
     Returns None if the section has no measurements, or lacks odometry or the reference.
@@ -188,7 +188,7 @@ def _sections(log: Log) -> list[Log]:
     out = []
     for begin, end in pairwise(edges.tolist()):
         margin = max(0.0, 0.5 * (end - begin - LONGEST / (last - first)))
-        part = _share(log, begin + margin, end - margin)
+        part = _section(log, begin + margin, end - margin)
         if part is not None and part.reference is not None and len(part.reference) >= FEWEST_POSES:
             out.append(part)
     return out

@@ -118,7 +118,7 @@ def page(calibration: Calibration) -> str:
     logs = calibration.logs if len(calibration.logs) > 1 else ()
     content: dict[str, list[Part]] = {
         "Summary": list(summary(calibration)),
-        "Constants": [_how(calibration), constants_table(calibration.knowledge.constants, logs)],
+        "Constants": [_method(calibration), constants_table(calibration.knowledge.constants, logs)],
     }
     if calibration.trials:
         explained = (
@@ -136,7 +136,7 @@ def page(calibration: Calibration) -> str:
     return sectioned(f"Calibration of {calibration.rig.name}", lead, calibration.doubts, content)
 
 
-def _how(calibration: Calibration) -> str:
+def _method(calibration: Calibration) -> str:
     """Return a paragraph about the method of the calibration."""
     if calibration.knowledge.turns:
         turns = ", ".join(number(change, 1) for change in calibration.knowledge.turns)

@@ -68,12 +68,14 @@ def inspect(log: Log) -> Inspection:
     problems += [notice("empty_stream", "{stream} is empty", name) for name in empty]
     for name, summary in (*streams.items(), *([("reference", reference)] if reference else [])):
         problems += gap_warnings(name, summary.gaps)
-    sensors = {name: _about(name, summarize(log.alone(name))) for name, summarize in functions("summarize", log.rig)}
+    sensors = {
+        name: _with_sensor_name(name, summarize(log.alone(name))) for name, summarize in functions("summarize", log.rig)
+    }
     problems += [problem for name in sensors for problem in _problems(name, sensors)]
     return Inspection(streams, reference, tuple(dict.fromkeys(problems)), sensors)
 
 
-def _about(name: str, summary: Summary) -> Summary:
+def _with_sensor_name(name: str, summary: Summary) -> Summary:
     """Return a summary that names the sensor in each line if there are several sensors of its kind."""
     if kind_of(name) == name:
         return summary

@@ -46,7 +46,7 @@ def plot_log(log: Log, tracks: Mapping[str, Track], folder: Path) -> list[Path]:
     if log.reference is not None and len(tracks) > 1:
         figures["error-distribution"] = error_distribution(log, log.reference, tracks)
     for estimator, track in tracks.items():
-        figures |= _of_one(log, estimator, track)
+        figures |= _estimator_figures(log, estimator, track)
     folder.mkdir(parents=True, exist_ok=True)
     paths = {folder / f"{file_name(log.name)}-{what}.png": figure for what, figure in figures.items()}
     for path, figure in paths.items():
@@ -67,7 +67,7 @@ def remove_plots(folder: Path) -> None:
             plot.unlink()
 
 
-def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
+def _estimator_figures(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
     """Return the plots of a single estimator by the ending of their file names, such as "errors-ekf"."""
     if not len(track.final):
         return {}
@@ -84,7 +84,7 @@ def _of_one(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
     """Plot causal and final trajectories with walls, map objects and reference. The range of the axes fits map and reference."""
-    view, height = _room(log)
+    view, height = _plotted_area(log)
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
         _map(axis, log, view)
@@ -100,7 +100,7 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
 
 def overview(log: Log, odometry: Trajectory | None) -> Figure:
     """Plot a log from above: its map, its reference, and ``odometry``, the dead reckoning from the start (None if unknown)."""
-    view, height = _room(log)
+    view, height = _plotted_area(log)
     figure, axes = grid(1, 1, height, log.name)
     _map(axes[0, 0], log, view)
     if odometry is not None and len(odometry):
@@ -217,13 +217,13 @@ def _layers(log: Log) -> list[Marks]:
     return [m for m in marks(log) if not m.dense]
 
 
-def _room(log: Log) -> tuple[Array | None, float]:
+def _plotted_area(log: Log) -> tuple[Array | None, float]:
     """Return the corners (2, 2) [m] of the drawn part of the plane, and the height of the figure [100 px].
 
     The corners are None for a log without a reference.
     """
     places = (*(m.positions[:, :2] for m in _layers(log)), np.array(log.world.walls).reshape(-1, 2))
-    view = _view(np.concatenate(places), log.reference)
+    view = _bounding_box(np.concatenate(places), log.reference)
     return view, 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))
 
 
@@ -232,7 +232,7 @@ def _joined(segments: Array) -> Array:
     return np.insert(segments, 2, np.nan, axis=1).reshape(-1, 2)
 
 
-def _view(places: Array, reference: Trajectory | None) -> Array | None:
+def _bounding_box(places: Array, reference: Trajectory | None) -> Array | None:
     """Return the lower and upper corner (2, 2) of a box around points ``places`` (N, 2) and the reference, None without it."""
     if reference is None or not len(reference):
         return None

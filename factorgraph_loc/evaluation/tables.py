@@ -52,13 +52,13 @@ def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[li
             runs = [r for r in rows if r["log"] == log and r["estimator"] == name]
             if runs:
                 cells = [_cell(metric, [_figure(r, metric.key) for r in runs]) for metric in metrics]
-                lines.append([log, name, *cells, counted(runs) or "-", _went_well(runs)])
+                lines.append([log, name, *cells, counted(runs) or "-", _success_count(runs)])
     if len(logs) > 1:
         for name in names:
             runs = [r for r in rows if r["estimator"] == name]
             by_log = [[r for r in runs if r["log"] == log] for log in logs]
             cells = [_pooled(metric, by_log) for metric in metrics]
-            lines.append([ALL, name, *cells, counted(*by_log) or "-", _went_well(runs)])
+            lines.append([ALL, name, *cells, counted(*by_log) or "-", _success_count(runs)])
     return ["log", "estimator", *(metric.column for metric in metrics), SCORED, "runs"], lines
 
 
@@ -170,6 +170,6 @@ def counted(*by_log: Sequence[Row]) -> str:
     return (f"{least:.0f}" if least == most else f"{least:.0f} to {most:.0f}") if known else ""
 
 
-def _went_well(runs: Sequence[Row]) -> str:
+def _success_count(runs: Sequence[Row]) -> str:
     """Return the number of successful runs and of all runs: "4/5"."""
     return f"{sum(r['status'] == 'ok' for r in runs)}/{len(runs)}"

@@ -36,7 +36,7 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, 
     return (notice("partly_scored", sentence, log.name, end - begin, whole, begin, end),)
 
 
-def in_bent_map(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
+def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
     """Return a warning about the error of a map that was made without a reference. It states the median and the maximum
     along the trajectory ``final``. ``frame``: has the covariance of this error at each pose."""
     if frame.error is None or not len(final):

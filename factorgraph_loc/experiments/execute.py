@@ -228,7 +228,7 @@ class Processes(Executor):
     def finished(self) -> Iterator[tuple[str, Files]]:
         readable = wait([worker.connection for worker in self._team], CHECK_INTERVAL)
         for worker in list(self._team):
-            run, failed = worker.job, self._too_much(worker)
+            run, failed = worker.job, self._exceeded_limit(worker)
             if worker.connection in readable:
                 was_ready, answer = worker.ready, worker.hear()
                 if not isinstance(answer, ProcessDiedError):
@@ -262,7 +262,7 @@ class Processes(Executor):
             return None
         return "killed", f"its process died {ATTEMPTS} times without a message (killed, or a crash in native code)"
 
-    def _too_much(self, worker: _Worker) -> tuple[Kind, str] | None:
+    def _exceeded_limit(self, worker: _Worker) -> tuple[Kind, str] | None:
         """Return the kind and the reason of the failure of a run that exceeds a limit, or None if it does not."""
         if worker.job is None:
             return None

@@ -296,7 +296,7 @@ def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
     if start is None:
         t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"
     else:
-        t, pose, source = start.t, start.pose, _in_words(start, source)
+        t, pose, source = start.t, start.pose, _describe_start(start, source)
     return replace(log, start=StartPose(t, pose, np.full(3, EXACT_SIGMA))), source
 
 
@@ -312,10 +312,10 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
             raise InputError(f"{log.name}: --extend without reference poses {needed}")
         return None, "that of the start: the first pose is the origin (0, 0, 0)"
     certain = replace(prior, covariance=EXACT_SIGMA**2 * np.eye(3))
-    return (prior if options.extend else certain), f"that of the start: {_in_words(prior, source)}"
+    return (prior if options.extend else certain), f"that of the start: {_describe_start(prior, source)}"
 
 
-def _in_words(start: PosePrior, source: str) -> str:
+def _describe_start(start: PosePrior, source: str) -> str:
     """Describe a start pose and its source."""
     x, y, heading = start.pose
     chosen = "" if start.has_heading else ", which has no heading"

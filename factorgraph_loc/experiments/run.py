@@ -13,7 +13,7 @@ import numpy as np
 
 from factorgraph_loc.errors import FglocError, InputError
 from factorgraph_loc.experiments.causal_run import CausalRun, rare_garbage_collection, span_of
-from factorgraph_loc.experiments.doubts import in_bent_map, never_localized, partly_scored, with_pauses
+from factorgraph_loc.experiments.doubts import map_error_warning, never_localized, partly_scored, with_pauses
 from factorgraph_loc.experiments.preparation import (
     SET_PRIOR,
     at_origin,
@@ -185,7 +185,7 @@ def _result(
         *(warning for result in reviews.values() for warning in result.warnings),
         *never_localized(log, use.sensors, causal.estimates.status, end.final),
         *partly_scored(log, end.final, config.max_gap),
-        *in_bent_map(log, causal.frame, end.final),
+        *map_error_warning(log, causal.frame, end.final),
         *with_pauses(log, causal.ticks.skipped, config.tick_gap),
     )
     return RunResult(

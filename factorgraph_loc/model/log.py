@@ -182,7 +182,7 @@ def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
     shift = _extent(first)[1] + gap - _extent(second)[0]
     streams = dict(first.streams)
     for name, stream in second.streams.items():
-        later = replace(stream, t=stream.t + shift).begun_anew()
+        later = replace(stream, t=stream.t + shift).without_first_motion()
         streams[name] = joined(streams[name], later) if name in streams else later
     return replace(
         first,

@@ -144,7 +144,7 @@ class Stream:
     def _columns(self) -> Iterator[Any]:
         return (column for name, column in columns_of(self).items() if name != "t")
 
-    def begun_anew(self) -> Self:
+    def without_first_motion(self) -> Self:
         """Return the stream with zero motion in its first row, for a log in which the robot was carried before that
         row. Streams that do not measure motion are returned unchanged."""
         return self

@@ -233,8 +233,8 @@ class _ClosedLoop:
         with self._guard.computing("the belief", self.robot.t):
             belief = self._estimator.belief()
         particles, weights = _sampled(belief, self._space, self._rng)
-        modes = _places(belief)
-        proposed = [*self._paths, *self._far(modes)]
+        modes = _main_modes(belief)
+        proposed = [*self._paths, *self._far_paths(modes)]
         if self.robot.metres >= self._turned_at + self._settings.policy.replan:
             proposed.append(self._turn)
         paths, free = usable(proposed, self.robot.free_ahead(proposed), self._settings.sight)
@@ -262,7 +262,7 @@ class _ClosedLoop:
         )
         return choice
 
-    def _far(self, modes: Sequence[Mode]) -> list[Path]:
+    def _far_paths(self, modes: Sequence[Mode]) -> list[Path]:
         """Return the shortest paths from each mode to distant tags and to distant places in free space."""
         out: list[Path] = []
         policy = self._settings.policy
@@ -313,7 +313,7 @@ def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings,
     return np.array(settings.start)
 
 
-def _places(belief: Belief) -> tuple[Mode, ...]:
+def _main_modes(belief: Belief) -> tuple[Mode, ...]:
     """Return at most :data:`MODES` modes of a belief with a weight of at least :data:`LIKELY`. Neighbouring modes
     become one, with the pose of the first mode and the sum of the weights."""
     places: list[Mode] = []

@@ -38,21 +38,21 @@ def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, win
         w, h = min(rng.uniform(*wide), width * texel - x - 0.05), rng.uniform(*high)
         top = tall - rng.uniform(*middle) - h / 2.0
         picture = draw(rng, max(round(h / texel), 16), max(round(w / texel), 16))
-        _hang(out, picture, round(x / texel), round(max(top, 0.05) / texel))
+        _paste_with_shadow(out, picture, round(x / texel), round(max(top, 0.05) / texel))
         x += w + rng.uniform(*GAP)
-    _low(out, rng, texel)
-    _small_things(out, rng, texel)
+    _draw_low_furniture(out, rng, texel)
+    _draw_fixtures(out, rng, texel)
     out[height - round(SKIRTING / texel) :] = pictures.wood(rng)
-    return _lit(out, rng, texel)
+    return _lighted(out, rng, texel)
 
 
 def lintel(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
     """Return the texture of the wall above a door, with a plate and the upper edge of the door frame."""
     out = _painted(rng, height, width, texel)
     plate = pictures.sign(rng, max(height // 3, 8), max(width // 2, 16))
-    _hang(out, plate, width // 4, height // 3)
+    _paste_with_shadow(out, plate, width // 4, height // 3)
     out[height - round(0.06 / texel) :] = pictures.wood(rng)
-    return _lit(out, rng, texel)
+    return _lighted(out, rng, texel)
 
 
 def furniture(rng: np.random.Generator, height: int, width: int) -> Canvas:
@@ -127,7 +127,7 @@ def _painted(rng: np.random.Generator, height: int, width: int, texel: float) ->
     return pictures.shaded(out, 1.0 + 0.012 * _grain(rng, height, width))
 
 
-def _hang(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
+def _paste_with_shadow(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
     """Paste ``picture`` on ``canvas`` at texel (x, y), with a shadow to the right and below."""
     height, width = picture.shape[:2]
     shadow = canvas[y + 3 : y + height + 3, x + 3 : x + width + 3]
@@ -135,18 +135,18 @@ def _hang(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
     pictures.paste(canvas, picture, x, y)
 
 
-def _low(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
+def _draw_low_furniture(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
     """Draw sideboards and low shelves at the foot of a wall with the texture ``canvas``. ``texel`` [m]: the size of a texel."""
     height, width = canvas.shape[:2]
     x = rng.uniform(0.0, 1.0)
     while x < width * texel - 0.4:
         w, h = min(rng.uniform(0.5, 1.5), width * texel - x - 0.05), rng.uniform(0.35, 0.75)
         picture = furniture(rng, round(h / texel), round(w / texel))
-        _hang(canvas, picture, round(x / texel), height - picture.shape[0] - 4)
+        _paste_with_shadow(canvas, picture, round(x / texel), height - picture.shape[0] - 4)
         x += w + rng.uniform(0.2, 1.5)
 
 
-def _small_things(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
+def _draw_fixtures(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
     """Draw sockets, switches, vents and stickers at random positions of a wall, five per metre."""
     height, width = canvas.shape[:2]
     for _ in range(int(5.0 * width * texel)):
@@ -154,10 +154,10 @@ def _small_things(canvas: Canvas, rng: np.random.Generator, texel: float) -> Non
         picture = pictures.filled(h, w, pictures.PAPER if rng.random() < 0.5 else pictures.vivid(rng))
         cv2.rectangle(picture, (0, 0), (w - 1, h - 1), pictures.INK, 1)
         picture[h // 3 : 2 * h // 3, w // 3 : 2 * w // 3] = pictures.INK
-        _hang(canvas, picture, int(rng.uniform(0, width)), int(rng.uniform(0, height)))
+        _paste_with_shadow(canvas, picture, int(rng.uniform(0, width)), int(rng.uniform(0, height)))
 
 
-def _lit(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
+def _lighted(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
     """Return the texture of a wall in the light of the ceiling: with bright spots, and darker in the corners and near the floor."""
     height, width = canvas.shape[:2]
     factor = 1.0 + 0.05 * pictures.clouds(rng, height, width, 1.5 / texel)

@@ -158,7 +158,7 @@ class Associator:
         """
         if len(frame.pixels) == 0 or frame.feature != self.feature or len(self._owners) == 0:
             return None
-        points, features = self._alike(frame)
+        points, features = self._match_descriptors(frame)
         pixels = np.asarray(frame.pixels, dtype=float)[features]
         resection = located(self._model, self._positions[points], pixels, self._covariances[points])
         if resection is None:
@@ -171,7 +171,7 @@ class Associator:
         )
         return resection.camera, associations
 
-    def _alike(self, frame: CameraFrame) -> tuple[Integers, Integers]:
+    def _match_descriptors(self, frame: CameraFrame) -> tuple[Integers, Integers]:
         """Match features to points by their descriptors alone. Returns indices of points and of features.
 
         The point and the feature of a match are mutually most similar, and pass the ratio test against all other points.

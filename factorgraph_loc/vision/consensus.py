@@ -79,7 +79,7 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
         inliers = points[None, inside], pixels[None, inside], whiteners[None, inside]
         residual, jacobian = _whitened(model, position, rotation, *inliers)
         step = np.linalg.lstsq(jacobian[0] @ root, -residual[0], rcond=1e-9)[0]
-        position, rotation = _moved(position, rotation, (root @ step)[None])
+        position, rotation = _perturbed(position, rotation, (root @ step)[None])
         inside = _squared(model, position, rotation, points, pixels, whiteners)[0] < GATE
     return np.asarray(inside) if np.count_nonzero(inside) >= FEWEST else np.zeros(count, dtype=bool)
 
@@ -111,7 +111,7 @@ def _best_of_samples(
             # if a sample has outliers, its correction may be arbitrarily large
             step *= np.minimum(1.0, FARTHEST / np.linalg.norm(step, axis=1))[:, None]
             total = total + step
-            position, rotation = _moved(position, rotation, step @ root.T)
+            position, rotation = _perturbed(position, rotation, step @ root.T)
         squared = _squared(model, position, rotation, points, pixels, whiteners)
         costs = np.minimum(squared, SAMPLE_GATE).sum(axis=1)
         i = int(np.argmin(costs))
@@ -162,7 +162,7 @@ def _root(camera: CameraPose) -> Array:
     return np.asarray(vectors * np.sqrt(np.where(values > ROUNDING * values[-1], values, 0.0)))
 
 
-def _moved(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
+def _perturbed(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
     """Perturb H camera poses by ``step`` (H, 6), rotation first. Returns positions (H, 3) and rotations (H, 3, 3)."""
     shifted = position + (rotation @ step[:, 3:, None])[..., 0]
     return shifted, rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:, :3]).as_matrix()

@@ -186,7 +186,7 @@ class KeyframeIndex:
         begin = sample[np.linspace(0, len(sample) - 1, min(WORDS, len(sample))).astype(np.int64)]
         with warnings.catch_warnings(action="ignore"):  # words that are nearest to no descriptor stay unchanged
             self._words, _ = kmeans2(sample, begin, ROUNDS, minit="matrix")
-        self._descriptions = self._described(values, self._of)
+        self._descriptions = self._vlad_vectors(values, self._of)
 
     def __len__(self) -> int:
         return len(self._descriptions)
@@ -194,12 +194,12 @@ class KeyframeIndex:
     def views(self, descriptors: Descriptors) -> Integers:
         """Return the indices of the views of the :data:`NEAREST` keyframes most similar to an image with
         ``descriptors`` (N, D)."""
-        (description,) = self._described(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
+        (description,) = self._vlad_vectors(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)
         alike[np.argsort(-(self._descriptions @ description), kind="stable")[:NEAREST]] = True
         return np.flatnonzero(alike[self._of])
 
-    def _described(self, values: Array, of: Integers) -> Array:
+    def _vlad_vectors(self, values: Array, of: Integers) -> Array:
         """Return the VLAD vectors (K, WORDS * D) of K images. Similar images have similar vectors. ``values`` (M, D):
         descriptors of all images. ``of`` (M,): the index of each descriptor's image."""
         (nearest, _), count = vq(values, self._words), len(self._words)

@@ -54,16 +54,16 @@ class FeatureTracker:
         image = _TrackedImage(undistorted(self._camera, pixels), descriptors, numbers)
         missed = None
         if self._last is not None:
-            missed = self._continued(self._last, image)
+            missed = self._continue_tracks(self._last, image)
             if self._before is not None:
-                self._continued(self._before, image)
+                self._continue_tracks(self._before, image)
         fresh = np.flatnonzero(numbers < 0)
         numbers[fresh] = self._count + np.arange(len(fresh))
         self._count += len(fresh)
         self._last, self._before = image, missed
         return numbers
 
-    def _continued(self, earlier: _TrackedImage, image: _TrackedImage) -> _TrackedImage:
+    def _continue_tracks(self, earlier: _TrackedImage, image: _TrackedImage) -> _TrackedImage:
         """Match the features of ``image`` that have no number yet with an earlier image, and write their track numbers.
         Returns the features of the earlier image that were not matched."""
         rows = np.flatnonzero(image.numbers < 0)

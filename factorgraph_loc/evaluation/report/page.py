@@ -50,8 +50,8 @@ def write_report(
     results = Results(rows)
     labels = {label: name for name, label in reversed(results.variants.items())}
     reference = labels.get(baseline or "", next(iter(results.variants)))
-    shown = _known(results, metrics)
-    values = _compared(results, shown, reference) | _read(results, shown[0].key, runs)
+    shown = _scored_metrics(results, metrics)
+    values = _row_variables(results, shown, reference) | _file_variables(results, shown[0].key, runs)
     asked = tomli_w.dumps(_toml(experiment)) if experiment else ""
     sections = {
         "results": "Results",
@@ -83,11 +83,11 @@ def write_report(
     write_text(out, page)
 
 
-def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dict[str, Any]:
+def _row_variables(results: Results, metrics: Sequence[Metric], baseline: str) -> dict[str, Any]:
     """Return the variables of the HTML template that depend only on the rows of the runs."""
     best = [results.compare(metric) for metric in metrics]
     against = [results.compare(metric, baseline) for metric in metrics]
-    times = _known(results, tuple(TIMINGS), whole=False)
+    times = _scored_metrics(results, tuple(TIMINGS), whole=False)
     return {
         "metrics": metrics,
         "baseline": baseline,
@@ -108,7 +108,7 @@ def _compared(results: Results, metrics: Sequence[Metric], baseline: str) -> dic
     }
 
 
-def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
+def _file_variables(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
     """Return the variables of the HTML template that are read from the files of the runs. Only one trajectory per
     variant and log is shown: that of the run with the median of the score ``metric`` over seeds."""
     read = read_runs(results, metric, runs)
@@ -124,7 +124,7 @@ def _read(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
     }
 
 
-def _known(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
+def _scored_metrics(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
     """Return the metrics with the given ``keys`` for which at least one run has a score. If there are none, return all
     metrics, or an empty list if ``whole`` is false."""
     known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]

@@ -37,8 +37,8 @@ def overview(results: Results, comparisons: Sequence[MetricComparison]) -> Table
         cells = [_pooled_cell(c, variant) for c in comparisons]
         runs = results.of(variant)
         if is_sought:
-            cells.append(_share([row.get("time_to_localized") is not None for row in runs]))
-        cells += [_poses(runs), _share([row["status"] == "ok" for row in runs])]
+            cells.append(_success_cell([row.get("time_to_localized") is not None for row in runs]))
+        cells += [_poses_cell(runs), _success_cell([row["status"] == "ok" for row in runs])]
         rows.append([name(results, variant), *cells])
     shares = ["localized before the end"] * is_sought + ["poses scored in a run", "successful runs"]
     return ["", *(c.metric.heading for c in comparisons), *shares], rows
@@ -66,7 +66,7 @@ def by_log(results: Results, metric: Metric) -> Table:
         pick = {"low": min, "high": max}.get(metric.better or "")
         best = pick(values.values()) if pick and len(values) > 1 else None
         cells = [_log_cell(metric, scores[v], len(results.runs(v, log)), best) for v in results.variants]
-        rows.append([Cell(log), *cells, _poses([row for v in results.variants for row in results.runs(v, log)])])
+        rows.append([Cell(log), *cells, _poses_cell([row for v in results.variants for row in results.runs(v, log)])])
     return ["log", *(name(results, v) for v in results.variants), "poses scored"], rows
 
 
@@ -189,12 +189,12 @@ def _first(names: Sequence[str]) -> str:
     return "; ".join(names[:4]) + (f"; and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def _poses(runs: Sequence[Row]) -> Cell:
+def _poses_cell(runs: Sequence[Row]) -> Cell:
     """Return a cell with the number of scored poses, such as "840", or "800 to 840" if it differs between the runs."""
     return Cell(counted(runs) or _NONE)
 
 
-def _share(outcomes: Sequence[bool]) -> Cell:
+def _success_cell(outcomes: Sequence[bool]) -> Cell:
     """Return a cell with the number of successes among ``outcomes``, and the 95 % interval of their rate."""
     low, high = wilson(sum(outcomes), len(outcomes))
     return Cell(f"{sum(outcomes)} of {len(outcomes)}", [f"[{100 * low:.0f}, {100 * high:.0f}] %"])

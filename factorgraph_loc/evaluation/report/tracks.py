@@ -86,7 +86,7 @@ def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
     """
     error, trajectory = estimates.errors["error_position"], estimates.trajectory
     x, y, _ = trajectory.poses.T
-    keep = _thin(error, count)
+    keep = _thinned_rows(error, count)
     columns = {"t": trajectory.t, "x": x, "y": y, "e": error, "s": sigma(estimates)}
     return {
         name: [round(v, 3) if math.isfinite(v) else None for v in values[keep].tolist()]
@@ -114,7 +114,7 @@ def _known(values: Array) -> Array:
     return np.asarray(values[np.isfinite(values)])
 
 
-def _thin(error: Array, count: int) -> NDArray[np.int64]:
+def _thinned_rows(error: Array, count: int) -> NDArray[np.int64]:
     """Select about ``count`` of N poses, and return their indices: the first and the last pose, and the poses with the smallest and
     the largest ``error`` (N,) of each of several intervals. Where no error is known, the selected poses are evenly spaced.
     """

@@ -171,7 +171,7 @@ def score_paths(
     }
     lengths = float(_steps(estimate).sum()), float(_steps(reference).sum())
     poses = len(estimate), len(reference)
-    warnings = [*estimate.warnings, *reference.warnings, *_doubts(estimate, reference, associate_by, align)]
+    warnings = [*estimate.warnings, *reference.warnings, *_height_warnings(estimate, reference, associate_by, align)]
     if associate_by == "nearest" and len(aligned) < _MANY * min(poses):
         sentence = (
             "{estimate}: only {paired} of {poses} poses are within {max_diff:g} s of a pose of {reference}: "
@@ -278,7 +278,9 @@ def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
 
-def _doubts(estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment) -> list[Notice]:
+def _height_warnings(
+    estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment
+) -> list[Notice]:
     """Return warnings about heights: if they vary although ``align`` ignores them, or if a planar trajectory is
     compared with one at other heights."""
     if align == "se2":

@@ -111,7 +111,7 @@ class IncrementStream(Stream):
         if not len(self.unknown):
             object.__setattr__(self, "unknown", np.zeros(len(self.t)))
 
-    def begun_anew(self) -> IncrementStream:
+    def without_first_motion(self) -> IncrementStream:
         """Return a copy with a first increment of zero. Use this if the robot was carried before the first row."""
         moves = np.arange(len(self.t)) > 0
         return replace(
