@@ -145,7 +145,7 @@ def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], 
 
 
 def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    """Return the factor (at least 1) between the pooled ANEES of a rig and its ideal value, the number of dimensions."""
+    """Return the factor (at least 1) between the pooled ANEES of a rig and its ideal value. ``kind``: "causal" or "final"."""
     dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
     factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
     return max(factor, 1.0 / factor)

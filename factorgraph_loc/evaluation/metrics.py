@@ -101,7 +101,8 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
 
     - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Compare only runs with equal values.
     - ``causal.*``, ``final.*``: scores of the online and of the final trajectory, see :func:`accuracy`. They begin when the
-      robot is first localized. They are None without a reference, or with fewer than :data:`FEWEST_SCORED` compared poses.
+      robot is first localized. Without a reference, or with fewer than :data:`FEWEST_SCORED` poses, all but ``scored`` are
+      None.
     - ``time_to_localized`` [s]: time from the start of the run until the robot is localized.
     - ``landmarks.*``: see :func:`landmark_figures`; None unless the run estimated the map.
     - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each learnt constant.
@@ -201,11 +202,12 @@ def landmark_figures(
 
     ``landmarks``: the estimated landmarks. They are compared with the map of the log, after the planar alignment of
     ``trajectory`` with the reference. Without a reference, the landmarks themselves are aligned with the map.
+    ``max_gap`` [s]: see :func:`errors`.
 
     - ``landmarks.count``: number of estimated landmarks that the log's map has too.
     - ``landmarks.rmse`` [m]: root mean square distance of these landmarks from the map.
-    - ``landmarks.anees``: their mean NEES, ideally 2. It is usually below 2, because the covariances include the
-      uncertainty of the start, which the alignment removes.
+    - ``landmarks.anees``: mean NEES of these landmarks, ideally 2. It is usually below 2, because the covariances
+      include the uncertainty of the start, which the alignment removes.
     """
     figures: dict[str, Any] = dict.fromkeys(OF_FREE_MAP)
     names = [name for name in landmarks if name in log.world.landmarks]

@@ -41,7 +41,7 @@ class Metric:
         return significant(self.factor * value, sign=sign)
 
     def range(self, least: float, most: float, *, sign: bool = False) -> str:
-        """Return a range of values as text for a report."""
+        """Return the range from ``least`` to ``most`` as text for a report. ``sign``: see :meth:`text`."""
         return f"{self.text(least, sign=sign)} … {self.text(most, sign=sign)}"
 
 

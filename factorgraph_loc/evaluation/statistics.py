@@ -54,7 +54,7 @@ def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> 
 
 
 def bounds(figures: Array) -> tuple[float, float]:
-    """Return the 95 % interval of a score from its bootstrap draws (D,)."""
+    """Return the 95 % interval of a score from its bootstrap draws ``figures`` (D,)."""
     tail = 100.0 * (1.0 - CONFIDENCE) / 2.0
     low, high = np.percentile(figures, (tail, 100.0 - tail))
     return float(low), float(high)

@@ -195,7 +195,7 @@ def figures_of(run: ActiveRun) -> dict[str, float | None]:
 
 
 def _check_names(what: str, names: Sequence[str], known: Sequence[str]) -> None:
-    """Raise InputError if there are no names, or if one is unknown or repeated. ``what``: the kind of names."""
+    """Raise InputError if there are no names, or if one is repeated or not in ``known``. ``what``: the kind of names."""
     if not names:
         raise InputError(f"no {what} is given; known: {', '.join(known)}")
     for name in names:

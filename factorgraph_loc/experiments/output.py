@@ -217,7 +217,8 @@ def _rows(
     update_ms: Array,
     flags: pl.DataFrame,
 ) -> pl.DataFrame:
-    """Return the rows of ``estimates.parquet`` for one trajectory. ``flags``: the columns ``status`` and ``doubts_model``."""
+    """Return the rows of ``estimates.parquet`` for one ``kind`` of trajectory. ``flags``: the columns ``status`` and
+    ``doubts_model``."""
     n = len(trajectory)
     covariances = trajectory.covariances if trajectory.covariances is not None else np.full((n, 3, 3), np.nan)
     position, heading, nees = np.full((3, n), np.nan)

@@ -241,7 +241,7 @@ def _remove(path: Path) -> None:
 
 
 def _lock(handle: int, path: Path) -> bool:
-    """Lock an open file without waiting. Return False if another process has locked or removed it, else True."""
+    """Lock the open file ``handle`` without waiting. Return False if another process has locked or removed it, else True."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -53,7 +53,7 @@ def channel_of(m: Measurement) -> str:
 
 
 def named(m: Measurement) -> str:
-    """Return the text that names a measurement in an error, such as ``BearingRange at 1.500 s``."""
+    """Return the name of the measurement ``m`` for an error message, such as ``BearingRange at 1.500 s``."""
     return f"{type(m).__name__} at {m.t:.3f} s"
 
 

@@ -246,7 +246,8 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
 def fisher_gain(mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors) -> Array:
     """Return the expected reduction of entropy (C,) [nats] of a Gaussian belief on each of C paths.
 
-    Standard deviations below :data:`~factorgraph_loc.planning.information.FINEST` are not counted as a gain.
+    ``mean`` (3,), ``covariance`` (3, 3): the belief. Standard deviations below
+    :data:`~factorgraph_loc.planning.information.FINEST` are not counted as a gain.
     """
     fine = np.diag(FINEST**2)
     entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine) for path in paths]

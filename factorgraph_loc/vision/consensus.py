@@ -187,7 +187,8 @@ def _whitened(
 def _squared(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> Array:
-    """Return the squared whitened residuals (H, K) of K points for each of H cameras."""
+    """Return the squared whitened residuals (H, K) of K points for H cameras. ``whiteners`` (K, 2, 2): of the pixel
+    errors."""
     local = (points - position[:, None]) @ rotation
     predicted = reprojection.project(model, local.reshape(-1, 3)).reshape(*local.shape[:2], 2)
     error = np.einsum("kij,hkj->hki", whiteners, predicted - pixels)

@@ -119,7 +119,8 @@ def _gradient(scale: float, centre: Array) -> list[Array]:
 
 
 def _gabor(wavelength: float, angle: float) -> list[Array]:
-    """Return the weights of a Gabor wavelet at the places of the lattice: real part, without its mean, and imaginary part."""
+    """Return the weights of a Gabor wavelet at the lattice places: real part, without its mean, and imaginary part.
+    ``angle`` [rad]: its direction."""
     x, y = LATTICE.T
     window = np.exp(-0.5 * (x**2 + y**2) / (ENVELOPE * wavelength) ** 2)
     window /= window.sum()

@@ -27,7 +27,7 @@ MIN_CONTRAST = 20.0  # grey levels across an edge; an edge with less contrast is
 
 
 def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
-    """Return the refined corners (4, 2) [px] of a marker. A corner is unchanged if its edges are blurred, covered or short.
+    """Return the refined corners (4, 2) [px] of a marker in a ``grey`` image. A corner with poor or short edges is unchanged.
 
     ``corners`` (4, 2) [px]: the detected corners. ``bits``: the number of cells along a side, including the black border.
     """
@@ -101,7 +101,7 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
 
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
-    """Detect the markers in an image. Returns the number of each marker and its corners (4, 2) [px].
+    """Detect the markers of a ``family`` in an image. Returns the number of each marker and its corners (4, 2) [px].
 
     The order of the corners is upper left, upper right, lower right, lower left of the printed marker. A number that
     occurs twice in the image is omitted, because it is not known which of both is meant.

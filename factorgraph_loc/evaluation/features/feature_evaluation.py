@@ -52,7 +52,7 @@ class MatchScores(NamedTuple):
 def evaluate(
     sequence: Sequence, what: Feature, progress: Callable[[], None] = lambda: None
 ) -> Iterator[dict[str, Any]]:
-    """Yield a dictionary of scores for each pair of the first image and a later image of a sequence.
+    """Yield a dictionary of scores of the feature ``what`` for each pair of the first and a later image of a sequence.
 
     The keys are the fields of :class:`MatchScores` and of
     :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`, and also:

@@ -156,7 +156,7 @@ def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple
 def _points(
     metric: Metric, by_value: Mapping[float, dict[str, dict[int, float | None]]]
 ) -> Iterator[tuple[float, float, float, float]]:
-    """Yield the points of a line of :func:`sweep`. ``by_value``: scores by value of the setting, log and seed."""
+    """Yield the points of a line of :func:`sweep`. ``by_value``: scores of ``metric`` by value of the setting, log and seed."""
     for value, scores in sorted(by_value.items()):
         figure = pooled(scores, rms=metric.rms)
         if figure is not None:
@@ -166,7 +166,7 @@ def _points(
 
 
 def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: str) -> str:
-    """Return the name of a line: the label of a run, and its swept settings except the one on the axis."""
+    """Return the name of a line: the label of a run, and its swept settings except ``column``, the setting on the axis."""
     columns = [c for c in results.sweeps if c != column and row.get(c) is not None]
     return ", ".join([results.variants[variant], *(f"{short_name(c)} {row[c]}" for c in columns)])
 

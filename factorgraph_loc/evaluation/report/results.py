@@ -188,12 +188,14 @@ class Results:
         return [row for log in self.logs for row in self.runs(variant, log)]
 
     def scores(self, metric: str, variant: str) -> dict[str, dict[int, float | None]]:
-        """Return a score of a variant by log and seed, None for failed runs and missing scores."""
+        """Return the score ``metric`` of a variant as {log: {seed: value}}. The value is None for failed runs and
+        missing scores."""
         by_log = {log: {row["seed"]: score(row, metric) for row in self.runs(variant, log)} for log in self.logs}
         return {log: seeds for log, seeds in by_log.items() if seeds}
 
     def representative(self, variant: str, log: str, metric: str) -> Row | None:
-        """Return the run with the median score over the seeds. If no run has a score, return the first successful run or None."""
+        """Return the run of a variant on a log with the median of the score ``metric``. Without scores, return the
+        first successful run, or None."""
         well = [row for row in self.runs(variant, log) if row["status"] == "ok"]
         ranked = sorted((s, i) for i, row in enumerate(well) if (s := score(row, metric)) is not None)
         return well[ranked[(len(ranked) - 1) // 2][1]] if ranked else next(iter(well), None)
@@ -262,7 +264,7 @@ def short_name(key: str) -> str:
 
 
 def score(row: Row, metric: str) -> float | None:
-    """Return a score of a run. Return None if the run failed, has no such score, or has too few scored poses.
+    """Return the score ``metric`` of a run. Return None if the run failed, has no such score, or has too few scored poses.
 
     Update times of batch estimators are None, because their updates only collect measurements.
     """

@@ -78,7 +78,8 @@ def associate(
 
 
 def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Integers, Integers]:
-    """Return the indices of paired poses of the estimate and of the reference. The arguments are their timestamps [s]."""
+    """Return the indices of paired poses of the estimate and of the reference, at most ``max_diff`` [s] apart.
+    ``estimate``, ``reference``: their timestamps [s]."""
     swapped = len(estimate) > len(reference)
     short, long = (reference, estimate) if swapped else (estimate, reference)
     later = np.searchsorted(long, short).clip(max=len(long) - 1)
@@ -194,7 +195,7 @@ def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similari
 
 
 def _umeyama(estimate: PosePath, reference: PosePath, *, with_scale: bool) -> Similarity:
-    """Return the least-squares transformation in space, by the method of Umeyama."""
+    """Return the least-squares transformation in space, by the method of Umeyama. ``with_scale``: whether it has a scale."""
     centre, target = estimate.positions.mean(axis=0), reference.positions.mean(axis=0)
     a, b = estimate.positions - centre, reference.positions - target
     left, singular, right = np.linalg.svd(b.T @ a / len(a))
