@@ -75,7 +75,7 @@ def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRul
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
-        expected = f"a timestamp not before that of the row before, {int(t_ns[i - 1])} ns{_remedy(rules)}"
+        expected = f"a timestamp not before that of the previous row, {int(t_ns[i - 1])} ns{_remedy(rules)}"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
 
 
@@ -102,7 +102,7 @@ def arrivals(
     late = newest - t_ns
     if max_late_ns is not None and np.any(late > max_late_ns):
         i = int(np.argmax(late > max_late_ns))
-        expected = f"a timestamp at most 0.5 s older than the newest before it, {int(newest[i])} ns{_remedy(rules)}"
+        expected = f"a timestamp at most 0.5 s older than that of an earlier row, {int(newest[i])} ns{_remedy(rules)}"
         raise bad_field(source, "time", f"{int(t_ns[i])} ns", expected, row=int(rows[i]))
     if count := int(np.count_nonzero(late)):
         sentence = "{source}: {rows} rows are late, by at most {delay:.3f} s"

@@ -92,12 +92,14 @@ def read_mapped(
     given = set(mapping.columns)
     known = set(optional).union(*shapes)
     if unknown := sorted(given - known):
-        raise InputError(f"{path}: there is no field {quoted(unknown[0])} to map{nearest(unknown[0], sorted(known))}")
+        raise InputError(
+            f"{path}: columns has an unknown field {quoted(unknown[0])}{nearest(unknown[0], sorted(known))}"
+        )
     if not any(set(shape) <= given <= set(shape).union(optional) for shape in shapes):
         expected = " or ".join(", ".join(shape) for shape in shapes)
-        raise InputError(f"{path}: columns maps {listed(sorted(given)) or 'nothing'}, expected the fields {expected}")
+        raise InputError(f"{path}: columns has {listed(sorted(given)) or 'nothing'}, expected the fields {expected}")
     if stray := sorted(set(mapping.units) - given):
-        raise InputError(f"{path}: units.{stray[0]} belongs to no field of columns: map the field, or remove the unit")
+        raise InputError(f"{path}: units.{stray[0]} belongs to no field in columns: add the field, or remove the unit")
     needed: list[Alternatives] = [
         (column,) for field, column in mapping.columns.items() if field not in (*optional, *either)
     ]
@@ -168,7 +170,7 @@ class TableFolder:
         ``columns``: the description of each field. ``more``: further invalid cells.
         """
         if cells.passed:
-            sentence = "{source}: {objects} objects that lack mapped columns are skipped"
+            sentence = "{source}: {objects} objects that lack keys in columns are skipped"
             self.warnings.append(notice("incomplete_objects", sentence, cells.path, cells.passed))
         self._read.setdefault(cells.path, []).append((cells, mapping))
         own = {"t": STAMP} | {name: columns[name] for name in cells.columns if name in columns}

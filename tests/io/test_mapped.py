@@ -69,7 +69,7 @@ units = {{ t = "s", wx = "deg/s", wy = "deg/s", wz = "deg/s" }}
     down = one(with_options(options + 'axes = "x -z y"\n'))
     np.testing.assert_allclose(np.degrees(down.streams["imu"].w), (20.0, 30.0))
     one_axis = options.replace('wx = "a", wy = "b", wz = "c"', 'w = "c"').replace('wx = "deg/s", wy = "deg/s", wz', "w")
-    refused(with_options(one_axis + 'axes = "optical"\n'), "axes or mounting is given, but columns maps no wx, wy, wz")
+    refused(with_options(one_axis + 'axes = "optical"\n'), "axes or mounting is given, but columns lacks wx, wy, wz")
 
 
 def test_other_sensors_by_mapping(hall, with_options, one):
@@ -153,7 +153,7 @@ def test_stamps_keep_their_nanoseconds():
         (
             '"impinj_itemtest"',
             '"impinj_itemtest"\nchannels = [866.3]',
-            ("channels is given, but columns maps no channel",),
+            ("channels is given, but columns has no channel",),
         ),
         (', heading = "yaw" }', " }", ("truth.csv", "units.heading belongs to no field")),
         ('decimal = ","', 'decimal = "."', ("wheels.csv:2", "speed is '1,8', expected a number")),

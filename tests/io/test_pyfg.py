@@ -59,7 +59,7 @@ def test_different_variances_and_ranges_of_zero_are_warnings(write, one):
         ("A1 L0 3.1", "A7 L0 3.1", ":8: EDGE_RANGE from is A7, expected a pose"),
         ("3.1 0.09", "3.1", ":8: EDGE_RANGE is 10.6 A1 L0 3.1, expected t POSE LANDMARK range variance"),
         ("3.1 0.09", "3.1 0.0", ":8: variance is 0.0, expected a variance above 0"),
-        ("VERTEX_SE2 11.0", "VERTEX_SE2 1.0", "expected a timestamp not before that of the row before"),
+        ("VERTEX_SE2 11.0", "VERTEX_SE2 1.0", "expected a timestamp not before that of the previous row"),
         ("EDGE_SE2 11.0 A1 A2 0.0 0.0 7.0 0.02 0.0 0.0 0.005 0.0 0.0008\n", "", "has no EDGE_SE2 A1 A2"),
     ],
 )

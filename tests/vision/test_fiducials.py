@@ -170,7 +170,7 @@ def test_images_that_are_no_images_and_those_without_markers(hall):
     ("old", "new", "fragment"),
     [
         ('"tag36h11"', '"tag36h12"', "markers.family is 'tag36h12'"),
-        ("[options.camera]", "[options.sightings]", "no field 'file' to map"),
+        ("[options.camera]", "[options.sightings]", "unknown field 'file'"),
     ],
 )
 def test_wrong_manifests(hall, old, new, fragment):

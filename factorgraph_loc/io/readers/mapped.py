@@ -217,7 +217,7 @@ def _about_z(rows: TableRows, mapping: ImuFile, numbers: dict[str, Array]) -> Ar
         return about_z(rows.path, rows.rows, np.column_stack([numbers[n] for n in RATES]), mapping.turned())
     if mapping.is_given():
         raise InputError(
-            f"{rows.path}: axes or mounting is given, but columns maps no wx, wy, wz: map them, or remove it"
+            f"{rows.path}: axes or mounting is given, but columns lacks wx, wy, wz: add them, or remove axes and mounting"
         )
     return numbers["w"]
 

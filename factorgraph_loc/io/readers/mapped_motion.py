@@ -81,11 +81,11 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
     wheel_names = motions.wheels_of(side, 4 if f"rear_{side}" in mapped.columns else 2) if side else ()
     if side is None and options.has_sizes():
         raise InputError(
-            f"{path}: track, radius or base is given, but columns maps no wheels, such as left and right: map them, or remove "
+            f"{path}: track, radius or base is given, but columns has no wheels, such as left and right: add them, or remove "
             "track, radius and base"
         )
     if options.base is not None and len(wheel_names) == 2:
-        raise InputError(f"{path}: base is given, but only two wheels are mapped: map rear_{side} too, or remove base")
+        raise InputError(f"{path}: base is given, but columns has only two wheels: add rear_{side} too, or remove base")
     size = options.metres(path, side, turns=side in TURNS) if side else 1.0
     t_ns, columns = _columns(mapped, options.clock_offset)
     if "dx" in columns:
@@ -121,7 +121,7 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
     mapped, _ = _with_poses(folder.read(options, (*POSES, ("t", "x", "y")), COLUMNS), options, warnings)
     if "heading" not in mapped.columns and "qw" not in mapped.columns and options.has_heading:
         raise InputError(
-            f"{path}: columns in [options.reference] maps neither heading nor qx, qy, qz, qw: map one of them, or set "
+            f"{path}: columns in [options.reference] has neither heading nor qx, qy, qz, qw: add one of them, or set "
             "has_heading = false"
         )
     t_ns, columns = _columns(mapped, options.clock_offset)
@@ -183,7 +183,7 @@ def _planar(path: Path, rows: Integers, columns: dict[str, Array], turned: Turne
         return on_floor(path, places, rotations, warnings, turned)
     if turned.is_given():
         raise InputError(
-            f"{path}: axes or mounting is given, but columns maps no qx, qy, qz, qw: map them, or remove it"
+            f"{path}: axes or mounting is given, but columns lacks qx, qy, qz, qw: add them, or remove axes and mounting"
         )
     heading = columns.get("heading", np.zeros(len(rows)))
     around = np.abs(np.diff(heading, prepend=heading[0]))

@@ -47,7 +47,7 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as ``rssi_*``.
 
     Each cell that is not empty is a read. The text in place of ``*`` is the EPC of the tag if the antenna is known, or
-    else the name of the antenna. The antenna is known if ``columns`` maps it, or if ``antenna``, the name of the only
+    else the name of the antenna. The antenna is known if ``columns`` has it, or if ``antenna``, the name of the only
     antenna, is given. Raises InputError at an invalid value.
     """
     pattern = mapping.columns["rssi"]
@@ -55,7 +55,7 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     missing = "epc" if "antenna" in fixed or antenna is not None else "antenna"
     if set(fixed) | {missing} != {"t", "epc", *(() if antenna is not None else ("antenna",))} or missing in fixed:
         expected = "t and one of epc, antenna" if antenna is None else "t"
-        raise InputError(f"{path}: columns with rssi = {quoted(pattern)} maps {listed(fixed)}, expected {expected}")
+        raise InputError(f"{path}: columns with rssi = {quoted(pattern)} has {listed(fixed)}, expected {expected}")
     units = {field: unit for field, unit in mapping.units.items() if field != "rssi"}
     narrow = read_mapped(path, mapping.model_copy(update={"columns": fixed, "units": units}), (tuple(fixed),))
     named = re.compile("(.+)".join(map(re.escape, pattern.split("*", 1))), re.DOTALL)
@@ -169,11 +169,11 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
             f"{path}: needs either columns.antenna, or antenna, the name of the only antenna: set one of the two"
         )
     if "channel" in options.columns and options.channels is None:
-        raise InputError(f"{path}: columns maps channel, but channels is missing: give the frequencies [MHz]")
+        raise InputError(f"{path}: columns has channel, but channels is missing: give the frequencies [MHz]")
     if "channel" not in options.columns and options.channels is not None:
-        raise InputError(f"{path}: channels is given, but columns maps no channel: map it, or remove channels")
+        raise InputError(f"{path}: channels is given, but columns has no channel: add it, or remove channels")
     if {"channel", "frequency"} <= set(options.columns):
-        raise InputError(f"{path}: columns maps frequency and channel: remove one of them")
+        raise InputError(f"{path}: columns has frequency and channel: remove one of them")
     shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
     cells = read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
     mapped = folder.noted(cells, options, _columns_of(options), _epcs(cells)[1])
