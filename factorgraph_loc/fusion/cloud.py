@@ -65,8 +65,8 @@ class Cloud:
         return mean[3:], covariance
 
     def _errors(self) -> tuple[Array, Array, Array]:
-        """The body-frame perturbations from the mean pose and the constants of all particles (N, 3+P), with the mean
-        (3+P,) and the covariance (3+P, 3+P) of these values."""
+        """The values (N, 3+P) of the particles: body-frame perturbations from the mean pose, and constants. Also their
+        mean (3+P,) and covariance (3+P, 3+P)."""
         errors = np.concatenate((se2.twists_to(self.moments[0], self.poses), self.constants), axis=1)
         return errors, *vector_moments(errors, self.weights)
 
@@ -293,8 +293,8 @@ def normalised(log_weights: Array) -> Array:
 
 
 def silverman(count: int, size: int) -> float:
-    """Return the bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions, as a fraction of the
-    points' standard deviation (Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14)."""
+    """Return the bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions. The unit is the points'
+    standard deviation. Source: Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14."""
     return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
 
 

@@ -69,8 +69,8 @@ def learnt_from(
     """Return a report of estimated constants and landmarks.
 
     ``constants``: the estimated constants of each sensor. ``blocks``: name, mean and covariance of each block of the
-    state. A block has the constants of a sensor (see ``constants``), the constant of a landmark (1 component), or the
-    position of a landmark called ``KIND/NAME`` (2 components). Larger blocks are points in space and are left out.
+    state. A block has the constants of a sensor, the constant of a landmark (1 component), or the position of a
+    landmark (2 components), which is called ``KIND/NAME``. Larger blocks are points in space and are left out.
     ``points``: a map of estimated points, or None.
     """
     values: dict[str, tuple[float, float]] = {}

@@ -48,8 +48,8 @@ OUTSIDE = -1.0  # change of the log-weight, at each motion, of a particle outsid
 NEGLIGIBLE, WIDENED = 1e-4, np.diag((0.1, 0.1, 0.05)) ** 2
 REACH = 5.0
 
-# A pose is clear if the probability that the robot is within these distances of the pose [m, rad] has exceeded one of the following
-# limits for the time [s] of that limit.
+# A pose is clear if the robot is within these distances [m, rad] of the pose with enough probability for long enough:
+# CLEAR has pairs of a probability and a time [s].
 NEAR_POSITION, NEAR_HEADING = 0.5, math.radians(15.0)
 CLEAR = ((0.95, 1.0), (0.85, 3.0))
 # A clear pose needs at least this many observations with detections, and this many different tags or landmarks.

@@ -70,9 +70,9 @@ class Timeline(ABC):
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """Return the pose at the time of the newest measurement or recorded pose, or at ``t`` [s] if that is later.
 
-        Before the start, the estimate is the most likely hypothesis of the search with the status ``ambiguous``, or NaN
-        with the status ``unlocalized`` if there is none. After the start, the status is ``ambiguous`` while a search is
-        in progress, and while the estimated poses do not explain the measurements.
+        Before the start, the estimate is the most likely hypothesis of the search, with the status ``ambiguous``. If
+        there is none, it is NaN, with the status ``unlocalized``. After the start, the status is ``ambiguous`` while a
+        search is in progress, and while the estimated poses do not explain the measurements.
         """
         if self._begun < math.inf:
             estimate = self._estimate_at(t)

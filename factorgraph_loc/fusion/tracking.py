@@ -120,8 +120,8 @@ class Tracking(Search):
     def is_unsure(self, t: float, covariance: Array) -> bool:
         """True if the estimated pose at ``t`` [s], with ``covariance`` (3, 3), should not be reported as localized.
 
-        This is so if the position error exceeds :data:`NEAR` with a probability above 1 - :data:`SURE`, if the motion
-        is unknown, or if the previous track was rejected less than :data:`PROBATION` ago.
+        There are three reasons: the position error exceeds :data:`NEAR` with a probability above 1 - :data:`SURE`, the
+        motion is unknown, or the previous track was rejected less than :data:`PROBATION` ago.
         """
         if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True

@@ -118,10 +118,10 @@ def map_tags(
 def _along_reference(
     log: Log, observations: TagObservations
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
-    """Locate the tags along the log's reference.
+    """Locate T tags along the log's reference.
 
-    Returns the located tags by index, the facings (T,) [rad], the search result of each of T tags, and the robot poses
-    (K, 3) of the antenna observations.
+    Returns the positions of located tags by index, the facings (T,) [rad] and search results of all tags, and the robot
+    poses (K, 3) at the antenna observations.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference: map its tags with --poses odometry")

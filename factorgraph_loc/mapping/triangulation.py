@@ -92,8 +92,8 @@ class Triangulated:
     parallax: Array
 
     def good(self, tracks: Tracks, model: CameraModel, parallax: float = PARALLAX) -> Truths:
-        """Return a mask (T,) of the points with two or more observations, an allowed depth in all their cameras, a
-        parallax of at least ``parallax`` [rad], and small residuals."""
+        """Return a mask (T,) of the good points. A good point has two or more observations, an allowed depth in all
+        cameras, small residuals, and a parallax of at least ``parallax`` [rad]."""
         invalid = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))
@@ -105,9 +105,8 @@ class Triangulated:
 def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Tracks) -> tuple[Array, Array, Array, Array]:
     """Return the residuals (N, 2) [px] of N observations, predicted minus measured, with derivatives.
 
-    Also returns the Jacobians with respect to the camera pose (N, 2, 6), as in
-    :func:`factors.camera.model.linearize_in_space`, and to the point (N, 2, 3), and the depths (N,) [m].
-    ``points`` (T, 3): positions in the world frame.
+    Also returns the Jacobians with respect to the camera pose (N, 2, 6) and to the point (N, 2, 3), and the depths (N,)
+    [m]. See :func:`factors.camera.model.linearize_in_space`. ``points`` (T, 3): positions in the world frame.
     """
     rotations = cameras.rotations[tracks.frame]
     local = np.einsum("nj,njk->nk", points[tracks.track] - cameras.positions[tracks.frame], rotations)
@@ -202,8 +201,9 @@ def matched_pairs(
 ) -> list[tuple[int, int, Integers, Array]]:
     """Match the features of each of the ``pairs`` (i, j) of images. Pairs without a match are left out.
 
-    ``gate`` [px]: see :func:`near_epipolar_lines`. Returns i, j, the indices (K, 2) of matching features, and the
-    distances (K,) of their descriptors, divided by the median distance of the pair of images.
+    ``gate`` [px]: see :func:`near_epipolar_lines`. Returns for each pair: i, j, the indices (K, 2) of matching
+    features, and the distances (K,) of their descriptors. Distances are divided by their median over the pair of
+    images.
     """
     out = []
     for i, j in pairs:

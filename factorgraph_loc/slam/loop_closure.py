@@ -128,9 +128,8 @@ def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable
 
 
 def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tuple[Array, Integers, Integers] | None:
-    """Return the pose (3,) of the robot, computed from the ``points`` in the image ``frame``, and the indices (M,) of
-    the matched points and features. Returns None if the pose is not on the floor, or if too few visible points match.
-    """
+    """Return the pose (3,) of the robot, and the indices (M,) of matched ``points`` and of features of ``frame``.
+    Returns None if the pose is not on the floor, or if too few visible points match."""
     associator = Associator(points, model)
     somewhere = associator.relocalized(frame)
     if somewhere is None:

@@ -37,8 +37,8 @@ def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> Sla
 
 
 def settled(state: SlamState, eye: Eye) -> SlamState:
-    """Convert points from inverse depth to x, y, z if their depth is certain enough, judged by the linearity index of
-    Civera, Davison and Montiel (2008). Returns the new state."""
+    """Convert points from inverse depth to x, y, z if their depth is certain enough. Returns the new state.
+    The criterion is the linearity index of Civera, Davison and Montiel (2008)."""
     position, _ = eye.pose(state.robot)
     rays = [i for i, p in enumerate(state.points) if p.ray]
     if not rays:

@@ -165,11 +165,10 @@ class FeatureMatcher:
         return state, self.match(m, state, eye)
 
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
-        """Return the rows of an image that may become new points of the state.
+        """Return the indices of features or named pixels of the image ``m`` that may become new points of the state.
 
-        A feature may become a point if it is not matched, belongs to one of ``tracks`` (the feature tracks of the
-        previous image), and is far enough from matched and predicted pixels. A named pixel may become a point if its
-        name is neither in the map nor in the state.
+        A feature qualifies if it is not matched, belongs to ``tracks`` (of the previous image), and is far enough from
+        matched and predicted pixels. A named pixel qualifies if its name is neither in the map nor in the state.
         """
         if m.frame is None:
             known_names = {p.name for p in state.points}

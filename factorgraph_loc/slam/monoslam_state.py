@@ -170,8 +170,8 @@ class Sights:
         return Sights(*(getattr(self, name)[rows] for name in Sights.__dataclass_fields__))
 
     def columns(self) -> tuple[Integers, Array]:
-        """Return the indices (C,) of the values of the error state that the pixels depend on, and the Jacobian (2K, C)
-        of the pixels with respect to these values."""
+        """Return the indices (C,) of the values of the error state that influence the pixels, and the Jacobian (2K, C)
+        of the pixels by these values."""
         own = np.unique(self.starts[self.sizes > 0], return_index=True, return_inverse=True)
         where, first, which = own
         sizes = self.sizes[self.sizes > 0][first]
@@ -291,8 +291,8 @@ class Innovation:
         return positive.root(self.total(noise))
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
-        """Return L, the Cholesky factor (2K, 2K) of the innovation covariance with ``noise`` (K, 2, 2), and M, which is
-        L^-1 times the transpose of ``carried``. The gain of the update is the transpose of M times L^-1."""
+        """Return the factors L and M of the Kalman gain, which is M.T @ inv(L). L: the Cholesky factor (2K, 2K) of the
+        innovation covariance with ``noise`` (K, 2, 2). M: inv(L) @ carried.T."""
         root = self.root(noise)
         return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
 

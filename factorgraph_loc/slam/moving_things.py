@@ -104,7 +104,7 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
 
 
 def fitting(model: CameraModel, first: Array, second: Array, step: Increment) -> Truths:
-    """Return a mask (K,) of the tracks that fit a motion ``step`` of the robot, if the distance of the point is chosen freely.
+    """Return a mask (K,) of the tracks that fit a motion ``step`` of the robot for some distance of the point.
 
     ``first``, ``second`` (K, 2): the pixels of K tracks before and after the motion. Two distances are tried. The first
     is where the rays are nearest to each other. The second is a Gauss-Newton step from there, which considers the

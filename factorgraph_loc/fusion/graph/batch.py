@@ -22,8 +22,8 @@ NARROWED = 0.5  # each step of graduated non-convexity multiplies the scales by 
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
-    """Return all measurements of a graph as one problem. ``link_width`` multiplies the scales of the robust losses of
-    links (factors between two poses, such as loop closures), ``width`` those of all other robust losses."""
+    """Return all measurements of a graph as one problem. ``link_width``: a factor on the scales of the robust losses of
+    links between two poses, such as loop closures. ``width``: a factor on the scales of all other robust losses."""
     assert graph.prior is not None
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)

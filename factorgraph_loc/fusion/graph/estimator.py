@@ -222,8 +222,8 @@ class Smoother(Timeline):
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
-        """Return the robot's pose (3,) at time ``t`` [s], computed back from the pose ``best`` that the search has
-        found for a later time, by the odometry in between."""
+        """Return the robot's pose (3,) at time ``t`` [s], from the pose ``best`` at a later time and the odometry in
+        between. ``best``: the result of the search."""
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
 

@@ -56,7 +56,7 @@ class FullHistory:
     ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
 
     To read an estimate, iSAM2 solves its whole elimination tree. The variables of the last update are therefore solved
-    separately at the root of the tree, except with points, because their updates have many variables.
+    separately, at the root of the tree. Updates with points have too many variables for this.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
@@ -279,14 +279,14 @@ class LinearFactors:
         for linear, linearized in zip(self._added, jacobian_factors(ours, self.at, self._on_failure), strict=True):
             linear.slot = graph.size()
             keys = linear.node.keys
-            # a factor on a held variable needs its own linearisation point
+            # a factor needs special treatment if the linearisation point of a variable is fixed (held)
             is_fixed = self._held and not self._held.keys().isdisjoint(keys)
             graph.add(self._on_held(keys, linearized) if is_fixed else gtsam.LinearContainerFactor(linearized))
         return graph, removed
 
     def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
-        """Correct the Jacobian of a factor that is ``linearized`` at a held variable, so that it agrees with the
-        marginal factors (see the module). ``keys``: its variables. Returns the factor."""
+        """Return the factor ``linearized`` with a Jacobian that agrees with the marginal factors (see the module
+        docstring). ``keys``: the variables of the factor, at least one with a fixed linearisation point."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
         if sum(map(is_place, keys)) > 1:  # a factor on one position has absolute information, which must not be removed
