@@ -147,7 +147,7 @@ class Ekf(Filter):
         self._constants = constants_of(self._motion, self._sensors)
         finders = {name: sensor for name, sensor in self._sensors.items() if sensor.finder is not None}
         slow = {name for name, sensor in finders.items() if sensor.finder and not sensor.finder.at_once}
-        # sensors that find a start or a lost pose, from one measurement or by particles
+        # the sensors of a search for a start or lost pose: all except those that need several measurements for a pose
         fast = {n: s for n, s in self._sensors.items() if n not in slow}
         self._search = Tracking(fast, self._motion, setup.rng, self.diagnostics)
         if self._search.possible:

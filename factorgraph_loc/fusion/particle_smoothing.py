@@ -75,7 +75,7 @@ class BackwardSimulation:
         clouds = [r.cloud for r in kept if r.cloud is not None]
         cloud, kernel = clouds[-1].density()
         self._drawn = [cloud.drawn(systematic(cloud.weights, rng, count), kernel, rng)]
-        # for each pair of consecutive clouds, the noise of the motion that each drawn trajectory implies
+        # for each pair of consecutive clouds, the difference between each trajectory's motion and the odometry
         self._missed: list[Array] = []
         for k in range(len(clouds) - 2, -1, -1):
             drawn, missed = self._step(clouds[k], increment(kept[k], kept[k + 1]), self._drawn[0])
@@ -101,8 +101,8 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """Draw an ancestor from ``cloud`` for each of the M later states ``later``. ``increment``: the odometry in
-        between. Returns the ancestors, and the noise (M, 3) of the odometry that they imply."""
+        """Draw an ancestor from ``cloud`` for each of the M later states ``later``. Returns the ancestors, and the
+        differences (M, 3) between their motions and the odometry. ``increment``: the odometry in between."""
         smooth, kernel = cloud.density()
         # without constants that were added later
         later = replace(later, constants=later.constants[:, : cloud.constants.shape[1]])

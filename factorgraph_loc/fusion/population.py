@@ -157,7 +157,8 @@ class Population:
         return True
 
     def advance(self, work: float = math.inf) -> bool:
-        """Process the queue until the computing cost exceeds ``work``. Returns True if an observation was completed."""
+        """Process queued observations until the computing cost exceeds ``work``. Returns True if at least one of them
+        was processed completely."""
         done = False
         while work > 0.0 and (self._running is not None or self._waiting):
             if self._running is None:

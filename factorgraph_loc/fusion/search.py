@@ -113,7 +113,8 @@ class Search:
             self._population.add(odometry, observation)
 
     def advance(self, t: float) -> bool:
-        """Weigh the particles for one slice of work at time ``t`` [s]. Returns True if an observation was completed."""
+        """Weigh the particles at time ``t`` [s] by queued observations, at a limited computing cost. Returns True if at
+        least one observation was processed completely."""
         if self._population is None or (t < self._advanced + PAUSE and self._work < math.inf):
             return False
         self._advanced = t

@@ -38,7 +38,7 @@ class Taken(NamedTuple):
 
 
 class Timeline(ABC):
-    """The base class of estimators that process measurements in order of time. ``modalities``: the used sensors."""
+    """The base class of estimators that process measurements in order of time."""
 
     deterministic = True
     takes_rows = True  # one measurement may contain several rows of odometry

@@ -77,7 +77,7 @@ def thinned(points: PointMap, most: int) -> PointMap:
 
 
 def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers) -> PointMap:
-    """Join the points of ``first`` and the points of ``second`` with the indices ``added``. All views of ``second`` are joined.
+    """Return a map with the points of ``first``, the points ``added`` (indices) of ``second``, and the views of both.
 
     ``owners`` (P,): for each point of ``second``, the index of the point in the result that gets its views.
     """

@@ -17,8 +17,8 @@ from factors.se2 import Array
 
 
 def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
-    """Return the covariance (12 + P + D, 12 + P + D) of ``posterior`` as if the update had used the invariant error
-    state of this module.
+    """Return the covariance (12 + P + D, 12 + P + D) of ``posterior``, without false information on unobservable
+    directions. It is the covariance after an update in the invariant error state (see the module docstring).
 
     ``prior``: the state before the update. ``posterior``: the state after an ordinary update, with its covariance.
     ``scale``: the index of the odometry's constant that scales distances, or None if this constant is not estimated.

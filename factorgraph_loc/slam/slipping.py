@@ -21,7 +21,7 @@ from factors.motion import Increment, propagate
 from factors.se2 import Array
 
 ENOUGH = 6  # least number of points that must agree with each other
-# m^2, rad^2: covariance of an error that all points have in common
+# m^2, rad^2: covariance of a pose from points, due to errors that all points have in common
 COMMON_COVARIANCE = np.diag((0.02, 0.02, 0.005)) ** 2
 
 
@@ -68,8 +68,8 @@ def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, m
 def _evidence(
     model: CameraModel, pose: Array, covariances: tuple[Array, Array], observed: tuple[Array, Array, Array, Array]
 ) -> float:
-    """Return the log-likelihood ratio of an image for the second of two ``covariances`` (3, 3) of the predicted ``pose`` (3,),
-    relative to the first. Returns 0 if too few points agree. ``observed``: see :func:`unless_slipped`."""
+    """Return the log-likelihood ratio of the second to the first of two ``covariances`` (3, 3) of the predicted
+    ``pose`` (3,), given an image. Returns 0 if too few points agree. ``observed``: see :func:`unless_slipped`."""
     points, pixels, of_points, noise = observed
     agrees = agreeing(model, lifted(model, pose, covariances[1]), points, pixels, noise)
     if np.count_nonzero(agrees) < ENOUGH:
@@ -84,7 +84,7 @@ def _evidence(
 
 
 def more_probable(off: Array, covariances: tuple[Array, Array]) -> float:
-    """Return the log-likelihood ratio of an error ``off`` (D,) for the second of two ``covariances`` (D, D), relative
-    to the first."""
+    """Return the log-likelihood ratio of the second to the first of two ``covariances`` (D, D), given an error ``off``
+    (D,) with mean zero."""
     fits = [positive.squared(off, covariance) + np.linalg.slogdet(covariance)[1] for covariance in covariances]
     return 0.5 * float(fits[0] - fits[1])

@@ -378,7 +378,7 @@ class Graph:
         return RunFailedError(f"the graph cannot be solved at {self.t:.3f} s: {self.reason(error)}")
 
     def reason(self, error: Exception) -> str:
-        """Describe an error of this solver or of GTSAM in one line."""
+        """Return a description in one line of ``error``, an error of this solver or of GTSAM."""
         key = blamed(error)
         if key is None:
             lines = str(error).strip().splitlines()
