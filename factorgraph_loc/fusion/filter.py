@@ -102,7 +102,7 @@ class Filter(Timeline):
         super().__init__(motion, diagnostics, settings.max_delay)
         self._smooth = settings.smooth
         self._state: Any = None
-        # the last requested prediction and the state it started from, so that the next tick can continue from the prediction
+        # the last requested prediction and the state it started from, so that the next request can continue from it
         self._ahead: tuple[Any, Filter] | None = None
         self._odometry = ChainState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         # False until the first measurement after a start: until then, odometry from before the start may still arrive

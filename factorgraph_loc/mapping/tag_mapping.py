@@ -1,7 +1,7 @@
 """Maps of RFID tags from a log, and their comparison with a given map.
 
 The robot poses are those of the log's reference, or they are estimated together with the tags from odometry and reads.
-The map is written in the frame of the survey of the log's rig (``[survey]``), so that it can be used with this rig.
+The map is written in the survey frame, which the section ``[survey]`` of the log's rig transforms to the world frame.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,10 +36,10 @@ Poses = Literal["reference", "odometry"]
 class MadeTags:
     """A new map of tags, and its comparison with the given map.
 
-    ``world``: the map as written to a file, in the frame of tag positions (rig section ``[rfid.survey]``). ``made``:
-    the same tags as landmarks in the world frame, and the verdicts on the given tags. ``poses`` (N, 3): the trajectory
-    in the world frame. ``open``: the reason why a tag was not located, by EPC. ``modes``: candidate positions of
-    ambiguous tags in the world frame, by EPC.
+    ``world``: the map as written to a file, in the survey frame (rig section ``[survey]``). ``made``: the same tags as
+    landmarks in the world frame, and the verdicts on the given tags. ``poses`` (N, 3): the trajectory in the world
+    frame. ``open``: the reason why a tag was not located, by EPC. ``modes``: candidate positions of ambiguous tags in
+    the world frame, by EPC.
     """
 
     world: World
@@ -185,7 +185,7 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 def _world(
     log: Log, observations: TagObservations, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
 ) -> World:
-    """Return the map as written to a file. Learnt tags are in the frame of ``[rfid.survey]``, given tags are unchanged.
+    """Return the map as written to a file: learnt tags in the survey frame (rig section ``[survey]``), given ones as given.
 
     ``made``: the map in the world frame. ``facing``: the facings [rad] of learnt tags in the world frame, by EPC.
     ``in_given_frame``: True if the new map has the frame of the log's map.

@@ -2,8 +2,8 @@
 
 A measurement becomes a keyframe if the last keyframe is at least an interval older. The interval is the sensor's
 ``keyframe_every``, or longer if landmarks are estimated. A mapper of points may need a keyframe earlier (``is_due``). A
-tick becomes a keyframe after :data:`LONGEST_INTERVAL`. All other measurements, including late ones, become factors on
-the previous keyframe, with the odometry since that keyframe as an offset.
+keyframe is also added :data:`LONGEST_INTERVAL` after the last one. All other measurements, including late ones, become
+factors on the previous keyframe, with the odometry since that keyframe as an offset.
 
 Some sensors, such as RFID readers, measure many times a second, each time with little information. Such a sensor
 gathers: the observations on one keyframe are combined into a few factors, which enter the graph together with the next
@@ -96,7 +96,7 @@ class Builder:
         self._gatherer: Sensor | None = None  # the sensor of the collected observations
 
     def pass_time(self, odometry: ChainState) -> None:
-        """Process a tick, a time at which a run records the pose. ``odometry``: the integrated odometry at this time."""
+        """Process a time at which the run records the pose. ``odometry``: the integrated odometry at this time."""
         graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
         if t - graph.newest.t >= LONGEST_INTERVAL:
