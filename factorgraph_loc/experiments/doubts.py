@@ -44,8 +44,8 @@ def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Not
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
     median, most = np.sqrt((np.median(worst), worst.max()))
     sentence = (
-        "{log}: the map was made without a reference. Along the trajectory the standard deviation of its error is {median:.2g} m "
-        "(median), {most:.2g} m at most, which the covariances include"
+        "{log}: the map was made without a reference. Along the trajectory the map's error has a standard deviation of "
+        "{median:.2g} m (median), {most:.2g} m at most. The covariances of the estimates include it"
     )
     return (notice("bent_map", sentence, log.name, median, most),)
 

@@ -172,7 +172,9 @@ def _count(experiment: Experiment, recorded: int, facts: Facts) -> int:
 def _check_count(count: int, experiment: Experiment) -> None:
     """Raise InputError if ``count``, the number of runs of the ``experiment``, is above :data:`MOST_RUNS`."""
     if count > MOST_RUNS:
-        raise InputError(f"the experiment {experiment.name} plans more than {MOST_RUNS:,} runs")
+        raise InputError(
+            f"the experiment {experiment.name} plans more than {MOST_RUNS:,} runs: use fewer logs, seeds or swept values"
+        )
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:

@@ -225,7 +225,7 @@ def test_a_run_without_a_map_writes_one(fgloc, gallery, gallery_on_disk, tmp_pat
     )
     assert result.exit_code == 0, result.output
     assert (
-        "the map was made without a reference. Along the trajectory the standard deviation of its error is 0.0"
+        "the map was made without a reference. Along the trajectory the map's error has a standard deviation of 0.0"
         in result.stderr
     )
     scores = json.loads((tmp_path / "tuesday" / "metrics.json").read_text())
