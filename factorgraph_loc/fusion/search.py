@@ -156,7 +156,7 @@ class Search:
         ]
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
-        """Return poses (N, 3) at time ``t`` [s] and weights (N,) of the particles, None if no particles are used."""
+        """Return poses (N, 3) at time ``t`` [s] and weights (N,) of the particles, None if the result is a finder's."""
         leading = self._leading
         if not isinstance(leading, Population) or leading.newest is None:
             return None

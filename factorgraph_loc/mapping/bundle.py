@@ -42,8 +42,7 @@ class Bundle:
     ``tracks``: the observations without outliers. ``points`` (T, 3) [m]: the adjusted positions of their points.
     ``old`` (T,): the index of each point in the input. ``errors`` (N, 2) [px]: the residuals, predicted minus measured.
     ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first.
-    ``point_covariances`` (T, 3, 3) [m^2]: of the points. Both include the uncertainty of cameras and points, but not
-    that of the calibration.
+    ``point_covariances`` (T, 3, 3) [m^2]: of the points. The uncertainty of the calibration is not included.
     """
 
     model: CameraModel
@@ -97,8 +96,8 @@ def adjust(
 
 
 def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
-    """Return a mask (N,) of the observations whose residual is at most ``limit`` standard deviations. If a point has
-    only one such observation, the mask is False for this observation, because it alone does not determine the point."""
+    """Return a mask (N,) of the observations with a residual of at most ``limit`` standard deviations. If a point has
+    only one such observation, the mask is False for it, because one observation does not determine a point."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     count = np.bincount(tracks.track[right], minlength=tracks.count)
@@ -108,11 +107,8 @@ def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array
 def marginals(
     model: CameraModel, cameras: Cameras, information: Array, tracks: Tracks, points: Array
 ) -> tuple[Array, Array]:
-    """Return the marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised at the given
-    poses and points.
-
-    ``information`` (F, 6, 6): the inverse covariances of the cameras' prior poses.
-    """
+    """Return the marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised at ``cameras``
+    and ``points``. ``information`` (F, 6, 6): the inverse covariances of the cameras' prior poses."""
     count, total = len(cameras), tracks.count
     _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
     by_camera, by_point = by_camera / model.sigma, by_point / model.sigma

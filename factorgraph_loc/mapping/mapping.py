@@ -115,7 +115,7 @@ class LandmarkMap:
 class Alignment:
     """The alignment of a new map with a given map.
 
-    ``pose`` (3,): the transform x, y, angle from the frame of the new map to that of the given map. ``covariance`` (3,
+    ``pose`` (3,): x, y and angle of the transform from the new map's frame to the given map's frame. ``covariance`` (3,
     3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: a correction by which the
     covariances of the new landmarks must be multiplied.
     """
@@ -225,7 +225,7 @@ def _pairs(count: int) -> list[list[int]]:
 
 
 def _moved(point: LearntPoint, alignment: Alignment) -> LearntPoint:
-    """Return a learnt point in the frame of the given map. Its covariance includes that of the ``alignment``."""
+    """Return a learnt point in the frame of the given map, with the covariance of the ``alignment`` added."""
     turn = _rotation(alignment.pose)
     (jacobian,) = _by_alignment(alignment.pose, point.position[None])
     covariance = alignment.factor * turn @ point.covariance @ turn.T + jacobian @ alignment.covariance @ jacobian.T
@@ -248,7 +248,7 @@ def _by_alignment(pose: Array, positions: Array) -> Array:
 
 
 def _differ(point: LearntPoint, landmark: Landmark) -> bool:
-    """True if the position of a learnt point differs significantly from that of a given landmark."""
+    """True if the positions of a learnt point and of a given landmark differ significantly."""
     error = point.position - np.array((landmark.x, landmark.y))
     covariance = point.covariance + landmark.spread()
     return bool(np.hypot(*error) > TOLERANCE and error @ np.linalg.solve(covariance, error) > GATE)

@@ -59,7 +59,7 @@ def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
 def thinned(points: PointMap, most: int) -> PointMap:
     """Return a map with all points without views, and at most ``most`` of the points with views.
 
-    Points are removed evenly over space. In each cell of space, the points with the smallest covariances are kept.
+    As many cells of space as possible keep points. In each cell, the points with the smallest covariances are kept.
     """
     viewed = np.unique(points.owners)
     if len(viewed) <= most:

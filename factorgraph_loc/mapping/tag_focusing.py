@@ -30,7 +30,7 @@ from factors.se2 import Array
 TEMPERING = 0.5
 STEP = 0.02  # m: spacing of the lattice, a quarter of the period of the likelihood
 REACH, FARTHEST = 3.0, 1.0  # half the size of the lattice: standard deviations of the prior, and upper bound in m
-SELECTIONS = 3  # number of times that the used reads are selected again, because the selection depends on the position
+SELECTIONS = 3  # number of times that the used reads are selected, because the selection depends on the position
 ITERATIONS, CONVERGED = 20, 1e-4  # of Fisher scoring; the step is in m
 FEWEST = 20  # reads
 INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and largest time between keyframes

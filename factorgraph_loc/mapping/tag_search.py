@@ -82,7 +82,7 @@ class TagPosterior:
     """The result of the search for one tag.
 
     ``modes``: by descending weight; the weights sum to 1. ``reads``: the number of inventory rounds that read the tag.
-    ``gain``: the tempered log-likelihood at the best position, minus that of a tag out of reach of all antennas.
+    ``gain``: the tempered log-likelihood ratio of the best position to a position out of reach of all antennas.
     """
 
     modes: tuple[TagMode, ...]
@@ -240,8 +240,8 @@ def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, f
 
 
 def _modes(optima: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMode, ...]:
-    """Convert the local optima of one tag to modes. Equal optima are dropped, and overlapping ones, such as those that
-    differ in facing only, are merged.
+    """Return the modes of one tag from its local optima. Equal optima are dropped. Overlapping optima are merged, such
+    as optima that differ in facing only.
 
     ``optima``: C optima, best first. ``nll`` (C,): their negative log-likelihoods. ``covariances`` (C, 2, 2).
     """

@@ -152,7 +152,7 @@ class Mapper:
         return ()
 
     def keep_only(self, keys: set[int]) -> None:
-        """Discard all points except those with these ``keys``."""
+        """Discard all points except the points with the keys ``keys``."""
 
     def forget(self, first: Keyframe) -> Sequence[int]:
         """Delete the data of keyframes before ``first``. Also delete points that have left the graph, if ``first`` and

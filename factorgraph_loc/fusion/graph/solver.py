@@ -211,11 +211,12 @@ class Window(FullHistory):
 
 
 def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[int, gtsam.NonlinearFactor]:
-    """Auxiliary factors that make iSAM2 hold the linearisation points of the variables of marginal ``factors``.
+    """Return auxiliary factors that keep iSAM2 from moving the linearisation points of the variables of ``factors``.
 
-    Each auxiliary factor connects one of these variables with a new auxiliary variable, and has no information. The auxiliary
-    variable is marginalised immediately. iSAM2 never moves the linearisation point of a variable next to a marginalised one.
-    Returns the auxiliary factors by the key of their auxiliary variable. ``values``: the values of the variables.
+    Each auxiliary factor connects one of these variables with a new auxiliary variable, and has no information. The
+    auxiliary variable is marginalised immediately. iSAM2 never moves the linearisation point of a variable next to a
+    marginalised one. The keys of the result are the auxiliary variables. ``factors``: marginal factors. ``values``: the
+    values of the variables.
     """
     marginal = (factor.keys() for factor in factors if isinstance(factor, gtsam.LinearContainerFactor))
     fixed = dict.fromkeys(key for keys in marginal for key in keys)
