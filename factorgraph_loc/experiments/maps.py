@@ -56,7 +56,7 @@ FLAGS: dict[
 }
 HEIGHTS = (-10.0, 20.0)  # m; bounds of the height of tags and landmarks
 OF_REFERENCE = "that of the reference"
-BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without one"
+BY_RUN = "fgloc run -e smoother --set smoother.landmarks=unknown makes a map of points without a reference"
 SOURCES = {"log": "the log's start", "reference": "its reference"}
 
 Progress = Callable[[float], None]

@@ -18,7 +18,7 @@ from factorgraph_loc.text import Notice, listed, notice, quoted
 # standard deviations of a start pose that is a pose of the reference
 REFERENCE_POSITION_SIGMA = 0.02  # m
 REFERENCE_HEADING_SIGMA = 0.01  # rad
-SET_PRIOR = "set the prior (--prior) to"  # start of the remedy in messages about the start
+SET_PRIOR = "set the prior (--prior) to"  # last part of messages about the start pose
 
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:

@@ -101,7 +101,7 @@ def _use(log: Log, config: RunConfig) -> Use:
     """Return the sensors and settings of a run. Raises InputError if values of the log or the configuration are out of bounds."""
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
-    require_bounds(log)  # a log that a program has made was not checked by a reader
+    require_bounds(log)  # no reader has checked a log that was made by a program
     require_one_span(log)
     sensors = used_sensors(log, config.sensors)
     settings = registry.settings_of(config.estimator, config.settings)

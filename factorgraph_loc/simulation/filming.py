@@ -96,7 +96,7 @@ def film(settings: SimulationSettings, seed: int) -> Film:
     if camera.z > LOWEST_BOX:
         raise InputError(
             f"rig {settings.rig.name}: camera.z is {camera.z:g}, expected at most {LOWEST_BOX:g} m for simulated images: "
-            "from above, simulated furniture cannot be rendered"
+            "furniture is rendered without an upper side"
         )
     world_seed = seed if settings.world_seed is None else settings.world_seed
     world = make_world(settings.world, generator(world_seed, "world"))
