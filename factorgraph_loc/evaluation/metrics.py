@@ -252,12 +252,12 @@ def _constants(learnt: Learnt) -> dict[str, float]:
 def _counts(diagnostics: Diagnostics) -> dict[str, Any]:
     """Return the diagnostics of a run as scores by key.
 
-    - ``nis.SENSOR.median_ratio``: median of the NIS divided by its expected median, ideally 1. ``nis.SENSOR.beyond_95``: fraction
-      above the 95 % bound. ``nis.SENSOR.count``: number of innovations.
+    - ``nis.SENSOR.median_ratio``: median of the NIS divided by its expected median, ideally 1.
+      ``nis.SENSOR.beyond_95``: fraction above the 95 % bound. ``nis.SENSOR.count``: number of innovations.
     - ``residual.NAME.rms`` and ``residual.NAME.median_abs`` [m or rad]: of measurement minus prediction.
     - ``ignored.*``, ``rejected.*``, ``late.*``: numbers of unused measurements, in total and by reason.
-    - ``KIND.NAME``: probability that the map is wrong about the landmark or tag NAME. KIND is the kind of error, such as
-      ``moved_tags``. ``KIND.total``: number of these landmarks or tags.
+    - ``KIND.NAME``: probability that the map is wrong about the landmark or tag NAME. KIND is the kind of error, such
+      as ``moved_tags``. ``KIND.total``: number of these landmarks or tags.
     - ``events``: number of events.
     """
     figures: dict[str, Any] = {}

@@ -83,10 +83,10 @@ def _seeds(value: Any) -> Any:
 class LogEntry(FileModel):
     """An entry of ``logs``: either recorded logs (``log``) or simulated logs (``simulate``).
 
-    ``log``: a name that ``fgloc datasets`` lists, a path relative to the experiment file, or a glob of names or paths. With
-    ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world`` that replace those of the log.
-    ``simulate``: a preset or a TOML file. With ``simulate`` there may be ``settings`` of the simulation, and ``seeds``. There
-    is one simulated log per seed.
+    ``log``: a name that ``fgloc datasets`` lists, a path relative to the experiment file, or a glob of names or paths.
+    With ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world`` that replace those of
+    the log. ``simulate``: a preset or a TOML file. With ``simulate`` there may be ``settings`` of the simulation, and
+    ``seeds``. There is one simulated log per seed.
     """
 
     log: Name | None = None

@@ -171,9 +171,9 @@ def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, o
 def orientation_histograms(patches: Float, side: int, weights: Float, histograms: Float) -> None:
     """Compute histograms of the gradient directions in patches.
 
-    ``patches`` (N, side * side): the samples of each patch, row by row. ``weights`` (side - 2, side - 2): weights of the
-    gradients, in addition to their magnitude. ``histograms`` (N, bins): the result is added here. Bin 0 is centred at direction
-    0. Each gradient is distributed over the two nearest bins.
+    ``patches`` (N, side * side): the samples of each patch, row by row. ``weights`` (side - 2, side - 2): weights of
+    the gradients, in addition to their magnitude. ``histograms`` (N, bins): the result is added here. Bin 0 is centred
+    at direction 0. Each gradient is distributed over the two nearest bins.
     """
     bins = histograms.shape[1]
     per_radian = np.float32(bins / (2.0 * math.pi))

@@ -112,7 +112,7 @@ def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnifie
     """Return candidates for pairs of overlapping regions, with their overlap errors (see :func:`pair_errors`).
 
     All pairs with an error below :data:`OVERLAP_ERROR` are among the candidates. ``magnified``: if true, both regions
-    are enlarged by the same factor, so that the first region has the radius :data:`RADIUS`. Otherwise the radius of a
+    are scaled by the same factor, so that the first region has the radius :data:`RADIUS`. Otherwise the radius of a
     region is :data:`MEASUREMENT` times half the size of its point.
     """
     if len(first) == 0 or len(second) == 0:

@@ -36,12 +36,12 @@ def write_report(
 ) -> None:
     """Write the report with the heading ``title`` to the file ``out``.
 
-    ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional columns are
-    label, sensors, kind (of a failure), warnings and ``sweep.*``.
+    ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional
+    columns are label, sensors, kind (of a failure), warnings and ``sweep.*``.
     ``runs``: a function that returns the result files of a run by its key. ``metrics``: keys of the scores to show.
-    ``baseline``: label of the runs with which all other runs are compared. If it is None or no run has it, the first label is
-    used. ``experiment``: content of the experiment file. ``damaged``: descriptions of runs with unusable results.
-    ``versions``: version of each used software by name.
+    ``baseline``: label of the runs with which all other runs are compared. If it is None or no run has it, the first
+    label is used. ``experiment``: content of the experiment file. ``damaged``: descriptions of runs with unusable
+    results. ``versions``: version of each used software by name.
 
     Raises InputError if there are no rows.
     """
