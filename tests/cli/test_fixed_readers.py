@@ -89,4 +89,4 @@ def test_a_rig_has_antennas_or_tags(refused, log, tmp_path):
     rig.write_text(
         'name = "both"\nsensors = ["odometry", "rfid"]\n[rfid.tags.A]\nz = 1.0\n[rfid.antennas.left]\nz = 1.0\n'
     )
-    assert "expected one of antennas, a preset, and tags" in refused("info", log, "--rig", rig)
+    assert "expected exactly one of antennas, preset and tags" in refused("info", log, "--rig", rig)

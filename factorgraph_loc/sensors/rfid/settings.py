@@ -27,8 +27,8 @@ Share = Annotated[float, Field(ge=0.0, lt=0.5)]
 
 
 class PriorSettings(FileModel):
-    """Standard deviations of two parameters of a detection model before a run (:mod:`factors.rfid.parameters`). A
-    parameter is estimated if its standard deviation is above 0."""
+    """Standard deviations of two parameters of a detection model before a run (:mod:`factors.rfid.parameters`).
+    Parameters with a value above 0 are estimated."""
 
     range_scale: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
     """standard deviation of the logarithm of the model's range"""
@@ -37,8 +37,8 @@ class PriorSettings(FileModel):
 
 
 class RfidUncertainty(FileModel):
-    """Standard deviations of mounting and clock before a run. A constant is estimated if its value is above 0. The
-    defaults are multiples of the largest setting ``prior.range_scale`` of the detection models."""
+    """Standard deviations of the yaws of antennas and of the time offset before a run. Constants above 0 are estimated.
+    The defaults are proportional to the largest ``prior.range_scale`` of the detection models."""
 
     yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
     """standard deviation of a yaw that all antennas share; by default 0.35 times the largest prior.range_scale"""
@@ -48,11 +48,11 @@ class RfidUncertainty(FileModel):
     """standard deviation of the time offset; by default 0.4 times the largest prior.range_scale"""
 
 
-BY_RANGE = {"yaw": 0.35, "antenna_yaw": 0.25, "time_offset": 0.4}  # rad, rad, s; default values for range_scale = 1
+BY_RANGE = {"yaw": 0.35, "antenna_yaw": 0.25, "time_offset": 0.4}  # rad, rad, s; defaults for range_scale = 1
 
 
 class BeamSettings(FileModel):
-    """A detection model with a beam: the probability of a read at distance r and bearing phi is
+    """A detection model of a directional antenna. The probability of a read at distance r and bearing phi is
     p0 sigmoid((r_max - r) / s_r) exp(-(phi / sigma_phi)^2 / 2). See :class:`factors.rfid.model.BeamModel`."""
 
     kind: Literal["beam"] = "beam"
@@ -87,7 +87,7 @@ class LogisticSettings(FileModel):
 
 
 class GridSettings(FileModel):
-    """A detection model as a learnt grid, which is stored in a file."""
+    """A detection model that consists of read probabilities on a grid around the antenna, stored in a file."""
 
     kind: Literal["grid"] = "grid"
     prior: PriorSettings = Field(default_factory=PriorSettings)
@@ -96,14 +96,14 @@ class GridSettings(FileModel):
     _folder: Path = PrivateAttr(default=Path())
 
     def model(self) -> GridModel:
-        """Read the grid. Raises InputError if the file is invalid."""
+        """Return the grid in the file. Raises InputError if the file is invalid."""
         return read_grid(self.path())
 
     def path(self) -> Path:
         return inside(self._folder, self.file, "grid")
 
     def placed(self, folder: Path) -> GridSettings:
-        """Return a copy whose file name is relative to ``folder``, the folder of the rig's file."""
+        """Return a copy that looks for its file in ``folder``, the folder of the rig's file."""
         out = self.model_copy()
         out._folder = folder
         return out
@@ -130,7 +130,7 @@ class AntennaSettings(FileModel):
 
 
 class FixedAntenna(AntennaSettings):
-    """Pose and detection model of an antenna that is fixed in the building, in the map."""
+    """Pose and detection model of an antenna that is fixed in the building. It is part of the map."""
 
     x: Coordinate
     """position of the antenna"""
@@ -139,7 +139,7 @@ class FixedAntenna(AntennaSettings):
 
 
 class CarriedTag(FileModel):
-    """Mounting of a tag on the robot, which fixed antennas read."""
+    """Position and facing of a tag on the robot, for antennas that are fixed in the building."""
 
     x: Offset = 0.0
     """position of the tag, forward"""
@@ -165,13 +165,13 @@ class RssiSettings(FileModel):
     """exponent of the likelihood, below 1 for correlated reads"""
 
     def model(self, antennas: tuple[Antenna, ...]) -> RssiModel:
-        """Return the model for the given antennas."""
+        """Return the model of signal strength for ``antennas``."""
         return RssiModel(antennas, self.coefficients, self.sigma, self.dof, self.tempering)
 
 
 class PhaseSettings(FileModel):
-    """A model of the phase of reads in windows of time. See :class:`factors.rfid.signals.PhaseModel`. Windows may
-    overlap, so reads have the weight ``step`` / ``window``."""
+    """A model of the phase of reads in time windows. See :class:`factors.rfid.signals.PhaseModel`. A read has the
+    weight ``step`` / ``window``, because windows may overlap."""
 
     kappa: Annotated[float, Field(ge=1e-6, le=100.0)] = 1.0
     """concentration of the phases (parameter of the von Mises distribution)"""
@@ -193,7 +193,7 @@ class PhaseSettings(FileModel):
         return self
 
     def model(self, antennas: tuple[Antenna, ...]) -> PhaseModel:
-        """Return the model of the phases in one window for the given antennas."""
+        """Return the model of the phases in one window for ``antennas``."""
         return PhaseModel(
             antennas, self.kappa, self.tempering * self.step / self.window, self.max_range, self.min_reads
         )
@@ -203,7 +203,7 @@ RACKHAM_RADIUS = 0.25  # m; distance of the antennas from the centre of the robo
 
 
 def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
-    """Return eight antennas around the body of a robot at height ``z`` [m]."""
+    """Return eight antennas around a robot at the height ``z`` [m], by name."""
     out = {}
     for i in range(8):
         yaw = se2.wrap_scalar(i * math.pi / 4.0)
@@ -214,12 +214,13 @@ def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
 
 
 def default_models() -> dict[str, BeamSettings | LogisticSettings | GridSettings]:
-    """Return the default detection model of uncalibrated antennas."""
+    """Return the detection model of uncalibrated antennas, by its name "default"."""
     return {"default": BeamSettings()}
 
 
 class RfidSettings(SensorSettings):
-    """An RFID reader: ``antennas`` on the robot, a ``preset`` of them, or ``tags`` on the robot for the antennas of the map."""
+    """An RFID reader. It has either ``antennas`` or a ``preset`` on the robot, or antennas in the building that read
+    ``tags`` on the robot."""
 
     preset: Literal["rackham"] | None = None
     """replaces antennas; rackham has eight antennas around the body, named 1 to 8 counter-clockwise from the front"""
@@ -255,7 +256,7 @@ class RfidSettings(SensorSettings):
     @model_validator(mode="after")
     def _is_complete(self) -> RfidSettings:
         if (self.preset is not None) + bool(self.antennas) + bool(self.tags) != 1:
-            raise ValueError("expected one of antennas, a preset, and tags on the robot")
+            raise ValueError("expected exactly one of antennas, preset and tags")
         for name, antenna in self.all_antennas().items():
             if antenna.model not in self.models:
                 raise ValueError(
@@ -267,20 +268,20 @@ class RfidSettings(SensorSettings):
         return self.antennas if self.preset is None else rackham(self.preset_z)
 
     def placed(self, folder: Path) -> RfidSettings:
-        """Return a copy whose grids are files in ``folder``."""
+        """Return a copy that looks for the files of detection grids in ``folder``."""
         models = {k: m.placed(folder) if isinstance(m, GridSettings) else m for k, m in self.models.items()}
         return self.model_copy(update={"models": models})
 
     def write_beside(self, folder: Path) -> None:
-        """Write the files of detection grids into ``folder``."""
+        """Copy the files of detection grids to ``folder``."""
         for model in self.models.values():
             if isinstance(model, GridSettings) and model.path().resolve() != (folder / model.file).resolve():
                 write_grid(model.model(), folder / model.file)
 
     def estimated(self, *, mounting: bool = True) -> Estimated:
-        """Return the parameters of the likelihood (:mod:`factors.rfid.parameters`) that an estimator estimates.
+        """Return the parameters of the likelihood (:mod:`factors.rfid.parameters`) that are estimated in a run.
 
-        ``mounting``: if False, the yaw of antennas and the time offset are not estimated.
+        ``mounting``: False to exclude the yaws of antennas and the time offset.
         """
         used, known, antennas = self.parameter_names(), self.uncertainties(), list(self.all_antennas())
         names = [used[model][i] if model in used else "" for model in self.models for i in range(len(OF_MODEL))]
@@ -292,21 +293,20 @@ class RfidSettings(SensorSettings):
         return Estimated.among(names, np.array(sigmas))
 
     def uncertainties(self) -> dict[str, float]:
-        """Return the standard deviations of mounting and clock, as given or by default."""
+        """Return the standard deviations in ``uncertainty`` by name, with defaults for missing values."""
         largest = max(self.models[antenna.model].prior.range_scale for antenna in self.all_antennas().values())
         given = self.uncertainty.model_dump(exclude_none=True)
         return {name: share * largest for name, share in BY_RANGE.items()} | given
 
     def parameter_names(self) -> dict[str, tuple[str, ...]]:
-        """Return the names of the parameters of each detection model that an antenna uses. If antennas use several
-        models, names have the prefix ``MODEL.``."""
+        """Return the names of the parameters of each detection model that an antenna uses, by the name of the model. If
+        several models are used, names have the prefix ``MODEL.``."""
         used = {antenna.model for antenna in self.all_antennas().values()}
         prefixes = {model: "" if len(used) == 1 else f"{model}." for model in self.models if model in used}
         return {model: tuple(prefix + name for name in OF_MODEL) for model, prefix in prefixes.items()}
 
     def model(self) -> RfidModel:
-        """Return the model of all antennas, in the order of :meth:`all_antennas`. Raises InputError if a grid cannot be
-        read."""
+        """Return the model of all antennas, ordered as in :meth:`all_antennas`. Raises InputError for invalid grids."""
         names = list(self.models)
         return RfidModel(
             antennas=tuple(
@@ -321,7 +321,7 @@ class RfidSettings(SensorSettings):
 
 
 class SurveySettings(FileModel):
-    """The transform from the frame of the tags' survey to the world: a rotation about a point, then a translation."""
+    """The transform from the survey frame of the tags to the world frame: a rotation, followed by a translation."""
 
     x: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
     """translation of the map's tags along x, after the rotation"""
@@ -335,7 +335,7 @@ class SurveySettings(FileModel):
     """centre of the rotation, in the frame of the survey"""
 
     def transform(self) -> Array:
-        """Return the pose (3,) of the survey's frame in the world."""
+        """Return the pose (3,) of the survey frame in the world frame."""
         pivot = np.array((self.about_x, self.about_y))
         turned = se2.transform_from(np.array((0.0, 0.0, self.heading)), pivot)
         origin = pivot + np.array((self.x, self.y)) - turned
@@ -343,14 +343,14 @@ class SurveySettings(FileModel):
 
 
 ARRAYS = ("logits", "origin", "cell", "heights")
-FARTHEST = 1000.0  # m; largest distance of a grid's knots from the antenna
-FINEST = 1e-3  # m; minimum distance between knots
-LARGEST = 20.0  # largest logit of a knot; the probability is then 0 or 1 to nine digits
+FARTHEST = 1000.0  # m; maximum distance of a grid point from the antenna
+FINEST = 1e-3  # m; minimum distance between grid points
+LARGEST = 20.0  # maximum absolute logit; the probability is then 0 or 1 to nine digits
 
 
 def read_grid(path: str | Path) -> GridModel:
-    """Read a detection grid from an .npz file. Infinite logits are clipped. Raises InputError with the array that is
-    missing, or whose shape or values are invalid."""
+    """Return the detection grid in an .npz file, with clipped logits. Raises InputError if an array is missing, or if
+    its shape or values are invalid."""
     arrays = _read_arrays(Path(path))
     logits, origin, heights = arrays["logits"], arrays["origin"], np.atleast_1d(arrays["heights"])
     if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):
@@ -372,7 +372,7 @@ def read_grid(path: str | Path) -> GridModel:
 
 
 def _read_arrays(path: Path) -> dict[str, Array]:
-    """Return the arrays of a grid file by name. The archive's declared unpacked size is checked first."""
+    """Return the arrays of a grid file by name. Raises InputError if the unpacked arrays would be too large."""
     with opened(path, GRID) as file, foreign(path, "is not a file of arrays (.npz)"):
         with zipfile.ZipFile(file) as archive:
             require_size(path, "its size in bytes when unpacked", sum(m.file_size for m in archive.infolist()), GRID)

@@ -28,7 +28,7 @@ from factors.se2 import Array
 
 
 class SimulatedPhaseSettings(FileModel):
-    """Settings of simulated phases of reads."""
+    """Settings of simulated phases of RFID reads."""
 
     frequency: Annotated[float, Field(ge=3e8, le=6e9), InUnit("Hz")] = 920.625e6
     """frequency of the carrier"""
@@ -39,7 +39,7 @@ class SimulatedPhaseSettings(FileModel):
 
 
 class SimulatedRssiSettings(FileModel):
-    """Settings of simulated signal strengths of reads. The noise has a Student-t distribution."""
+    """Settings of simulated signal strengths of RFID reads. The noise has a Student-t distribution."""
 
     coefficients: Annotated[tuple[Weight, ...], Field(min_length=6, max_length=6)] = (-50.0, 2.0, -8.0, 0.0, 2.0, 0.0)
     """coefficients of the strength, as rfid.rssi.coefficients of a rig"""
@@ -50,7 +50,8 @@ class SimulatedRssiSettings(FileModel):
 
 
 class Fading(FileModel):
-    """Fades: intervals when an antenna misses a tag. Fades are independent for each antenna and tag."""
+    """Settings of fades: time intervals in which an antenna cannot read a tag. They are independent for each pair of an
+    antenna and a tag."""
 
     duration: Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("s")] = 2.0
     """mean duration of a fade"""
@@ -59,9 +60,9 @@ class Fading(FileModel):
 
 
 class AntennaStop(FileModel):
-    """The failure of an antenna, which reads nothing from then on."""
+    """The failure of an antenna at some time. After this time the antenna reads nothing."""
 
-    model_config = ConfigDict(coerce_numbers_to_str=True)  # antennas are often named by numbers
+    model_config = ConfigDict(coerce_numbers_to_str=True)  # names of antennas are often numbers
 
     antenna: str
     """name of the antenna"""
@@ -81,7 +82,7 @@ class ClockJump(FileModel):
 
 
 class Silence(FileModel):
-    """An interval without reads by any antenna."""
+    """A time interval in which no antenna reads a tag."""
 
     time: Duration
     """start of the interval without reads"""
@@ -110,14 +111,14 @@ Hits = NDArray[np.bool_]
 
 
 def read_probabilities(likelihood: RfidLikelihood, poses: Array) -> Array:
-    """Return the probabilities (N, A, T) that one round of each of A antennas at ``poses`` (N, 3) reads each of T tags.
-    They include the probability of false reads."""
+    """Return the probability (N, A, T) that antenna a reads tag t in one round at the robot pose n, including false
+    reads. ``poses`` (N, 3): the robot poses."""
     antennas = range(len(likelihood.model.antennas))
     return np.stack([likelihood.probabilities(poses, a) for a in antennas], axis=1)
 
 
 def draw_dead(faults: FaultSettings, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Choose the dead tags among ``count`` tags at random. Returns their indices."""
+    """Return the indices of randomly chosen dead tags among ``count`` tags. ``faults.dead`` is their fraction."""
     return np.asarray(rng.permutation(count)[: round(faults.dead * count)])
 
 
@@ -129,13 +130,11 @@ def draw_reads(
     dead: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> Hits:
-    """Draw the reads of A antennas and T tags in rounds at ``times`` (N,). Returns a mask (N, A, T) that is True for reads.
+    """Draw random reads of T tags by A antennas in rounds at ``times`` (N,). Returns a mask (N, A, T) of the reads.
 
-    ``probabilities`` (N, A, T): the probability of a read without faults. ``faults``: faults of the map and of the
-    clock are not simulated here, all others are.
-    ``dead``: indices of tags that are never read. In a fade a tag has only false reads. Outside of fades the
-    probability is higher, so that its mean is that of ``probabilities``. This is possible if the rig's ``miss`` is at
-    least the fraction of time in fades.
+    ``probabilities`` (N, A, T): the mean probability of a read over time. ``faults``: the faults to simulate, except
+    those of map and clock. In a fade, tags have only false reads. Outside of fades their probability is therefore
+    higher. ``dead``: indices of tags that are never read.
     """
     shape = probabilities.shape
     share = faults.fading.share
@@ -159,17 +158,18 @@ def draw_reads(
 def rfid_stream(
     names: list[str], epcs: list[str], times: Array, hits: Hits, faults: FaultSettings, signals: Mapping[str, Array]
 ) -> RfidStream:
-    """Return the stream of the reads ``hits`` (N, A, T), a mask, of antennas ``names`` (A) and tags ``epcs`` (T).
+    """Return simulated reads as a stream. ``hits`` (N, A, T): a mask of the reads, see :func:`draw_reads`.
 
-    All antennas end a round at each of ``times`` (N,) [s], which are also the times of the reads. ``signals``: values
-    (N, A, T) of rssi, phase and frequency, if they are simulated.
+    ``names`` (A): antennas. ``epcs`` (T): tags. ``times`` (N,): the times [s] of the reads, at which a round of every
+    antenna ends. ``faults``: stops antennas, and shifts the clock. ``signals``: values (N, A, T) of "rssi", "phase" and
+    "frequency", if they are simulated.
     """
     listened = np.ones(hits.shape[:2], dtype=bool)
     stop = faults.antenna_stop
     if stop is not None and not stop.rounds_go_on:
         listened[times >= stop.time, names.index(stop.antenna)] = False
     empty = listened & ~hits.any(axis=2)
-    # the last column, without a tag, is for rounds without reads
+    # the last column is True for rounds without reads
     n, a, tag = np.nonzero(np.concatenate((hits & listened[:, :, None], empty[:, :, None]), axis=2))
     if (jump := faults.clock_jump) is not None:
         times = times + np.where(times >= jump.time, jump.jump, 0.0)
@@ -189,17 +189,17 @@ def rfid_stream(
 
 
 def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.Generator) -> Hits:
-    """Simulate fades at ``times`` (N,). Returns a mask (N, A, T) that is True while a tag is in a fade for an antenna.
+    """Simulate fades at ``times`` (N,). Returns a mask (N, A, T) that is True while antenna a cannot read tag t.
 
-    ``shape``: (A, T). Each pair has a stationary Markov chain of two states (Gilbert, Bell System Technical Journal 39,
-    1960). Fades end with the rate 1 / ``duration``, and begin with the rate that results in the fraction ``share``.
+    ``shape``: (A, T). Each pair of an antenna and a tag has a stationary Markov chain with two states (Gilbert, Bell
+    System Technical Journal 39, 1960).
     """
     out = np.empty((len(times), *shape), dtype=bool)
     rate = 1.0 / (fading.duration * (1.0 - fading.share))
     state = rng.random(shape) < fading.share
     for i in range(len(times)):
         if i:
-            # with this probability the state is drawn again, independent of the previous one
+            # the state is drawn again with the probability that it is independent of the previous state
             forgotten = rng.random(shape) < -np.expm1(-rate * (times[i] - times[i - 1]))
             state = np.where(forgotten, rng.random(shape) < fading.share, state)
         out[i] = state
@@ -207,8 +207,8 @@ def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.
 
 
 def _false(count: int, share: float, shape: tuple[int, ...], rng: np.random.Generator) -> Hits:
-    """Return random false reads as a mask of this ``shape`` (N, A, T). Their expected fraction of all reads is
-    ``share``, if there are ``count`` true reads."""
+    """Return a mask of random false reads, with the shape ``shape``. With ``count`` true reads, the expected fraction
+    of false reads among all reads is ``share``."""
     out = np.zeros(shape, dtype=bool)
     size = out.size
     extra = min(rng.poisson(count * share / (1.0 - share)), size)
@@ -224,8 +224,8 @@ def strengths(
     settings: SimulatedRssiSettings,
     rng: np.random.Generator,
 ) -> Array:
-    """Simulate the RSSI (N, A, T) [dBm] of the reads ``hits`` (N, A, T), a mask, at robot ``poses`` (N, 3). It is NaN
-    without a read. The model is that of :mod:`factors.rfid.signals`."""
+    """Return the simulated RSSI (N, A, T) [dBm] of reads by the model of :mod:`factors.rfid.signals`, NaN without a
+    read. ``hits`` (N, A, T): a mask of the reads. ``poses`` (N, 3): the robot poses."""
     n, a, tag = np.nonzero(hits)
     reads = RssiReads(poses[n], a, tag, np.full(len(n), np.nan))
     features = strength_features(rfid.model().antennas, tags, np.zeros(3), reads)
@@ -237,7 +237,7 @@ def strengths(
 def phases(
     rfid: RfidSettings, tags: TagArray, poses: Array, settings: SimulatedPhaseSettings, rng: np.random.Generator
 ) -> Array:
-    """Simulate the phase (N, A, T) in [0, 2 pi) of a read of each tag by each antenna at robot ``poses`` (N, 3).
+    """Return the simulated phase (N, A, T), from 0 to 2 pi, of a read of each tag by each antenna at ``poses`` (N, 3).
 
     The phase is ``offset - 4 pi f d / c`` (Nikitin et al., IEEE RFID 2010, eq. 4), with frequency f, distance d and
     speed of light c. The offset is random for each antenna and tag. Noise is added, and pi for a fraction of the reads.
@@ -254,8 +254,8 @@ def phases(
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the reads of a simulated drive with all faults, the surveyed map, and metadata that lists dead and misplaced
-    tags."""
+    """Return the simulated reads of a drive, with all faults. Also return the map with survey errors, and metadata that
+    lists dead and misplaced tags."""
     world, ride = ride.world, installed(ride)
     settings, rfid, rng = ride.settings, ride.rig.of(RfidSettings), ride.rng("reads")
     tags = tag_map(ride.world, ride.rig.of(SurveySettings))
@@ -282,14 +282,14 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"tags": the number of simulated chances to read a tag per second}. Raises ValueError if the rig has no
-    RFID reader, or if a fault names an unknown antenna."""
+    """Return {"tags": N}, where N is rounds per second times antennas times tags. Raises ValueError if rig and world do
+    not fit together, or if a fault names an unknown antenna."""
     if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no section [rfid], expected one with antennas")
     rfid, fixed = settings.rig.of(RfidSettings), settings.world.antenna_names()
     if bool(rfid.tags) != bool(fixed):
         raise ValueError(
-            "world.antennas and rig.rfid.tags belong together, as in the preset gates: expected both or neither of them"
+            "world.antennas and rig.rfid.tags require each other, as in the preset gates: expected both or neither"
         )
     if fixed and (settings.rssi is not None or settings.phase is not None):
         raise ValueError("rssi and phase need antennas on the robot, but world.antennas are fixed: remove them")
@@ -304,7 +304,7 @@ def looks(settings: Any) -> dict[str, float]:
 def _surveyed(
     tags: Mapping[str, Tag], faults: FaultSettings, rng: np.random.Generator
 ) -> tuple[dict[str, Tag], list[str]]:
-    """Return the tags as surveyed, some at wrong positions, and the names of the misplaced tags."""
+    """Return a copy of ``tags`` in which some have a wrong position, and the names of these tags."""
     names = list(tags)
     chosen = sorted(rng.permutation(len(names))[: round(faults.misplaced * len(names))].tolist())
     surveyed = dict(tags)
@@ -316,7 +316,7 @@ def _surveyed(
 
 
 class SimulatedReader:
-    """A simulated RFID reader on a moving robot, whose antennas have one round each per measurement. It implements
+    """A simulated RFID reader on a robot. A measurement has one round of each antenna. It implements
     :class:`~factorgraph_loc.sensors.interfaces.LiveSensor`."""
 
     channel, decides = "rfid", True
@@ -328,7 +328,7 @@ class SimulatedReader:
         self._likelihood = RfidLikelihood(rig.of(RfidSettings).model(), self._map.tags)
 
     def measure(self, t: float, pose: Array) -> RfidScan:
-        """Simulate one round of all antennas that ends at ``t`` [s], from the robot's ``pose`` (3,)."""
+        """Return a simulated scan with one round of each antenna, at ``t`` [s] and the robot's ``pose`` (3,)."""
         chance = read_probabilities(self._likelihood, pose[None])[0]
         antenna, tag = np.nonzero(self._rng.random(chance.shape) < chance)
         unknown = np.full(len(tag), np.nan)
@@ -339,8 +339,8 @@ class SimulatedReader:
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
-    """Return the simulated reader of a rig. Raises InputError if the settings have faults or fixed antennas, which are not
-    supported here."""
+    """Return the simulated reader of a rig for active localization. Raises InputError if ``settings`` have faults, or
+    if the antennas are fixed in the building, because this is not supported."""
     if is_fixed(rig):
         raise InputError(f"{settings.name}: has antennas in the map, expected antennas on the robot for active runs")
     if settings.faults != FaultSettings():

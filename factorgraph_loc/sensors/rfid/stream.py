@@ -32,8 +32,8 @@ from factorgraph_loc.text import listed, plain
 from factors.rfid.signals import PhaseReads
 from factors.se2 import Array, Integers
 
-MAX_GAP = 0.1  # s; longest interpolated gap of a reference
-PHASE_WINDOW = 2.0  # s; length of the windows for the comparison of phases
+MAX_GAP = 0.1  # s; longest interpolated gap between reference poses
+PHASE_WINDOW = 2.0  # s; length of the time windows in which phases are compared
 
 ANTENNA = named("antenna", "the name of an antenna")
 RFID = Table(
@@ -57,7 +57,7 @@ INVENTORIES = Table(
 )
 # the index of a read's antenna in a scan
 PLACE = Column("antenna", "whole", PURE, -(2.0**53), 2.0**53, False, "index in antennas")
-# the fields of reads in a stream or scan, whose times are relative to the end of the round
+# the fields of reads in a stream or scan; times are relative to the end of the round
 READS = Table(
     "reads",
     (
@@ -73,11 +73,10 @@ READS = Table(
 class RfidScan:
     """Inventory rounds of A antennas that ended at the time ``t`` [s], with R tag reads.
 
-    ``antennas``: the names of the active antennas. A name occurs twice for an antenna with two rounds. All active
-    antennas have missed the tags of the map that were not read.
-    ``antenna`` (R,): index of each read's antenna in ``antennas``. ``tags``: R EPCs. ``age`` (R,): time [s] from the
-    read to ``t``. ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, ``frequency`` (R,) of the carrier
-    [Hz]: NaN if unknown.
+    ``antennas``: the antenna of each round. Tags that a round did not read count as missed by its antenna.
+    ``antenna`` (R,): the index in ``antennas`` of the round of each read. ``tags``: R EPCs. ``age`` (R,): time [s] from
+    the read to ``t``. ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, ``frequency`` (R,) of the
+    carrier [Hz]: NaN if unknown.
     """
 
     sensor: ClassVar[str] = "rfid"
@@ -95,17 +94,17 @@ class RfidScan:
 
     @property
     def count(self) -> int:
-        """The number of rounds."""
+        """The number A of rounds."""
         return len(self.antennas)
 
 
 @dataclass(frozen=True)
 class RfidStream(Stream):
-    """All reads of a log, one per row. A round without reads has one row with an empty EPC. Rows of one timestamp form a scan.
+    """All reads of a log, one per row. A round without reads has one row with an empty EPC.
 
-    ``t`` (N,): end of the inventory round [s]. ``round`` (N,): number of the round, unique within a timestamp.
-    ``antenna``, ``epc``: N names. ``age`` (N,): time [s] from the read to ``t``. ``rssi`` (N,) [dBm], ``phase`` (N,)
-    [rad], ``frequency`` (N,) [Hz]: NaN if unknown.
+    ``t`` (N,): end of the inventory round [s]. Rows with equal ``t`` form a scan. ``round`` (N,): number of the round
+    in the scan. ``antenna``, ``epc``: N names. ``age`` (N,): time [s] from the read to ``t``. ``rssi`` (N,) [dBm],
+    ``phase`` (N,) [rad], ``frequency`` (N,) [Hz]: NaN if unknown.
     """
 
     kind: ClassVar[type[Any]] = RfidScan
@@ -119,7 +118,7 @@ class RfidStream(Stream):
 
     @cached_property
     def number(self) -> Integers:
-        """The number (N,) of each row's round among all R rounds of the log, in the order of the rows."""
+        """The number (N,) of the round of each row, from 0 to R - 1 for the R rounds of the log."""
         scan = np.cumsum(np.diff(self.t, prepend=np.nan) != 0.0).tolist()
         numbers: dict[tuple[int, int], int] = {}
         keys = zip(scan, self.round.tolist(), strict=True)
@@ -127,11 +126,11 @@ class RfidStream(Stream):
 
     @property
     def first_rows(self) -> Integers:
-        """The index (R,) of the first row of each round."""
+        """The index (R,) of the first row of each of R rounds."""
         return np.asarray(np.unique(self.number, return_index=True)[1])
 
     def hits(self, tags: Mapping[str, int]) -> NDArray[np.bool_]:
-        """Return a mask (R, T) that is True if a round read a tag. ``tags``: the column of each of T EPCs."""
+        """Return a mask (R, T) that is True if round r read tag t. ``tags``: the column t of each EPC."""
         out = np.zeros((len(self.first_rows), len(tags)), dtype=bool)
         columns = np.array([tags.get(epc, -1) for epc in self.epc], dtype=np.int64)
         out[self.number[columns >= 0], columns[columns >= 0]] = True
@@ -160,12 +159,12 @@ class RfidStream(Stream):
 
 @dataclass(frozen=True)
 class RfidRead:
-    """One read of a tag, as an argument of :func:`scan_of`.
+    """One read of a tag, an argument of :func:`scan_of`.
 
-    ``antenna``: the name of the antenna. ``epc``: the EPC of the tag. ``t``: time of the read [s], None for the end of the
-    round. ``rssi`` [dBm], ``phase`` [rad] as the reader reports it, ``frequency`` of the carrier [Hz]: NaN if unknown.
-    ``round``: index of the round in the list of antennas, or None. If it is None, the first read of a tag by an antenna belongs
-    to the antenna's first round, the second read to its second round, because a tag responds once per round.
+    ``antenna``: the name of the antenna. ``epc``: the EPC of the tag. ``t``: time of the read [s], None for the end of
+    the round. ``rssi`` [dBm], ``phase`` [rad] as the reader reports it, ``frequency`` of the carrier [Hz]: NaN if
+    unknown. ``round``: the index of the round among ``antennas`` of :func:`scan_of`. If it is None, the k-th read of a
+    tag by an antenna is assigned to the k-th round of the antenna.
     """
 
     antenna: str
@@ -178,8 +177,8 @@ class RfidRead:
 
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
-    """Return a scan of rounds of ``antennas`` that ended at ``t`` [s]. Raises InputError if a read is invalid, or if
-    its antenna or its round is not in the scan."""
+    """Return the scan of inventory rounds that ended at ``t`` [s]. ``antennas``: the antenna of each round. Raises
+    InputError if a read is invalid, or if its antenna or its round is not in the scan."""
     t = values.seconds_of("RfidScan", t)
     where = f"RfidScan at {t:.3f} s"
     antenna_names = values.names(where, "antennas", values.items_of(where, "antennas", antennas))
@@ -202,10 +201,11 @@ def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> Rfi
 
 
 def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: Sequence[RfidRead]) -> NDArray[np.int64]:
-    """Return the index (R,) of the round of each read. ``times``: times of the reads [s]. ``names``: the antenna of each round.
+    """Return the index (R,) of the round of each of R reads. ``times``: times of the reads [s]. ``names``: the antenna
+    of each round. ``where``: the name of the scan in error messages.
 
-    A read without a given round belongs to the first round of its antenna that has no read of the tag yet, in order of
-    time. If all rounds of the antenna have one, it belongs to the last round.
+    A read with an unknown round is assigned to the first round of its antenna without a read of the same tag, in order
+    of time. If there is no such round, it is assigned to the last round.
     """
     own = {name: [k for k, antenna in enumerate(names) if antenna == name] for name in names}
     out = np.full(len(reads), -1, dtype=np.int64)
@@ -229,8 +229,8 @@ def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: S
 
 
 def check(m: RfidScan, where: str) -> dict[str, Any]:
-    """Return the validated fields of a scan. Raises InputError with the first invalid field. ``where``: the scan's name
-    in messages."""
+    """Return the validated fields of ``m`` by name. Raises InputError for the first invalid field. ``where``: the name
+    of the measurement in error messages."""
     tags, antennas = values.names(where, "tags", m.tags), values.names(where, "antennas", m.antennas)
     antenna = values.integers(where, PLACE, m.antenna, len(tags))
     if np.any((antenna < 0) | (antenna >= len(antennas))):
@@ -244,11 +244,11 @@ def check(m: RfidScan, where: str) -> dict[str, Any]:
 def along_reference(
     log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
 ) -> tuple[RfidStream, Integers, Array, Array, Integers, Integers]:
-    """Return the R reads of known tags by known antennas within the reference of a log.
+    """Return the R reads of a log for which tag, antenna and reference pose are known.
 
-    ``tags``, ``antennas``: the index of each EPC and of each antenna name. Returns the stream, the row indices (R,) of
-    the reads, their times (R,) [s], the robot's poses (R, 3), the antenna indices (R,), and the tag indices (R,).
-    Raises InputError if the log has no reference or no reads.
+    ``tags``, ``antennas``: the index of each tag by EPC, and of each antenna by name. Returns the stream, the row
+    numbers (R,) of the reads, their times (R,) [s], the robot's poses (R, 3), the antenna indices (R,), and the tag
+    indices (R,). Raises InputError if the log has no reference or no reads.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference trajectory, which the calibration needs")
@@ -266,11 +266,11 @@ def along_reference(
 def phase_reads(
     log: Log, tags: Mapping[str, int], antennas: Mapping[str, int], window: float = PHASE_WINDOW, first_window: int = 0
 ) -> PhaseReads:
-    """Return the reads with a phase along the reference of a log, in windows of ``window`` seconds, numbered from
-    ``first_window``.
+    """Return the reads with a phase along the reference of a log, with poses in the world frame.
 
-    The poses of the reads are in the world frame. ``tags``, ``antennas``: the index of each EPC and of each antenna
-    name. Raises InputError like :func:`along_reference`.
+    ``tags``, ``antennas``: see :func:`along_reference`. ``window``: the length [s] of the time windows in which phases
+    are compared. ``first_window``: the number of the first window. Raises InputError if the log has no reference or no
+    reads.
     """
     stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
     windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)

@@ -1,9 +1,9 @@
 """Summarises RFID reads of a log, and reviews a finished run: warnings, and the reliability of the detection models.
 
-The reliability compares observed with predicted reads along the final trajectory, by distance and antenna (a reliability
-diagram: DeGroot and Fienberg, "The comparison and evaluation of forecasters", The Statistician 32, 1983). Reads of one tag by
-one antenna are correlated, because reflections and obstacles last for seconds. The overdispersion of reads in blocks of time
-accounts for this in the variance of all counts (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
+The reliability compares observed with predicted reads along the final trajectory, by distance and antenna (a
+reliability diagram: DeGroot and Fienberg, "The comparison and evaluation of forecasters", The Statistician 32, 1983).
+Successive reads are correlated. The variances of all counts are therefore multiplied by the overdispersion of reads in
+time blocks (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
 """
 
 import math
@@ -33,9 +33,9 @@ from factors.rfid.detection import ExpectedReads, RfidLikelihood
 from factors.rfid.parameters import MOST_CERTAIN, rate_of
 from factors.se2 import Array, Integers, wrap_scalar
 
-STOPPED = 10.0  # s; an antenna has stopped if its last round is earlier than this before the end
-CLOCK_STEP = 1.0  # s; a larger step back of timestamps, or a larger offset to the odometry, causes a warning
-SHOWN = 5  # number of names that a line or a warning lists
+STOPPED = 10.0  # s; an antenna has stopped if its last round or read is more than this before the end of the log
+CLOCK_STEP = 1.0  # s; larger steps back of timestamps, and larger offsets from the odometry, cause warnings
+SHOWN = 5  # maximum number of names in a line or a warning
 UNKNOWN_ANTENNA = "antenna {antenna} is not {place}: {reads} reads, {rounds} rounds"
 IN_MAP, ON_ROBOT = "tags of the map", "tags on the robot"
 
@@ -44,8 +44,8 @@ IN_MAP, ON_ROBOT = "tags of the map", "tags on the robot"
 class AntennaSummary:
     """A summary of one antenna in a log.
 
-    ``reads``, ``rounds``: their numbers. ``rate``: rounds per second. ``silent``: number of rounds without reads.
-    ``last``, ``last_read``: timestamps [s] of the last round and of the last read, which is None without reads.
+    ``reads``, ``rounds``: the numbers of reads and of rounds. ``rate``: rounds per second. ``silent``: the number of
+    rounds without reads. ``last``: the timestamp [s] of the last round. ``last_read``: that of the last read, or None.
     """
 
     reads: int
@@ -58,11 +58,12 @@ class AntennaSummary:
 
 @dataclass(frozen=True)
 class RfidSummary:
-    """A summary of all reads of a log. ``reads``, ``scans``, ``rounds``: their numbers. ``antennas``: a summary of each by name.
+    """A summary of all RFID reads of a log.
 
-    ``known``: number of tags of the map that are read. ``unread``: tags of the map that are never read. ``unknown``:
-    number of reads of each EPC that the map lacks. ``late``: number of rounds with an earlier timestamp than a previous
-    one, and the largest step back [s].
+    ``reads``, ``scans``, ``rounds``: the numbers of reads, scans and rounds. ``antennas``: the summaries of antennas by
+    name. ``known``: the number of tags of the map that are read. ``unread``: the other tags of the map. ``unknown``:
+    the number of reads of each EPC that is not in the map. ``late``: the number of rounds with an earlier timestamp
+    than a previous round, and the largest such difference [s].
     """
 
     reads: int
@@ -76,7 +77,7 @@ class RfidSummary:
 
 
 def summarize(log: Log) -> Summary:
-    """Return a summary with warnings. Its entry ``rfid`` is an :class:`RfidSummary`, or None if the log has no reads."""
+    """Return the summary of the reads in a log, with warnings. Its entry "rfid" is an :class:`RfidSummary` or None."""
     in_map = {"antennas": len(log.world.antennas)} if is_fixed(log.rig) else {"tags": len(log.world.tags)}
     log = installed(log)
     summary = summarize_rfid(log)
@@ -101,7 +102,7 @@ def _paragraph(log: Log, summary: RfidSummary) -> Paragraph:
 
 
 def summarize_rfid(log: Log) -> RfidSummary | None:
-    """Return a summary of the stream ``rfid``, or None if the log lacks it."""
+    """Return a summary of the RFID reads of a log, or None if the log has no stream "rfid"."""
     stream = log.streams.get("rfid")
     if not isinstance(stream, RfidStream):
         return None
@@ -137,13 +138,13 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
 
 
 def rfid_problems(log: Log, summary: RfidSummary) -> list[Notice]:
-    """Return warnings about tags, antennas and clock of the reads of a log."""
+    """Return warnings about the tags, the antennas and the clock of the reader in a log."""
     out, fixed = list[Notice](), is_fixed(log.rig)
     if summary.unread:
         sentence = f"{{unread}} of {{tags}} {ON_ROBOT if fixed else IN_MAP} are never read: {{names}}"
         names = listed(summary.unread, SHOWN)
         out.append(notice("unread_tags", sentence, len(summary.unread), len(log.world.tags), names))
-    if summary.unknown and not fixed:  # fixed antennas usually read tags of goods and of other robots too
+    if summary.unknown and not fixed:  # fixed antennas usually also read tags of goods and of other robots
         reads = sum(summary.unknown.values())
         sentence, names = "{reads} reads are of {tags} tags that the map lacks: {names}", listed(summary.unknown, SHOWN)
         out.append(notice("unknown_tags", sentence, reads, len(summary.unknown), names))
@@ -194,26 +195,23 @@ def _clock_trouble(log: Log, summary: RfidSummary) -> list[Notice]:
     return out
 
 
-CLEARLY = 3.0  # standard deviations; a smaller change of a parameter causes no warning
-CHANGED = 0.1  # minimum change of a range (relative) or of a probability that causes a warning
-TURNED, LATE = math.radians(3.0), 0.05  # rad, s; minimum change of a yaw and of a time offset that causes a warning
+CLEARLY = 3.0  # minimum change of a parameter that causes a warning, in standard deviations
+CHANGED = 0.1  # minimum relative change of a range, and minimum change of a probability, that causes a warning
+TURNED, LATE = math.radians(3.0), 0.05  # minimum change of a yaw [rad] and of a time offset [s] that causes a warning
 
 
 def review(use: Use, ending: Ending) -> Review:
-    """Return the warnings about a finished run, and the reliability of the detection models along its final trajectory."""
+    """Return the review of the RFID sensor after a run: warnings, and the reliability of the detection models."""
     use = replace(use, log=installed(use.log)) if "rfid" in use.sensors else use
     models = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
     return Review((*doubts(use, ending.diagnostics, ending.learnt), *models.warnings), models.reliability)
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings about a finished run. ``diagnostics``: of the causal estimates. ``learnt``: the estimated constants.
-
-    The warnings state that the estimator does not use RFID, that no tag of the map is read, which tags are probably dead, weak or
-    moved (most probable first), and how the estimated models and mountings of the antennas differ from the rig.
-    """
+    """Yield warnings after a run: reads that are not used, tags that are probably dead, weak or moved, and estimated
+    constants that differ from the rig. ``diagnostics``: of the causal estimates. ``learnt``: estimated constants."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
-    if rounds and use.estimator != "dead_reckoning":  # its name says that it uses odometry only
+    if rounds and use.estimator != "dead_reckoning":  # no warning, because dead reckoning uses only odometry
         ignored = "{log}: {estimator} does not use RFID: all {rounds} inventory rounds are ignored"
         yield notice("unused_rfid", ignored, log.name, use.estimator, rounds)
     if "rfid" not in use.sensors:
@@ -241,10 +239,8 @@ def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notic
 
 
 def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings about estimated parameters of detection models and mountings that clearly differ from the rig's ``settings``.
-
-    ``learnt``: the estimates of the run.
-    """
+    """Yield warnings if estimated constants of the RFID reader clearly differ from the rig. ``settings``: the values in
+    the rig. ``learnt``: the estimates of the run."""
     names = settings.parameter_names()
     for name, parameters in names.items():
         peak = min(settings.models[name].model().peak, MOST_CERTAIN)
@@ -263,8 +259,8 @@ def _differences(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
 
 
 def _mounting(settings: RfidSettings, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings about estimated yaws of antennas and a time offset that clearly differ from the rig, with the
-    settings that correct them."""
+    """Yield warnings if the estimated yaws of antennas or the time offset clearly differ from ``settings``. The
+    warnings contain the values to set."""
     common, turned = learnt.values.get("rfid.yaw", (0.0, 0.0)), dict[str, float]()
     for name in settings.all_antennas():
         own = learnt.values.get(f"rfid.antennas.{name}.yaw", (0.0, 0.0))
@@ -287,17 +283,17 @@ def _percent(probability: float) -> str:
     return "> 99 %" if probability > 0.99 else f"{100.0 * probability:.0f} %"
 
 
-MOST_ROUNDS = 6000  # number of rounds of a long log that are compared, evenly spread
-OFF = 4.0  # standard deviations; a larger difference of observed and predicted reads of a group is reported
-TOGETHER = 2.0  # a warning is given if the overdispersion exceeds this multiple of 1 / tempering
+MOST_ROUNDS = 6000  # maximum number of rounds of a log that are compared, evenly selected
+OFF = 4.0  # minimum difference of observed and predicted reads that is reported, in standard deviations
+TOGETHER = 2.0  # an overdispersion above this multiple of 1 / tempering causes a warning
 
 
 @dataclass(frozen=True, eq=False)
 class _Trials:
-    """M trials: in each, one antenna could read one tag in one round.
+    """M trials. A trial is one round of one antenna in which it may read one tag.
 
     ``p`` (M,): predicted probability of a read. ``hit`` (M,): 1 for a read, otherwise 0. ``antenna``, ``tag`` (M,):
-    indices. ``block`` (M,): number of the block of time. ``distance`` (M,): distance of antenna and tag [m].
+    indices of antenna and tag. ``block`` (M,): number of the time block. ``distance`` (M,): from antenna to tag [m].
     """
 
     p: Array
@@ -309,11 +305,10 @@ class _Trials:
 
 
 def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Review:
-    """Compare the reads of a run with its estimated detection models, along its ``final`` trajectory. Returns the
-    reliability and warnings. ``diagnostics``: those of the final trajectory. ``learnt``: the estimated parameters.
+    """Compare observed reads with predicted reads along the trajectory ``final``, without tags that are probably dead.
 
-    The result is empty without reads, antennas or covariances. Tags that are probably dead, and times without reads,
-    are omitted. Tags that seem to have moved are not omitted, because a wrong model has the same effect on many tags.
+    Returns the reliability of the detection models, and warnings. The review is empty without reads, antennas or
+    covariances. ``diagnostics``: the diagnostics of ``final``. ``learnt``: the estimated parameters of the models.
     """
     log, settings = use.log, use.log.rig.find(RfidSettings)
     stream = log.streams.get("rfid")
@@ -354,9 +349,9 @@ def _observed(
 
 
 def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -> Review:
-    """Count observed and predicted reads of ``trials`` by bands of distance and by ``antennas``. Returns the
-    reliability and warnings. The result is empty if there are too few predicted reads. ``log``: the name of the log.
-    ``tempering``: the rig's exponent of the likelihood."""
+    """Compare observed and predicted reads in ``trials`` by bands of distance and by ``antennas``. Returns the
+    reliability and warnings, or an empty review if too few reads are predicted. ``log``: the name of the log.
+    ``tempering``: the exponent of the likelihood in the rig."""
     if trials.p.sum() < FEWEST:
         return Review()
     groups = ReadGroups(antennas)
@@ -367,7 +362,7 @@ def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -
     if not len(chosen):
         return Review()
     observed, predicted, variance = groups.sums[:, chosen]
-    # the tempering of the rig already assumes correlated rounds, so the variance is at least that of the tempering
+    # a tempering below 1 already assumes correlated rounds: 1 / tempering is the minimum overdispersion
     sigma = np.sqrt(max(ratio, 1.0 / tempering) * variance)
     off = (np.abs(observed - predicted) > OFF * sigma) & (np.abs(observed / predicted - 1.0) > DIFFERENT)
     doubts = []
@@ -387,8 +382,8 @@ def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -
 
 
 def _overdispersion(trials: _Trials, band: Integers) -> float:
-    """Return the overdispersion (:func:`.overdispersion`) of trials, after the probabilities are scaled to the observed
-    reads in each band of distance. ``band`` (M,): number of each trial's band."""
+    """Return the overdispersion (:func:`.overdispersion`) of ``trials``. The probabilities are scaled first, so that
+    they predict the number of reads in each distance band. ``band`` (M,): the distance band of each trial."""
     share = np.ones(int(band.max(initial=0)) + 1)
     predicted, observed = np.bincount(band, trials.p), np.bincount(band, trials.hit)
     np.divide(observed, predicted, out=share, where=predicted > 0.0)

@@ -20,14 +20,14 @@ from factorgraph_loc.sensors.tables import Columns, Reading, Writing
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
-OUTSIDE = -1  # round of a read that no inventory contains
+OUTSIDE = -1  # the round of a read that is in no inventory
 
 
 def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Integers:
-    """Return the round numbers (N,), from 0, of reads at sorted times ``t_ns`` (N,) by the antennas ``antenna`` (N).
+    """Return the round (N,) of each of N reads, numbered from 0, if the log has no table of rounds.
 
-    A round ends with a read of another antenna, or after ``gap`` seconds without a read. Rounds without reads cannot be
-    detected.
+    ``t_ns`` (N,), ``antenna`` (N): time [ns] and antenna of each read, in order of time. A round ends when another
+    antenna reads a tag, or after ``gap`` [s] without a read. Rounds without reads cannot be detected.
     """
     names = np.asarray(antenna, dtype=str)
     first = np.ones(len(t_ns), dtype=bool)
@@ -38,11 +38,11 @@ def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Inte
 def rounds_from_inventories(
     t_ns: Integers, antenna: Sequence[str], end_ns: Integers, inventory_antenna: Sequence[str], duration_ns: Integers
 ) -> Integers:
-    """Return the index (N,) of the inventory that contains each of N reads, :data:`OUTSIDE` if none does.
+    """Return the index (N,) of the inventory round of each of N reads, :data:`OUTSIDE` for reads in no round.
 
-    ``t_ns`` (N,), ``antenna`` (N): time [ns] and antenna of each read. ``end_ns``, ``duration_ns`` (R,), ``inventory_antenna`` (R):
-    end [ns], duration [ns] and antenna of R inventories. An inventory contains the reads of its antenna from
-    ``end_ns - duration_ns`` to ``end_ns``, inclusive. A read on the border of two inventories belongs to the earlier one.
+    ``t_ns`` (N,), ``antenna`` (N): time [ns] and antenna of each read. ``end_ns``, ``duration_ns`` (R,): end and
+    duration [ns] of R rounds. ``inventory_antenna`` (R): their antennas. A round contains the reads of its antenna from
+    its beginning to its end, inclusive. A read on the border of two rounds belongs to the earlier one.
     """
     names, listening = np.asarray(antenna, dtype=str), np.asarray(inventory_antenna, dtype=str)
     out = np.full(len(t_ns), OUTSIDE, dtype=np.int64)
@@ -61,8 +61,8 @@ def rounds_from_inventories(
 
 
 def ends_of(t_ns: Integers, number: Integers, gap: float) -> Integers:
-    """Return the times (R,) [ns] at which R rounds of :func:`rounds_from_gaps` end: at the next read of another antenna, but at
-    most ``gap`` seconds after the last read of the round. ``t_ns``, ``number`` (N,): time [ns] and round number of each read."""
+    """Return the end (R,) [ns] of R rounds from :func:`rounds_from_gaps`: the time of the next read, but at most
+    ``gap`` [s] after the last read of the round. ``t_ns``, ``number`` (N,): time [ns] and round of each read."""
     last = np.flatnonzero(np.diff(number, append=number[-1:] + 1))
     following = np.append(t_ns, np.iinfo(np.int64).max)[last + 1]
     return np.asarray(np.minimum(t_ns[last] + round(gap * 1e9), following), dtype=np.int64)
@@ -76,8 +76,8 @@ ROUND_GAP: float = RfidSettings.model_fields["round_gap"].default
 class ReadsByRound:
     """N reads in R rounds.
 
-    ``t_ns`` (N,), ``epc`` (N), ``number`` (N,): time [ns], EPC and round index of each read. ``columns``: RSSI, phase and
-    frequency, each (N,). ``end_ns`` (R,) and ``antenna`` (R): end [ns] and antenna of each round.
+    ``t_ns`` (N,), ``epc`` (N), ``number`` (N,): time [ns], EPC and round index of each read. ``columns``: RSSI, phase
+    and frequency of each read, each (N,). ``end_ns`` (R,), ``antenna`` (R): end [ns] and antenna of each round.
     """
 
     t_ns: Integers
@@ -88,9 +88,9 @@ class ReadsByRound:
     antenna: list[str]
 
     def stream(self, t0_ns: int) -> RfidStream:
-        """Return the stream of the reads, in the order of the rounds. ``t0_ns``: the absolute time of t = 0 [ns].
+        """Return the reads as a stream, in the order of the rounds. ``t0_ns``: the absolute time of t = 0 [ns].
 
-        Reads of a round keep their order. A round without reads becomes a row without an EPC.
+        A round without reads becomes a row without an EPC.
         """
         silent = np.setdiff1d(np.arange(len(self.end_ns)), self.number)
         rounds = np.concatenate((self.number, silent))
@@ -113,7 +113,8 @@ class ReadsByRound:
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
-    """Return the stream of reads of a log, with rounds from inventories or from gaps between reads."""
+    """Return the reads of a log as a stream. Without the table "inventories", gaps between reads separate rounds.
+    ``rows``: the rows by table name."""
     settings = reading.rig.find(RfidSettings)
     gap = ROUND_GAP if settings is None else settings.round_gap
     return read_rounds(rows.get("rfid"), rows.get("inventories"), gap, reading.warnings).stream(reading.t0_ns)
@@ -122,9 +123,9 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
 def read_rounds(
     reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[Notice]
 ) -> ReadsByRound:
-    """Return the reads in their rounds. Without ``inventories``, a ``gap`` [s] between reads separates rounds.
+    """Return the reads of a log, assigned to rounds. Without ``inventories``, a ``gap`` [s] between reads ends a round.
 
-    Reads outside of every inventory are skipped with a warning. Raises InputError with file, row and field for an
+    Reads in none of the ``inventories`` are skipped, with a warning. Raises InputError with file, row and field for an
     invalid value.
     """
     if inventories is not None:
@@ -141,10 +142,10 @@ def read_rounds(
 
 
 def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[Notice]) -> ReadsByRound:
-    """Assign reads to the rounds of a table of inventories. See :func:`read_rounds`."""
+    """Return the reads, assigned to the rounds in the table ``inventories``. See :func:`read_rounds`."""
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
-    # late inventories are allowed, because a reader's clock may jump; estimators drop the late scans
+    # timestamps may decrease, because the clock of a reader may jump; estimators drop late scans
     checks.arrivals(inventories.path, inventories.rows, end_ns, warnings, max_late_ns=None)
     if reads is None:
         nothing = np.zeros(0)
@@ -165,7 +166,7 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
 
 
 def _require_all(inventories: TableRows) -> None:
-    """Raise InputError if rows of ``inventories`` were skipped or sorted, because reads refer to the rows by number."""
+    """Raise InputError if rows of ``inventories`` were skipped or sorted. Reads refer to these rows by number."""
     first, rows = int(inventories.rows.min(initial=2)), inventories.rows
     if first > 2 or np.any(rows != np.arange(first, first + len(rows))):
         raise InputError(
@@ -174,8 +175,9 @@ def _require_all(inventories: TableRows) -> None:
 
 
 def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
-    """Return the round index (N,) of each read from its column ``inventory``, a row number from 1 of the table of
-    inventories. Raises InputError if the row does not exist, has another antenna, or ends before the read."""
+    """Return the round index (N,) of each read, from the row numbers (from 1) in its column ``inventory``. ``end_ns``,
+    ``antenna``: end and antenna of each row of the table of inventories. Raises InputError if a row does not exist, has
+    another antenna, or ends before the read."""
     named = reads.numbers["inventory"]
     with np.errstate(invalid="ignore"):
         bad = ~((named >= 1.0) & (named <= len(end_ns)) & (named == np.floor(named)))
@@ -192,8 +194,8 @@ def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Int
 
 
 def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> ReadsByRound:
-    """Return the selected ``rows`` of a table of reads with their round indices ``number``. ``end_ns`` (R,),
-    ``antenna`` (R): end [ns] and antenna of each round."""
+    """Return the reads in ``rows`` (N,) of the table ``reads``, assigned to the rounds ``number`` (N,). ``end_ns``
+    (R,), ``antenna`` (R): end [ns] and antenna of each round."""
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in SIGNALS)
@@ -201,8 +203,7 @@ def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers
 
 
 def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of both tables, in the order of the rounds. The written duration of a round is the time from
-    its first read to its end."""
+    """Return the columns of the tables "rfid" and "inventories". The duration of a round begins at its first read."""
     number, first = stream.number, stream.first_rows
     end_ns = checks.absolute(stream.t, writing.t0_ns)
     age_ns = np.rint(stream.age * 1e9).astype(np.int64)
