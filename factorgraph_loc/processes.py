@@ -68,10 +68,10 @@ class Worker:
 
     def send(self, content: object) -> None:
         """Send ``content`` to the process. The first object must be the function, each later one is a job."""
-        with suppress(OSError):  # `hear` reports that the process has died
+        with suppress(OSError):  # `receive` reports that the process has died
             self.connection.send(content)
 
-    def hear(self) -> Any:
+    def receive(self) -> Any:
         """Receive the next answer of the process: ``READY``, the value of the job, or the exception that the job raised.
 
         Return a ProcessDiedError if the process has ended.
@@ -101,7 +101,7 @@ def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]
     use_one_thread()
     parent_end, child_end = Pipe()
     process = Child(target=function, args=(child_end, *args), daemon=True)
-    with _undisturbed(), _without_script():
+    with _ignoring_interrupts(), _without_script():
         process.start()
     child_end.close()
     return process, parent_end
@@ -126,7 +126,7 @@ def run_each(
                 worker.send(function)
             for connection in wait([worker.connection for worker in team], None if beat is None else BEAT):
                 worker = next(worker for worker in team if worker.connection is connection)
-                answer = worker.hear()
+                answer = worker.receive()
                 if isinstance(answer, ProcessDiedError) and worker.job is None and waiting:  # died before its first job
                     worker.job = waiting.popleft()
                 at, worker.job = worker.job, None
@@ -214,7 +214,7 @@ def _without_script() -> Iterator[None]:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def _ignoring_interrupts() -> Iterator[None]:
     """Make processes that start in this block ignore keyboard interrupts. Delay signals to this process meanwhile."""
     resource_tracker.ensure_running()  # its start unblocks keyboard interrupts, so it must not start in the block
     came: list[int] = []

@@ -230,7 +230,7 @@ class Processes(Executor):
         for worker in list(self._team):
             run, failed = worker.job, self._exceeded_limit(worker)
             if worker.connection in readable:
-                was_ready, answer = worker.ready, worker.hear()
+                was_ready, answer = worker.ready, worker.receive()
                 if not isinstance(answer, ProcessDiedError):
                     worker.job = None
                     if isinstance(answer, Exception):

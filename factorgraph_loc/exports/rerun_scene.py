@@ -188,7 +188,7 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
     settings = log.rig.find(CameraSettings)
     if settings is None or not pictures_of.has_pictures(log):
         return
-    model, (at, poses) = settings.model(), _carried(log, runs)
+    model, (at, poses) = settings.model(), _camera_and_robot(log, runs)
     if at != CAMERA:
         place = rr.Transform3D(translation=model.position, mat3x3=model.rotation)
         recording.log(at, place, static=True)
@@ -206,7 +206,7 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
         recording.send_columns(f"{at}/image", _times(np.array(t)), columns)
         if log.world.points is not None and poses is not None:
             path = poses.at(np.array(t), max_gap=GAP)
-            expected = [_expected(model, pose, log.world.points.positions) for pose in path]
+            expected = [_predicted_pixels(model, pose, log.world.points.positions) for pose in path]
             _pixels_over_time(recording, f"{at}/image/map", np.array(t), expected)
             recording.log(f"{at}/image/map", rr.Points2D.from_fields(radii=2.0, colors=DETECTION), static=True)
     sightings = list(pictures_of.sightings(log))
@@ -227,7 +227,7 @@ def _pixels_over_time(
     recording.send_columns(at, _times(t), columns.partition([len(p) for p in pixels]))
 
 
-def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
+def _predicted_pixels(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
     """Return the pixels (K, 2) of the nearest visible ``points`` (P, 3). K is 0 if the robot's ``pose`` (3,) is NaN."""
     if not np.isfinite(pose).all():
         return np.empty((0, 2))
@@ -236,7 +236,7 @@ def _expected(model: reprojection.CameraModel, pose: Array, points: Array) -> Ar
     return np.asarray(pixels[visible[np.argsort(depths[visible])[:NEAREST]]])
 
 
-def _carried(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
+def _camera_and_robot(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
     """Return the entity path of the camera in Rerun, and the trajectory of the robot that carries the camera, or None.
 
     It is the trajectory of the first run that has one, or else the reference of the log.
@@ -266,7 +266,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
     )
     beside: list[rrb.View] = []
     if log.rig.find(CameraSettings) is not None and pictures_of.has_pictures(log):
-        beside.append(rrb.Spatial2DView(origin=_carried(log, runs)[0], name="camera"))
+        beside.append(rrb.Spatial2DView(origin=_camera_and_robot(log, runs)[0], name="camera"))
     titles = {"error_position": "error of position [m]", "error_heading": "error of heading [rad]", "nees": "NEES"}
     beside += [
         rrb.TimeSeriesView(origin=f"{PLOTS}/{name}", name=title)

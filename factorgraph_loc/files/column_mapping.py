@@ -156,13 +156,13 @@ class TableFolder:
         return inside(self.path, name, self.path)
 
     def read(self, mapping: TimedMapping, shapes: Sequence[Collection[str]], columns: Mapping[str, Column]) -> Cells:
-        """Read the file that a mapping names. Return the valid cells as :meth:`noted` does.
+        """Read the file that a mapping names. Return the valid cells as :meth:`record_read` does.
 
         ``shapes``: alternative sets of fields, as in :func:`read_mapped`. ``columns``: the description of each field.
         """
-        return self.noted(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
+        return self.record_read(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
 
-    def noted(
+    def record_read(
         self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
     ) -> Cells:
         """Record that the rows and columns of ``cells`` are read. Return the cells after :meth:`Cells.usable`.
@@ -374,9 +374,9 @@ def _objects(path: Path, unread: list[tuple[int, str]]) -> Iterator[tuple[int, d
             unread.append((row, str(error)))
             continue
         # old versions of sllurp write each number as a list of one
-        yield from ((row, {name: _alone(value) for name, value in flattened(entry)}) for entry in entries)
+        yield from ((row, {name: _without_single_list(value) for name, value in flattened(entry)}) for entry in entries)
 
 
-def _alone(value: Any) -> Any:
+def _without_single_list(value: Any) -> Any:
     """Return the element of a list that has one element. Return any other value unchanged."""
     return value[0] if isinstance(value, list) and len(value) == 1 else value

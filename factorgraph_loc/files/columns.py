@@ -171,7 +171,7 @@ class Table:
         return tuple(column for column in self.columns if column.name not in omitted)
 
 
-def farthest(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
+def find_outlier(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
     """Find an outlier among timestamps. ``tables``: arrays of timestamps.
 
     Returns the index of the table and the row of the timestamp that is farthest from the median, and the median.
@@ -190,7 +190,7 @@ def require_span(tables: Sequence[tuple[object, Sequence[int] | Integers, Intege
 
     ``tables``: for each table the file, the row numbers (N,) in the file, and the timestamps (N,) [ns].
     """
-    if outlier := farthest([t_ns for _, _, t_ns in tables], MAX_SPAN * 1e9):
+    if outlier := find_outlier([t_ns for _, _, t_ns in tables], MAX_SPAN * 1e9):
         table, i, middle = outlier
         source, rows, t_ns = tables[table]
         expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log, most are near {middle} ns"

@@ -11,7 +11,7 @@ import numpy as np
 
 from factorgraph_loc.errors import InputError
 from factorgraph_loc.files.checks import ROUNDING
-from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column, farthest
+from factorgraph_loc.files.columns import MAX_SPAN, POSES, Column, find_outlier
 from factorgraph_loc.model.log import Log
 from factorgraph_loc.model.sections import kind_of
 from factorgraph_loc.sensors.landmarks.measurement import BearingRangeStream
@@ -65,7 +65,7 @@ def require_one_span(log: Log) -> None:
             raise InputError(f"{log.name}: {name} has a timestamp that is not a finite number")
     first, last = log.span()
     expected = f"one at most {MAX_SPAN / 86_400.0:g} days from all others of the log"
-    if outlier := farthest(list(filled.values()), MAX_SPAN):
+    if outlier := find_outlier(list(filled.values()), MAX_SPAN):
         table, i, middle = outlier
         name, t = list(filled.items())[table]
         where = f"{log.name}: row {i + 1} of {name} has a timestamp {t[i] - middle:+.0f} s from most others"

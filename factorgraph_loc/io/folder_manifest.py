@@ -73,9 +73,9 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
     options: dict[str, Any] = {}
     for role, table in list(roles.tables.items()):
         if role in MAPS:
-            options.setdefault("world", {})[role] = _in_map(role, roles)
+            options.setdefault("world", {})[role] = _map_settings(role, roles)
         else:
-            options[role] = _described(role, table, roles, path)
+            options[role] = _table_settings(role, table, roles, path)
     if "odometry" not in options:
         roles.remarks.append(
             "no file was recognised as odometry, which every estimator needs: describe one in [options.odometry]"
@@ -136,13 +136,13 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
             walls = next(
                 (y.name for y in sorted(path.parent.glob("*.yaml")) if "resolution:" in read_text(y, YAML)), None
             )
-            world = {"name": name, **({} if walls is None else {"walls": walls}), role: _in_map(role, roles)}
+            world = {"name": name, **({} if walls is None else {"walls": walls}), role: _map_settings(role, roles)}
             lines = toml_of(world).splitlines()
             return [f"{table.name} seems to be a map: save these lines as {name}.world.toml next to it", *lines]
     return []
 
 
-def _in_map(role: str, roles: _Roles) -> dict[str, Any]:
+def _map_settings(role: str, roles: _Roles) -> dict[str, Any]:
     """Return the settings of a world file for the table of the map. ``role``: "tags" or "landmarks".
 
     If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map.
@@ -211,22 +211,22 @@ def _role(table: Guess) -> str | None:
         return "rfid"
     if table.has("landmark") and (table.has("range") or table.has("bearing")):
         return "bearing_range"
-    if _sides(table) or table.has("v", "w"):
+    if _wheel_fields(table) or table.has("v", "w"):
         return "odometry"
     if table.has("antenna"):
         return "inventories"
     return "imu" if table.has("w") else None
 
 
-def _sides(table: Guess) -> tuple[str, ...]:
+def _wheel_fields(table: Guess) -> tuple[str, ...]:
     """Return the fields of two or four wheels. Returns an empty tuple if the table has no such fields."""
     return tuple(name for name in table.fields if name.removeprefix("rear_").startswith(("left", "right")))
 
 
-def _described(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
+def _table_settings(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
     """Return the settings that describe a table with a ``role`` in the manifest. ``roles``: the tables of all roles.
     ``path``: the folder of the tables."""
-    sides = _sides(table) if role == "odometry" else ()
+    sides = _wheel_fields(table) if role == "odometry" else ()
     if sides:
         settings = table.mapping(("t", *sides))
         _add_sizes(settings, table, sides, roles, path)
@@ -291,7 +291,7 @@ def _reference(roles: _Roles, path: Path) -> Trajectory | None:
     if (table := roles.tables.get("reference")) is None:
         return None
     with suppress(InputError):
-        options = parse_model(ReferenceFile, _described("reference", table, roles, path), path)
+        options = parse_model(ReferenceFile, _table_settings("reference", table, roles, path), path)
         return read_reference(TableFolder(path), options, 0)
     return None
 
@@ -335,8 +335,8 @@ def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
     if role == "reference":
         reference = _reference(roles, path)
         return None if reference is None or not reference.has_heading else _turns_of(reference)
-    if role == "odometry" and _sides(table)[:1] == ("left",):
-        left, right = _counted(table, _sides(table))
+    if role == "odometry" and _wheel_fields(table)[:1] == ("left",):
+        left, right = _counted(table, _wheel_fields(table))
         return Turns(table.times(), right - left)
     if table.has("heading"):
         period = 360.0 if table.units.get("heading") == "deg" else 2.0 * np.pi

@@ -192,7 +192,7 @@ def guess(path: Path) -> Guess | None:
     columns = {name: [parts[i] for parts in rows] for i, name in enumerate(names)}
     cells = " ".join(text for parts in rows[:LOOKED_AT] for text in parts)
     decimal = "," if separator != "," and re.search(r"\d,\d", cells) and not re.search(r"\d\.\d", cells) else "."
-    return _filled(Guess(path, separator, decimal, not names[0].isdecimal(), columns))
+    return _guess_fields(Guess(path, separator, decimal, not names[0].isdecimal(), columns))
 
 
 def _is_value(text: str) -> bool:
@@ -206,7 +206,7 @@ def _is_time(text: str) -> bool:
     return False
 
 
-def _filled(out: Guess) -> Guess:
+def _guess_fields(out: Guess) -> Guess:
     """Guess the fields and units of the table ``out`` from its columns. Return ``out`` with these guesses."""
     _add_time(out)
     if not out.header:

@@ -107,7 +107,7 @@ def between_poses(
     return moves
 
 
-def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Integers, Array]:
+def bridge_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Integers, Array]:
     """Return timestamps (M,) [ns] and increments (M, 4) of odometry from a device that sometimes loses its pose.
 
     ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of lost poses.
@@ -116,7 +116,7 @@ def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Int
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):
-        return t_ns, after_rest(moves)
+        return t_ns, with_start_row(moves)
     every = np.union1d(t_ns, lost)
     at, durations = np.searchsorted(every, t_ns), np.append(0.0, np.diff(every) / 1e9)
     out, velocity = np.zeros((len(every), 4)), np.zeros(3)
@@ -132,7 +132,7 @@ def through_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Int
     return every, out
 
 
-def held(t_ns: Integers, velocities: Array) -> Array:
+def integrate_velocities(t_ns: Integers, velocities: Array) -> Array:
     """Integrate velocities (N, 2), forward [m/s] and about the vertical [rad/s]. Return motions (N - 1, 3).
 
     A velocity is constant until the next of the timestamps ``t_ns`` (N,), for at most :data:`HOLD_TIME`.
@@ -141,12 +141,12 @@ def held(t_ns: Integers, velocities: Array) -> Array:
     return np.asarray(se2.exp(twists * np.minimum(np.diff(t_ns) / 1e9, HOLD_TIME)[:, None]))
 
 
-def after_rest(moves: Array) -> Array:
+def with_start_row(moves: Array) -> Array:
     """Return the motions (N - 1, 3) with a row of zeros in front (N, 3), which stands for the start."""
     return np.vstack((np.zeros((1, 3)), moves))
 
 
-def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[Notice]) -> Array:
+def wheel_motions(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[Notice]) -> Array:
     """Return the motions (N - 1, W) [m] of W wheels between N timestamps [ns].
 
     ``distances`` (N, W): the distances of the wheels [m]. ``scales`` (W,): metres per encoder count. Encoders may wrap.
@@ -161,17 +161,19 @@ def between_ways(source: object, t_ns: Integers, distances: Array, scales: Array
     return _continued(source, t_ns, steps, anew, warnings)
 
 
-def between_wheels(
+def motion_of_wheel_distances(
     source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[Notice]
 ) -> Array:
     """Return the motions (N - 1, 3) of a robot from the distances of its wheels. ``sizes``: the sizes of the drive.
 
-    For the other arguments see :func:`between_ways`.
+    For the other arguments see :func:`wheel_motions`.
     """
-    return se2.exp(sizes.twists(source, between_ways(source, t_ns, distances, scales, warnings), warnings))
+    return se2.exp(sizes.twists(source, wheel_motions(source, t_ns, distances, scales, warnings), warnings))
 
 
-def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[Notice]) -> Array:
+def motion_of_wheel_speeds(
+    source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[Notice]
+) -> Array:
     """Return the speed [m/s] and the turn rate [rad/s] of a robot (N, 2). ``speeds`` (N, 2 or 4): of the wheels [m/s].
 
     For mecanum wheels, increments (N, 3) are returned instead. A speed is assumed constant until the next of the
@@ -180,7 +182,7 @@ def of_speeds(source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, 
     twists = sizes.twists(source, speeds, warnings)
     if sizes.base is None:
         return twists[:, [0, 2]]
-    return after_rest(se2.exp(twists[:-1] * (np.diff(t_ns) / 1e9)[:, None]))
+    return with_start_row(se2.exp(twists[:-1] * (np.diff(t_ns) / 1e9)[:, None]))
 
 
 def odometry_stream(

@@ -18,7 +18,7 @@ from factorgraph_loc.files.models import write_text
 from factorgraph_loc.files.temporary import writing
 from factorgraph_loc.io.bags import rosbag
 from factorgraph_loc.io.bags.file import is_bag, require_rosbags
-from factorgraph_loc.io.bags.poses import checked_rotations, seven
+from factorgraph_loc.io.bags.poses import checked_rotations, numbers_of_pose
 from factorgraph_loc.io.readers import read_log
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.io.results import FINAL
@@ -157,7 +157,7 @@ def from_ros(messages: Any) -> PosePath:
         try:
             stamp = message.header.stamp
             stamps.append(stamp.sec * 10**9 + stamp.nanosec)
-            rows.append(_seven(message))
+            rows.append(_numbers_of_pose(message))
         except AttributeError as error:
             problem = f"message {i} is of type {type(message).__name__}"
             raise InputError(f"{problem}, expected {MESSAGES} of ROS 2, or one nav_msgs/Path") from error
@@ -176,13 +176,13 @@ def _posed(trajectory: Trajectory | PosePath, t0_ns: int) -> PosePath:
     return path
 
 
-def _seven(message: Any) -> tuple[float, ...]:
+def _numbers_of_pose(message: Any) -> tuple[float, ...]:
     """Return x, y, z [m] and the quaternion x, y, z, w of a message. A point has the identity quaternion."""
     if hasattr(message, "transform"):
-        return seven(message.transform, "translation", "rotation")
+        return numbers_of_pose(message.transform, "translation", "rotation")
     if hasattr(message, "point"):
         return message.point.x, message.point.y, message.point.z, 0.0, 0.0, 0.0, 1.0
-    return seven(message.pose.pose if hasattr(message.pose, "pose") else message.pose)
+    return numbers_of_pose(message.pose.pose if hasattr(message.pose, "pose") else message.pose)
 
 
 def _messages() -> Any:

@@ -5,7 +5,7 @@ import pytest
 from mapped_hall import write_mapped
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.io.motions import between_poses, between_ways
+from factorgraph_loc.io.motions import between_poses, wheel_motions
 from factors import se2
 
 STEP = np.array((0.05, 0.0, 0.02))  # in 0.1 s
@@ -49,7 +49,7 @@ def test_an_encoder_counts_on_from_its_other_end(size, least, way):
         ticks = (way * np.array(((30, 35),)) * np.arange(-200, 200)[:, None]) % size
     ticks = (ticks - least) % size + least
     warnings = []
-    steps = between_ways("wheels.csv", stamps(len(ticks)), ticks * scale, np.full(2, scale), warnings)
+    steps = wheel_motions("wheels.csv", stamps(len(ticks)), ticks * scale, np.full(2, scale), warnings)
     np.testing.assert_allclose(steps, np.tile(way * np.array((30, 35)) * scale, (len(ticks) - 1, 1)), atol=1e-6)
     assert warnings == []
 
@@ -58,7 +58,7 @@ def test_encoders_that_are_set_to_0_go_on_as_before():
     ways = np.cumsum(np.full((100, 2), 0.05), axis=0) + 3.0
     ways[70:] -= ways[70]
     warnings = []
-    steps = between_ways("wheels.csv", stamps(100), ways, np.ones(2), warnings)
+    steps = wheel_motions("wheels.csv", stamps(100), ways, np.ones(2), warnings)
     np.testing.assert_allclose(steps, 0.05, atol=1e-9)
     assert len(warnings) == 1
 

@@ -8,7 +8,7 @@ from mapped_hall import write_mapped
 from refusal import refusal
 
 from factorgraph_loc import read_log, write_native
-from factorgraph_loc.io.motions import through_losses
+from factorgraph_loc.io.motions import bridge_losses
 from factorgraph_loc.io.readers.pose_file import read_pose_file
 from factorgraph_loc.model.planar import are_null
 from factorgraph_loc.sensors.motion import whole_motion
@@ -147,7 +147,7 @@ def test_a_constant_placeholder_marks_no_loss():
 def test_losses_at_both_ends():
     t_ns = np.array([5, 6, 7]) * 100 * MS
     moves = np.array([(0.1, 0.0, 0.2), (0.1, 0.0, 0.2)])
-    every, out = through_losses(t_ns, moves, np.array([1, 2, 7, 8, 9, 30]) * 100 * MS)
+    every, out = bridge_losses(t_ns, moves, np.array([1, 2, 7, 8, 9, 30]) * 100 * MS)
     assert (every // (100 * MS)).tolist() == [5, 6, 7, 8, 9, 30]
     np.testing.assert_allclose(out[1:5, :3], np.tile(moves[0], (4, 1)), atol=1e-9)
     np.testing.assert_allclose(out[:, 3], (0.0, 0.0, 0.0, 0.1, 0.1, 2.1))

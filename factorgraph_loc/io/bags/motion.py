@@ -212,7 +212,7 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
 
     ``rows``: two velocities, and optionally a quaternion and the variances of x and y. A device that has lost its pose
     reports null quaternions or variances. Then a warning is appended, and increments (N, 4) are returned instead, see
-    :func:`motions.through_losses`.
+    :func:`motions.bridge_losses`.
     """
     values = rows.values
     null = np.zeros(len(rows), dtype=bool)
@@ -226,7 +226,7 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
     if not null.any():
         return t_ns, velocities
     warnings.append(null_poses(rows.source, int(rows.rows[null.argmax()]), int(np.count_nonzero(null))))
-    return motions.through_losses(t_ns, motions.held(t_ns, velocities), np.sort(rows.t_ns[null]))
+    return motions.bridge_losses(t_ns, motions.integrate_velocities(t_ns, velocities), np.sort(rows.t_ns[null]))
 
 
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
@@ -239,7 +239,7 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
         path = made(warnings)
         t_ns = path.stamps()
         moves = motions.between_poses(path.name, t_ns, path.on_floor(warnings, options), warnings, path.lost_ns)
-        return motions.through_losses(t_ns, moves, path.lost_ns)
+        return motions.bridge_losses(t_ns, moves, path.lost_ns)
 
     return motion
 
@@ -272,10 +272,10 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
             size *= wheels.unit
         t_ns, numbers = rows(warnings)
         if are_speeds:
-            return t_ns, motions.of_speeds(source, t_ns, size * numbers, wheels, warnings)
+            return t_ns, motions.motion_of_wheel_speeds(source, t_ns, size * numbers, wheels, warnings)
         scales = np.full(numbers.shape[1], size)
-        moves = motions.between_wheels(source, t_ns, size * numbers, scales, wheels, warnings)
-        return t_ns, motions.after_rest(moves)
+        moves = motions.motion_of_wheel_distances(source, t_ns, size * numbers, scales, wheels, warnings)
+        return t_ns, motions.with_start_row(moves)
 
     return motion
 

@@ -76,7 +76,7 @@ class Start:
         if self._found is None:
             stated = item.message.pose
             variances = np.asarray(stated.covariance, dtype=float)[[0, 7, 35]]
-            self._found = (t_ns, np.array([seven(stated.pose)], dtype=float), variances)
+            self._found = (t_ns, np.array([numbers_of_pose(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
         """Return the start. Its time [s] counts from ``t0_ns`` [ns]. If the robot is tilted, a warning is appended.
@@ -92,7 +92,7 @@ class Start:
         return StartPose((t_ns - t0_ns) / 1e9, pose, np.sqrt(variances))
 
 
-def seven(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
+def numbers_of_pose(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
     """Return x, y, z [m] and the quaternion x, y, z, w of the message ``pose``, from the fields with the two names."""
     p, q = getattr(pose, position), getattr(pose, orientation)
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
@@ -128,7 +128,7 @@ def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = Tr
     return PosePath(source, values[keep, :3], rotations, t_ns[keep], has_rotations, lost_ns=np.sort(t_ns[null]))
 
 
-def upward(parents: Mapping[str, str], frame: str) -> list[str]:
+def frame_and_ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
     """Return ``frame``, its parent, the parent of its parent, and so on. ``parents``: the parent of each frame.
 
     A cycle ends at the first repeated frame."""
@@ -151,7 +151,7 @@ class StaticFrames:
 
     def add(self, item: Stamped, t_ns: int) -> None:
         for transform in item.message.transforms:
-            values = np.array([seven(transform.transform, "translation", "rotation")])
+            values = np.array([numbers_of_pose(transform.transform, "translation", "rotation")])
             rotations = checked_rotations(item.topic, np.array([item.row]), values)
             child = plain(transform.child_frame_id)
             self.parents[child] = plain(transform.header.frame_id)
@@ -159,7 +159,7 @@ class StaticFrames:
 
     def pose(self, frame: str) -> Array | None:
         """Return the pose (4, 4) of ``frame`` in the frame of the robot. Returns None if no transforms connect the two frames."""
-        ours, theirs = self._up(plain(frame)), self._up(plain(self.base))
+        ours, theirs = self._poses_in_ancestors(plain(frame)), self._poses_in_ancestors(plain(self.base))
         common = next((name for name in ours if name in theirs), None)
         return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
 
@@ -174,10 +174,10 @@ class StaticFrames:
             raise InputError(f"{source}: tf_static has no pose of {frame} on {self.base}, only the frames: {frames}")
         return pose
 
-    def _up(self, frame: str) -> dict[str, Array]:
-        """Return the poses (4, 4) of ``frame`` in each of the frames that :func:`upward` returns, by frame name."""
+    def _poses_in_ancestors(self, frame: str) -> dict[str, Array]:
+        """Return the poses (4, 4) of ``frame`` in itself and in its ancestors, by the name of the ancestor."""
         out = {frame: np.eye(4)}
-        for child, parent in pairwise(upward(self.parents, frame)):
+        for child, parent in pairwise(frame_and_ancestors(self.parents, frame)):
             out[parent] = self.poses[child] @ out[child]
         return out
 
@@ -204,7 +204,7 @@ class FrameReference:
             self._parents[child] = parent
             edge = self._edges.setdefault(child, TopicRows(f"{self._source} {parent} to {child}", 7, rules=self._rules))
             stamp = self._stamper.choose(as_nanoseconds(transform.header.stamp, 1), t_ns)
-            edge.append(item, stamp, seven(transform.transform, "translation", "rotation"))
+            edge.append(item, stamp, numbers_of_pose(transform.transform, "translation", "rotation"))
 
     def path(self, warnings: list[Notice]) -> PosePath:
         """Return the trajectory at the timestamps of the most frequent transform. Other transforms are interpolated.
@@ -240,7 +240,7 @@ class FrameReference:
     def _chain(self) -> list[str]:
         """Return the frames from the child up to the parent, without the parent. Raises InputError if they are not connected."""
         parents = self._static.parents | self._parents
-        chain = upward(parents, self._child)
+        chain = frame_and_ancestors(parents, self._child)
         if self._parent in chain:
             return chain[: chain.index(self._parent)]
         known = sorted({*parents, *parents.values()})
@@ -317,7 +317,7 @@ class Tree:
 
     def above(self, frame: str, names: tuple[str, ...]) -> str | None:
         """Return the first of ``names`` that is an ancestor of ``frame`` and in which ``frame`` moves, or None."""
-        chain = upward(self.parents, frame)
+        chain = frame_and_ancestors(self.parents, frame)
         first = next((i for i, name in enumerate(chain) if name in self.moving), len(chain))
         return next((name for name in names if name in chain[first + 1 :]), None)
 

@@ -72,7 +72,7 @@ def read_camera(text: str) -> tuple[dict[str, Any], list[str]]:
     chain = {key: _camera(path, key, value) for key, value in stated.items()}
     camera = chain[name]
     section = _lens(path, name, camera)
-    mounting = _on_imu(path, chain, name)
+    mounting = _pose_in_imu(path, chain, name)
     remarks = [(WITHOUT if mounting is None else ON_IMU).format(name=name, file=path.name)]
     if mounting is not None:
         roll, pitch, yaw = angles_of_camera(mounting[:3, :3])
@@ -113,7 +113,7 @@ def _lens(path: Path, name: str, camera: ChainCamera) -> dict[str, Any]:
     return {"width": width, "height": height, **lens, "distortion_model": model, "distortion": distortion}
 
 
-def _on_imu(path: Path, chain: Mapping[str, ChainCamera], name: str) -> Array | None:
+def _pose_in_imu(path: Path, chain: Mapping[str, ChainCamera], name: str) -> Array | None:
     """Return the pose (4, 4) of the camera ``name`` in the frame of the IMU. Returns None if it is unknown.
 
     The transform to the IMU may be that of a previous camera of the chain."""

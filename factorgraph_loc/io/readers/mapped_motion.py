@@ -75,7 +75,7 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
         if options.has_sizes():
             raise InputError(f"{path}: format {options.format} has no wheels: remove track, radius and base")
         t_ns, poses, lost_ns = _in_format(folder, options)
-        return motions.through_losses(t_ns, motions.between_poses(path, t_ns, poses, warnings, lost_ns), lost_ns)
+        return motions.bridge_losses(t_ns, motions.between_poses(path, t_ns, poses, warnings, lost_ns), lost_ns)
     mapped, lost_ns = _with_poses(folder.read(options, ODOMETRY, COLUMNS), options, warnings)
     side = next((name for name in WHEELS if name in mapped.columns), None)
     wheel_names = motions.wheels_of(side, 4 if f"rear_{side}" in mapped.columns else 2) if side else ()
@@ -100,13 +100,13 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
     if side is not None:
         wheels = size * np.column_stack([kept[name] for name in wheel_names])
         if side in ("left_speed", "left_rate"):
-            return t_ns, motions.of_speeds(path, t_ns, wheels, options, warnings)
+            return t_ns, motions.motion_of_wheel_speeds(path, t_ns, wheels, options, warnings)
         scales = size * np.array([COLUMNS[name].in_unit(options.units.get(name, 1.0))[1] for name in wheel_names])
-        moves = motions.between_wheels(path, t_ns, wheels, scales, options, warnings)
+        moves = motions.motion_of_wheel_distances(path, t_ns, wheels, scales, options, warnings)
     else:
         poses = _planar(path, mapped.rows[keep], kept, options, warnings)
         moves = motions.between_poses(path, t_ns, poses, warnings, lost_ns)
-    return motions.through_losses(t_ns, moves, lost_ns)
+    return motions.bridge_losses(t_ns, moves, lost_ns)
 
 
 def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:

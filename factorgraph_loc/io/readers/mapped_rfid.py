@@ -176,7 +176,7 @@ def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
         raise InputError(f"{path}: columns has frequency and channel: remove one of them")
     shapes = REQUIRED[0] if options.antenna is None else REQUIRED[1]
     cells = read_wide(path, options, options.antenna) if wide else read_mapped(path, options, shapes, OPTIONAL, EPCS)
-    mapped = folder.noted(cells, options, _columns_of(options), _epcs(cells)[1])
+    mapped = folder.record_read(cells, options, _columns_of(options), _epcs(cells)[1])
     mapped.require(_epcs(mapped)[1])
     mapped = _in_sequence(mapped, options, folder.warnings)
     t_ns = mapped.stamps("t", options.clock_offset)
