@@ -24,20 +24,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
 
-VIEW = 6.0  # m; the plot shows this distance around the antenna
+VIEW = 6.0  # m; half the side of the plot around the antenna
 STEP = 0.1  # m; grid spacing of the plot
 
 
 class RfidCalibrator(Calibrator):
-    """Estimates survey, mounting and models of an RFID reader from reads and misses along trajectories."""
+    """Estimates survey transform, antenna mounting and detection models from reads and misses along trajectories."""
 
     section, channel = "rfid", "rfid"
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Estimate survey, mounting and models, see :meth:`Calibrator.learn`. With smoothed trajectories the survey is
-        not estimated. Raises InputError if the rig has no antennas, if they are fixed in the map, or if a log is too short."""
+        """Estimate survey transform, mounting and models. See :meth:`Calibrator.learn`. With smoothed trajectories, the
+        survey transform is not estimated. Raises InputError if the rig has no antennas, or if a log is too short."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()
@@ -58,7 +58,7 @@ class RfidCalibrator(Calibrator):
         return learn_rfid(logs, rig, grids, None if known is None else known.kind)
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
-        """Return ``rig`` with the priors of the detection models from ``first``. See :meth:`Calibrator.with_priors`."""
+        """Return ``rig`` with the priors of the detection models in ``first``. See :meth:`Calibrator.with_priors`."""
         if rig.rfid is None or first.rfid is None:
             return rig
         priors: dict[str, PriorSettings] = {name: model.prior for name, model in first.rfid.models.items()}
@@ -66,11 +66,11 @@ class RfidCalibrator(Calibrator):
         return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
     def is_complete(self, rig: Rig) -> bool:
-        """True if the rig has a detection model other than the default, which is too inaccurate."""
+        """Return False if the rig lacks a detection model other than the default, which is too inaccurate."""
         return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
 
     def pictures(self, knowledge: SensorKnowledge) -> Sequence[Part]:
-        """Return a plot of the probability of a read around the antenna, or () without detection models."""
+        """Return a title and a plot of the read probability around the antennas, or () without detection models."""
         if knowledge.details is None:
             return ()
         text = "Probability of a read around the antenna (triangle): observed on the left, the model on the right."
@@ -81,8 +81,8 @@ CALIBRATOR = RfidCalibrator()
 
 
 def field_figure(fit: RfidFit) -> Picture:
-    """Plot the probability of a read around the antenna: as observed, and by each detection model. A model with facing
-    has a plot for tags that face towards, across and away from the antenna."""
+    """Return a plot of the read probability around the antenna, with a row for each detection model: observed on the
+    left, by the model on the right. A model with facing has three plots: tag facing towards, across and away."""
     facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in fit.models) else (0.0,)
     figure, axes = grid(len(fit.models), 1 + len(facings), 5.0 * len(fit.models))
     axis = np.arange(-VIEW, VIEW + 1e-9, STEP)
@@ -105,8 +105,8 @@ def field_figure(fit: RfidFit) -> Picture:
 
 
 def _draw(panel: Axes, axis: Array, values: Array) -> QuadMesh:
-    """Draw probabilities ``values`` (N, N) at the grid positions ``axis`` (N,) [m] in x and y, and the antenna at the
-    origin."""
+    """Draw probabilities on a square grid, and the antenna at the origin. ``axis`` (N,): grid positions [m] in x and in
+    y. ``values`` (N, N): the probabilities. Returns the drawn image."""
     image = panel.pcolormesh(axis, axis, values.T, vmin=0.0, vmax=1.0, cmap="viridis", shading="nearest")
     panel.plot(0.0, 0.0, ">", color=COLOURS[1], markersize=9)
     panel.set_aspect("equal")

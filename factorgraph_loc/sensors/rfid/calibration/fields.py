@@ -1,8 +1,9 @@
 """Fits detection grids, and selects the kind of detection model that predicts held-out reads best.
 
-A detection grid has logits of the probability of a read in an antenna's frame. It is fitted as a difference to a parametric
-model. The difference is smooth by a penalty on second differences (Eilers and Marx, "Flexible smoothing with B-splines and
-penalties", Statistical Science 11(2), 1996), and zero without data. Logits are interpolated as in :mod:`factors.rfid.model`.
+A detection grid has logits of the probability of a read in an antenna's frame. It is fitted as a difference to a
+parametric model. The difference is smooth by a penalty on second differences (Eilers and Marx, "Flexible smoothing with
+B-splines and penalties", Statistical Science 11(2), 1996), and zero without data. Logits are interpolated as in
+:mod:`factors.rfid.model`.
 """
 
 import math
@@ -26,20 +27,20 @@ CELL = 0.5  # m; distance between knots
 EXTENT = 6.0  # m; half the side of a grid
 FACINGS = 5  # number of knots for the facing, if the model uses it
 HEIGHT_STEP = 0.5  # m; distance between knots in height
-PULL = 0.3  # weight of the squared difference of a knot to the parametric model
-GRADIENT = 0.01  # nats per logit; the fit ends at this gradient
-FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m and cosine; pairs that are closer are merged
+PULL = 0.3  # weight of squared differences between the grid and the parametric model
+GRADIENT = 0.01  # nats per logit; the fit ends when the gradient is smaller
+FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m, cosine; size of cells in which pairs are merged
 SMOOTHNESS = 5.0  # weight of squared second differences of logits
-WORTH = 1e-3  # nats per pair; minimum gain of a more complex model
-MODEL_PAIRS = 40000  # number of pairs that is sufficient for a parametric model
+WORTH = 1e-3  # nats per round; minimum gain of a more complex model
+MODEL_PAIRS = 40000  # maximum number of pairs for the fit of a parametric model
 
 
 def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, floor: Floor) -> GridModel:
-    """Fit a detection grid to the reads and misses of ``pairs``. Without data it equals the ``parametric`` model.
+    """Return a detection grid fitted to the reads and misses of ``pairs``. Far from all data it equals ``parametric``.
 
     ``smoothness``: weight of squared second differences of logits. ``floor``: probabilities of false reads and misses.
-    The grid has an axis for height if the heights of ``pairs`` differ, and one for facing if the parametric model has
-    it. The fitted difference to the parametric model does not depend on the facing.
+    The grid has an axis for height if the heights of ``pairs`` differ, and an axis for facing if ``parametric`` depends
+    on the facing.
     """
     base = bake(parametric, EXTENT, CELL, _heights(pairs), FACINGS if parametric.uses_facing else 1)
     shape = (base.logits.shape[0], 1, *base.logits.shape[2:])
@@ -71,8 +72,8 @@ def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, flo
 
 
 def _heights(pairs: TagPairs) -> list[float]:
-    """Return the knots of a grid in height [m]: evenly spaced multiples of HEIGHT_STEP that cover nearly all ``pairs``,
-    or a single one if their heights are nearly equal."""
+    """Return the heights [m] of the layers of a grid, as multiples of HEIGHT_STEP that cover nearly all ``pairs``. If
+    all pairs have nearly the same height, only this height is returned."""
     low, high = np.quantile(pairs.points[:, 2], (0.01, 0.99)).tolist()
     if high - low < HEIGHT_STEP:
         return [round(0.5 * (low + high), 3)]
@@ -80,8 +81,8 @@ def _heights(pairs: TagPairs) -> list[float]:
 
 
 def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array:
-    """Return the interpolation matrix (M, number of knots) from the grid's logits to those at ``points`` (M, 3) with
-    ``facing`` (M,)."""
+    """Return the matrix (M, number of grid points) that interpolates logits of the grid at tags. ``points`` (M, 3):
+    positions of the tags in the antenna frame. ``facing`` (M,): see :class:`TagPairs`."""
     shape, heights = grid.logits.shape, grid.heights
     axes = [
         knots.linear((points[:, 2] - heights[0]) / (heights[1] - heights[0] if len(heights) > 1 else 1.0), shape[0]),
@@ -98,8 +99,8 @@ def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array
 
 
 def _roughness(shape: Sequence[int]) -> sparse.csc_array:
-    """Return the matrix of a quadratic form: the sum of squared second differences along each axis of a grid of this
-    ``shape``. An axis with two knots has first differences."""
+    """Return the matrix of a quadratic form of the values on a grid with this ``shape``: the sum of squared second
+    differences along all axes. An axis with two grid points has first differences."""
     total = sparse.csc_array((int(np.prod(shape)),) * 2)
     for axis, size in enumerate(shape):
         if size < 2:
@@ -114,7 +115,7 @@ def _roughness(shape: Sequence[int]) -> sparse.csc_array:
 
 
 def _merged(pairs: TagPairs) -> TagPairs:
-    """Merge pairs with nearly equal positions and facings into one pair at their mean."""
+    """Return pairs in which those with nearly equal positions and facings are merged, at their mean."""
     rows = np.column_stack((pairs.points, pairs.facing))
     first, cell = cells(rows, FINE)
     hits, count = by_block(np.column_stack((pairs.hits, pairs.count)), cell).T
@@ -124,23 +125,23 @@ def _merged(pairs: TagPairs) -> TagPairs:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of detection model. ``name``: beam, logistic or grid. ``facing``: True if the model depends on the tags'
-    facing. ``own``: True if each antenna has its own model."""
+    """A kind of detection model. ``name``: "beam", "logistic" or "grid". ``facing``: True if the model depends on the
+    facing of tags. ``own``: True if each antenna has its own model."""
 
     name: str
     facing: bool = False
     own: bool = False
 
     def label(self) -> str:
-        """Return the name of the kind in tables."""
+        """Return the name of this kind of model for tables."""
         facing = ", with facing" if self.facing else ""
         return f"{self.name}{facing}, {'one per antenna' if self.own else 'one for all'}"
 
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
-    """Fit detection models of a ``kind`` to the reads and misses of ``pairs``. Returns the models, and for each antenna
-    the index of its model. If each antenna has its own model, an antenna without rounds gets a model that is fitted to
-    all antennas. ``floor``: probabilities of false reads and misses. ``antennas``: the number of antennas."""
+    """Fit detection models of a kind to the reads and misses of ``pairs``. Returns the models, and the index of the
+    model of each antenna. Antennas without data get a model of all antennas. ``floor``: probabilities of false reads
+    and misses. ``antennas``: the number of antennas."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     active = [a for a in range(antennas) if np.any(pairs.antenna == a)]
@@ -151,11 +152,11 @@ def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple
 
 
 def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tuple[Kind, dict[Kind, float]]:
-    """Choose the kind of detection model that predicts held-out reads best. Returns it, and the score of each kind.
+    """Choose a kind of detection model by cross-validation. Returns the best kind, and the score of each kind.
 
-    The score is the negative log-likelihood [nats per round] on folds of ``pairs`` that are held out. A more complex
-    model must be better than a simpler one by :data:`WORTH`. ``floor``: probabilities of false reads and misses.
-    ``antennas``: their number. ``facing``: True if the tags' facing is known.
+    The score is the negative log-likelihood [nats per round] of held-out ``pairs``. A more complex model must be better
+    than a simpler one by :data:`WORTH`. ``floor``: probabilities of false reads and misses. ``antennas``: the number of
+    antennas. ``facing``: True if the facing of tags is known.
     """
     kinds = [Kind("beam"), Kind("logistic"), *([Kind("logistic", facing=True)] if facing else [])]
     if antennas > 1:
@@ -169,7 +170,7 @@ def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tup
 
 
 def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
-    """Fit one detection model of a ``kind`` to all ``pairs``."""
+    """Return one detection model of a ``kind``, fitted to all ``pairs``."""
     some = pairs.part(np.arange(len(pairs.facing)) % (1 + len(pairs.facing) // MODEL_PAIRS) == 0)
     if kind.name == "beam":
         return fit_model(some, beam(BeamModel()), floor)[0]
@@ -178,8 +179,8 @@ def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
 
 
 def _held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> float:
-    """Return the negative log-likelihood per round of all folds of ``pairs``, each with models of the ``kind`` that are
-    fitted to the other folds."""
+    """Return the cross-validated negative log-likelihood per round of a ``kind`` of model: each fold of ``pairs`` is
+    predicted by models that are fitted to the other folds."""
     total = 0.0
     for fold in np.unique(pairs.fold):
         models, which = fit(pairs.part(pairs.fold != fold), kind, floor, antennas)

@@ -1,4 +1,4 @@
-"""Estimates RFID settings along trajectories: survey, mounting, detection models, tempering, and models of strength and phase.
+"""Estimates RFID settings: survey transform, mounting, detection models, tempering, and models of strength and phase.
 
 Along references all of these are estimated. Along smoothed trajectories only detection models and tempering are
 estimated. There the likelihood of the reads is averaged over possible poses
@@ -57,12 +57,12 @@ from factors.rfid.parameters import OF_MODEL
 from factors.se2 import Array
 
 DEFAULT = "default"
-# prior of a calibrated model: standard deviations of the changes from day to day in one installation
+# prior of a calibrated model: standard deviations of the changes between days in one building
 CALIBRATED = PriorSettings(range_scale=0.02, read_rate=0.1)
-MIN_READS = 100.0  # minimum number of weighted reads for the fit of a model
+MIN_READS = 100.0  # minimum (weighted) number of reads for the fit of a model
 COEFFICIENT = "coefficient of "
-VAGUE = 0.5  # a parameter with a larger relative standard error is not determined
-BURSTS = 1.3  # the tempering is not changed for an overdispersion below this
+VAGUE = 0.5  # maximum standard error of a parameter, as a fraction of its value
+BURSTS = 1.3  # minimum overdispersion for a change of the tempering
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class RfidFit:
     """Fitted detection models and their data.
 
     ``models``: the models. ``which``: the index of the model of each antenna. ``antennas``: names of the antennas.
-    ``kind``: the kind of all models. ``pairs``: the reads and misses that they are fitted to.
+    ``kind``: the kind of all models. ``pairs``: the reads and misses to which the models are fitted.
     """
 
     models: tuple[DetectionModel, ...]
@@ -81,9 +81,9 @@ class RfidFit:
 
 
 def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = None) -> SensorKnowledge:
-    """Estimate the RFID settings of a rig from ``logs`` with references.
+    """Estimate the RFID settings of ``rig`` from ``logs`` with references. Returns the result of the calibration.
 
-    Of logs with the same reads only one is used. ``grids``: path with name prefix of files for detection grids.
+    If several logs have the same reads, only one is used. ``grids``: path and name prefix of files for detection grids.
     ``kind``: the kind of detection model, None to choose the best kind. Raises InputError if a log has too few rounds.
     """
     logs = [log for i, log in enumerate(logs) if recordings(logs)[i] == i]
@@ -120,10 +120,10 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
 
 
 def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) -> SensorKnowledge:
-    """Estimate detection models, their priors, tempering, and yaw and clock of the antennas, from smoothed logs.
+    """Estimate the RFID settings of ``rig`` from smoothed logs. Returns the result of the calibration.
 
-    ``rig``: the rig that the logs were smoothed with. ``first``: the rig before the first repetition of smoothing and
-    calibration. The priors are around its values. ``grids``: path with name prefix of files for detection grids.
+    ``rig``: the rig with which the logs were smoothed. ``first``: the rig before the first iteration of smoothing and
+    calibration. Priors are around its values. ``grids``: path and name prefix of files for detection grids.
     """
     settings, initial = rig.of(RfidSettings), first.of(RfidSettings)
     floor = floor_of(initial)
@@ -148,7 +148,7 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
     constants.append(FittedConstant("rfid", "tempering", known, tempering, max(error / excess**2, 1e-4)))
     settings, mounting = _mounted(traced, settings, initial)
     changes = {"models": models, "false_read": floor.false_read, "miss": floor.miss, "tempering": tempering}
-    # the default uncertainties would shrink with the new priors of the models
+    # keep the uncertainties, because their defaults would become smaller with the new priors of the models
     changes["uncertainty"] = RfidUncertainty(**initial.uncertainties())
     return SensorKnowledge({"rfid": settings.model_copy(update=changes)}, [*constants, *mounting], notes)
 
@@ -156,8 +156,8 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
 def _mounted(
     traced: Sequence[Traced], settings: RfidSettings, initial: RfidSettings
 ) -> tuple[RfidSettings, list[FittedConstant]]:
-    """Return settings with the yaws of the antennas and the time offset that the smoother estimated, and these
-    constants. A constant that the logs do not determine keeps its initial value."""
+    """Return ``settings`` with the antenna yaws and the time offset that the smoother estimated, and a list of these
+    constants. Constants that the logs do not determine get their value in ``initial``."""
     known, antennas, constants = initial.uncertainties(), dict(settings.all_antennas()), list[FittedConstant]()
     common = corrections_of("rfid.yaw", traced)
     for name, antenna in antennas.items():
@@ -179,9 +179,9 @@ def _mounted(
 def _mean(
     name: str, corrections: Sequence[tuple[float, float]], initial: float, value: float, prior: float
 ) -> FittedConstant | None:
-    """Return a constant that is the same in all logs: ``value`` plus the mean of its ``corrections``, each with a
-    standard deviation. It has the ``initial`` value if the logs do not determine it. Returns None without corrections.
-    ``prior``: the standard deviation of the constant before the calibration."""
+    """Return a constant that is the same in all logs, or None without corrections. Its value is ``value`` plus the mean
+    correction, or ``initial`` if the logs do not determine the constant. ``corrections``: a correction and its standard
+    deviation for each log. ``prior``: the standard deviation of the constant before the calibration."""
     if not corrections:
         return None
     each, errors = np.array(corrections).T
@@ -194,8 +194,8 @@ def _refitted(
     pairs: TagPairs, initial: DetectionModel, name: str, floor: Floor
 ) -> tuple[DetectionModel, list[FittedConstant]] | None:
     """Fit a detection model of the same kind as ``initial`` to ``pairs``. Returns the model and its parameters, or None
-    if the model is a beam and ``pairs`` do not determine it. ``name``: the name of the model. ``floor``: probabilities
-    of false reads and misses."""
+    if it is a beam that ``pairs`` do not determine. ``name``: the name of the model. ``floor``: probabilities of false
+    reads and misses."""
     family = family_of(initial, pairs)
     model, posterior = fit_model(pairs, family, floor)
     if isinstance(initial, BeamModel) and np.any(posterior.errors > VAGUE * np.abs(posterior.values)):
@@ -209,8 +209,8 @@ def _refitted(
 
 
 def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
-    """Return the standard deviations between logs of the range and the rate of a model, from the smoother's estimates.
-    ``labels``: the names of the two parameters."""
+    """Return the standard deviations, between logs, of the range and the read rate that the smoother estimated for a
+    model. ``labels``: the names of the two parameters in the logs."""
     scatters = {}
     for kind, label in zip(OF_MODEL, labels, strict=True):
         if corrections := corrections_of(f"rfid.{label}", traced):
@@ -219,14 +219,14 @@ def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
 
 
 def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
-    """Return the rounds of a log with a smoothed trajectory, at poses that are drawn from the distribution of the trajectory. Tags
-    that are probably not at their position in the map are omitted. Raises InputError if fewer than two tags remain."""
+    """Return the rounds of a log at poses that are drawn from its smoothed trajectory. Tags that have probably moved
+    are omitted. Raises InputError if fewer than two tags remain."""
     rounds = rounds_of(trace.log, settings)
     kept = np.array([name not in trace.doubted for name in rounds.names])
     if kept.sum() < 2:
         raise InputError(
-            f"{trace.log.name}: {kept.sum()} of the {len(kept)} tags that were read are where the map has them, expected 2 or "
-            "more for a calibration without a reference"
+            f"{trace.log.name}: {kept.sum()} of the {len(kept)} tags that were read are at their position in the map, "
+            "expected 2 or more for a calibration without a reference"
         )
     assert trace.log.reference is not None
     return replace(
@@ -239,14 +239,14 @@ def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
 
 
 def _bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
-    """Return the overdispersion of ``pairs`` with predicted logits (M,), and its standard error. See
-    :func:`.overdispersion`."""
+    """Return the overdispersion of the reads in ``pairs`` and its standard error, see :func:`.overdispersion`.
+    ``logit`` (M,): predicted logits of a read."""
     return overdispersion(pairs.hits, pairs.count, floor.probability(logit), pairs.antenna, pairs.tag, pairs.block)
 
 
 def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """Estimate survey and lever arm by phases. Returns None if there are too few phases, or if the phases agree with
-    the estimate no better than with ``survey`` and ``settings``."""
+    """Estimate the survey transform and the lever arm from phases. Returns None if there are too few phases, or if the
+    phases do not agree better with the estimates than with ``survey`` and ``settings``."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:
@@ -255,23 +255,23 @@ def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) 
 
 
 def _priors_of(phase: PhaseFit, survey: SurveySettings) -> dict[str, tuple[float, float]]:
-    """Return mean and standard deviation of each change of survey and lever arm by its name, such as ``antennas.x``,
-    from a fit to phases."""
+    """Return the changes of survey transform and lever arm that phases determine: (mean, standard deviation) by name,
+    such as "antennas.x". ``survey``: the transform before the fit."""
     shift = (phase.survey.x - survey.x, phase.survey.y - survey.y, phase.survey.heading - survey.heading)
     names = (*SURVEY, "antennas.x", "antennas.y")
     return dict(zip(names, zip((*shift, *phase.lever_arm), phase.sigmas.tolist(), strict=True), strict=True))
 
 
 def floor_of(settings: RfidSettings) -> Floor:
-    """Return the rig's probabilities of false reads and misses. If the rig does not set them, return the defaults of
-    :class:`Floor`, which are robust to a few wrong tags and reads."""
+    """Return the probabilities of false reads and misses in ``settings``. If these are not set, return the defaults of
+    :class:`Floor`, with which fits are robust to a few wrong tags and reads."""
     given = settings.model_fields_set & {"false_read", "miss"}
     return Floor(settings.false_read, settings.miss) if given else Floor()
 
 
 def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> SurveySettings:
-    """Return a survey transform whose rotation is about the centre of the tags, so that shift and rotation are
-    uncorrelated. A transform that the rig already has is returned unchanged."""
+    """Return an identity transform with a rotation about the centre of the tags, so that translation and rotation are
+    uncorrelated. If ``survey`` is not the default, it is returned unchanged."""
     if survey != SurveySettings():
         return survey
     places = {name: point for log in rounds for name, point in zip(log.names, log.tags.points[:, :2], strict=True)}
@@ -282,11 +282,11 @@ def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> Surve
 def _with_models(
     settings: RfidSettings, models: Sequence[DetectionModel], which: Sequence[int], grids: Path, floor: Floor
 ) -> RfidSettings:
-    """Return the settings with fitted detection models, and write grids to files with the name prefix ``grids``.
-    ``which``: the index of the model of each antenna. ``floor``: the probabilities of false reads and misses."""
+    """Return ``settings`` with fitted detection models. Detection grids are written to files with the path prefix
+    ``grids``. ``which``: the index of the model of each antenna. ``floor``: probabilities of false reads and misses."""
     antennas = dict(settings.all_antennas())
     names = [DEFAULT] * len(models)
-    if len(models) > 1:  # each model has the name of its antenna
+    if len(models) > 1:  # a model gets the name of its antenna
         names = [next((a for a, w in zip(antennas, which, strict=True) if w == i), DEFAULT) for i in range(len(models))]
     antennas = {
         a: s.model_copy(update={"x": round(s.x, 4), "y": round(s.y, 4), "yaw": round(s.yaw, 5), "model": names[w]})
@@ -297,7 +297,7 @@ def _with_models(
             "antennas": antennas,
             "preset": None,
             "models": {name: written(model, name, grids) for name, model in zip(names, models, strict=True)},
-            "uncertainty": RfidUncertainty(),  # defaults, which are proportional to the models' priors
+            "uncertainty": RfidUncertainty(),  # the defaults are proportional to the priors of the models
             "false_read": floor.false_read,
             "miss": floor.miss,
         }
@@ -307,9 +307,9 @@ def _with_models(
 def _with_signals(
     logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings, *, focused: bool
 ) -> RfidSettings:
-    """Return the settings with a model of strength if the logs have it, and with a model of phase if ``focused``.
+    """Return ``settings`` with models of signal strength (if the logs have it) and of phase (if ``focused``).
 
-    ``focused``: True if phases have determined the geometry, which is too inaccurate for phases otherwise.
+    ``focused``: True if the geometry was estimated from phases. Otherwise it is too inaccurate to use phases.
     """
     changes: dict[str, object] = {}
     try:
@@ -324,7 +324,7 @@ def _with_signals(
 
 
 def written(model: DetectionModel, name: str, grids: Path) -> BeamSettings | LogisticSettings | GridSettings:
-    """Return the settings of a fitted model. A grid is written to a file whose name has the prefix ``grids``."""
+    """Return the settings of the fitted model ``name``. A grid is written to a file with the path prefix ``grids``."""
     if isinstance(model, BeamModel):
         values = {field: round(value, 4) for field, value in asdict(model).items()}
         return BeamSettings.bounded(**values, prior=CALIBRATED)
@@ -337,6 +337,6 @@ def written(model: DetectionModel, name: str, grids: Path) -> BeamSettings | Log
 
 
 def _safe(name: str) -> str:
-    """Convert a name to a file name that is valid on every system. Different names have different results."""
+    """Return a unique file name for ``name`` that is valid on every operating system."""
     safe = file_name("".join(c if c.isalnum() or c in "-_" else "-" for c in name))
     return safe if safe == name else f"{safe}-{hashlib.sha256(name.encode('utf-8', 'surrogatepass')).hexdigest()[:8]}"

@@ -1,4 +1,4 @@
-"""Data for the fit of detection models: pairs of an active antenna and a tag, with position of the tag and number of reads."""
+"""Data for the fit of detection models: pairs of an antenna pose and a tag, with the number of reads."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from factors import se2
 from factors.rfid.model import NEGLIGIBLE_LOGIT, DetectionModel, logits
 from factors.se2 import Array
 
-REACH = 8.0  # m; largest distance in the plane of a pair, which is also the range of a logistic model
-BLOCK = 20.0  # s; reads in the same block of time may be correlated
-BLOCKS = 4  # number of folds if there is only one log; otherwise each log is a fold
+REACH = 8.0  # m; maximum horizontal distance from an antenna to a tag, also for logistic models
+BLOCK = 20.0  # s; length of time blocks; reads in the same block may be correlated
+BLOCKS = 4  # number of folds for cross-validation if there is only one log; otherwise each log is a fold
 
 
 @dataclass(frozen=True, eq=False)
 class TagPairs:
-    """M pairs of an antenna at one pose and a tag.
+    """M pairs of an antenna pose and a tag, with the number of reads: the data to which detection models are fitted.
 
-    ``points`` (M, 3): positions of the tags in the antenna's frame [m].
+    ``points`` (M, 3): position of the tag in the antenna frame [m].
     ``facing`` (M,): cosine of the angle between the tag's facing and the direction to the antenna, 0 if unknown.
-    ``hits``, ``count`` (M,): number of rounds that read the tag, and number of rounds.
+    ``count`` (M,): number of rounds. ``hits`` (M,): number of rounds that read the tag.
     ``antenna``, ``tag`` (M,): index of the antenna in the rig, and of the tag among all logs.
-    ``fold`` (M,): number of the fold for cross-validation. ``block`` (M,): number of the block of time.
+    ``fold`` (M,): number of the fold for cross-validation. ``block`` (M,): number of the time block.
     """
 
     points: Array
@@ -40,14 +40,14 @@ class TagPairs:
     block: Integers
 
     def part(self, keep: NDArray[np.bool_] | Integers) -> TagPairs:
-        """Return the selected pairs."""
+        """Return only the pairs that ``keep``, a mask (M,) or indices, selects."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The likelihood of M pairs, each field (M,): the negative log-likelihood, its derivative by the logit, and the
-    Fisher information on the logit."""
+    """The likelihood of M pairs. ``nll`` (M,): negative log-likelihood. ``gradient`` (M,): its derivative by the logit
+    of a read. ``information`` (M,): Fisher information on the logit."""
 
     nll: Array
     gradient: Array
@@ -61,10 +61,10 @@ def pairs_of(
     within: Sequence[Integers] | None = None,
     length: float = BLOCK,
 ) -> TagPairs:
-    """Return the pairs of antenna and tag of several logs.
+    """Return the pairs of antenna pose and tag in several logs.
 
-    ``survey``: the transform of the tags' positions. ``within``: for each log the flat indices (round, tag) of the
-    pairs, None for all pairs within :data:`REACH`. ``length``: length of the blocks of time [s].
+    ``survey``: the transform of the tags to the world frame. ``within``: the result of :func:`nearby` for each log,
+    None to compute it. ``length``: length of the time blocks [s].
     """
     numbers = {name: i for i, name in enumerate(dict.fromkeys(name for log in logs for name in log.names))}
     parts = []
@@ -86,16 +86,16 @@ def pairs_of(
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
-    """Return the flat indices (round, tag) of the pairs of antenna and tag that are closer than :data:`REACH`."""
+    """Return the indices of all pairs closer than :data:`REACH`. The index of round k and tag t of T is k T + t."""
     every = np.arange(log.hits.size)
     return every[view_of(log, settings, survey, every)[1] < REACH]
 
 
 def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: Integers) -> tuple[Array, Array]:
-    """Return the geometry of the pairs of a log with flat indices ``pairs`` (M,) of round and tag.
+    """Return the geometry of M pairs of a log. ``pairs`` (M,): indices of the pairs as in :func:`nearby`.
 
-    Returns coordinates (M, 4), which are the tag's position in the antenna's frame [m] and its facing as in
-    :class:`TagPairs`, and the distance (M,) of antenna and tag in the plane [m].
+    Returns an array (M, 4) with the tag's position in the antenna frame [m] and its facing as in :class:`TagPairs`, and
+    the horizontal distance (M,) from antenna to tag [m].
     """
     row, column = np.divmod(pairs, len(log.names))
     transform = survey.transform()
@@ -117,21 +117,21 @@ def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: 
 
 @dataclass(frozen=True)
 class Floor:
-    """Lower bounds of two probabilities at any position of a tag: ``false_read`` of the probability of a read, and
-    ``miss`` of the probability of a miss."""
+    """Lower bounds of probabilities. ``false_read``: the minimum probability of a read, at any position of the tag.
+    ``miss``: the minimum probability of a miss."""
 
     false_read: float = 0.02
     miss: float = 0.02
 
     def probability(self, logit: Array) -> Array:
-        """Return the probability of a read for logits of a detection model."""
+        """Return the probability of a read, within the bounds, for the logit of a detection model."""
         sigmoid = 1.0 / (1.0 + np.exp(-np.maximum(logit, NEGLIGIBLE_LOGIT)))
         return np.asarray(self.false_read + (1.0 - self.false_read - self.miss) * sigmoid)
 
 
 def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
-    """Return the likelihood of ``hits`` (M,) in ``count`` (M,) rounds with logits (M,). ``floor``: probabilities of
-    false reads and misses, see :mod:`factors.rfid.model`."""
+    """Return the binomial likelihood of ``hits`` (M,) reads in ``count`` (M,) rounds. ``logit`` (M,): logits of a read
+    by a detection model. ``floor``: probabilities of false reads and misses."""
     q = np.clip(floor.probability(logit), 1e-12, 1.0 - 1e-12)
     by_logit = (q - floor.false_read) * (1.0 - floor.miss - q) / (1.0 - floor.false_read - floor.miss)
     return Terms(
@@ -142,7 +142,7 @@ def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
 
 
 def modelled(models: Sequence[DetectionModel], which: Sequence[int], pairs: TagPairs) -> Array:
-    """Return the logits (M,) of ``pairs`` by detection models. Antenna i has the model ``models[which[i]]``."""
+    """Return the logits (M,) of a read that ``models`` predict for ``pairs``. Antenna i has ``models[which[i]]``."""
     out = np.empty(len(pairs.facing))
     mine = np.asarray(which)[pairs.antenna]
     for i, model in enumerate(models):

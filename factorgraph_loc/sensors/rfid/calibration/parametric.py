@@ -1,4 +1,4 @@
-"""Fits parametric detection models, and estimates survey and mounting together with a model, by maximal posterior density.
+"""Maximum a posteriori estimates of parametric detection models, and of survey and mounting together with a model.
 
 The likelihood of reads and misses includes false reads (:func:`~factorgraph_loc.sensors.rfid.calibration.pairs.terms`).
 Derivatives by parameters of a model, by the survey's transform and by the antennas' mounting are numerical.
@@ -28,17 +28,17 @@ from factors.rfid.parameters import MOST_CERTAIN, OF_MODEL, rate_of
 from factors.se2 import Array, Integers
 
 FACING = tuple(i for i, name in enumerate(FEATURES) if "c" in name)  # features that depend on the facing
-EDGE = 5.0  # pseudo-rounds without reads at the maximum range, so that extrapolations do not grow with distance
-VAGUE = 1e3  # standard deviation of a prior without information
+EDGE = 5.0  # weight of artificial misses at the maximum range, so that read probabilities do not grow with distance
+VAGUE = 1e3  # standard deviation of a flat prior
 STEP = 1e-4  # step of numerical derivatives
 WINDOW = 10.0  # s; reads in different windows are treated as independent
-MOST_PAIRS = 60000  # largest number of pairs per log in the fit of survey and mounting
+MOST_PAIRS = 60000  # maximum number of pairs per log in the fit of survey and mounting
 # bounds of the parameters of a beam
 BEAM = {"p0": (0.05, 0.999), "r_max": (0.3, 2.0 * REACH), "s_r": (0.05, 5.0), "sigma_phi": (0.1, 9.0)}
 SURVEY = {"survey.x": 0.1, "survey.y": 0.1, "survey.heading": 0.05}  # m, rad; standard deviations of the priors
-# m, rad; standard deviations of the priors of changes of mounting that all antennas have in common
+# m, rad; prior standard deviations of a change of the mounting that all antennas share
 COMMON = {"antennas.x": 0.05, "antennas.y": 0.05, "antennas.yaw": 0.15}
-APART = 0.7  # standard deviations of the additional change of each antenna's mounting, as a fraction of COMMON
+APART = 0.7  # prior standard deviation of the additional change of each antenna, as a fraction of COMMON
 NO_FOCUS: Mapping[str, tuple[float, float]] = {}
 
 
@@ -46,8 +46,9 @@ NO_FOCUS: Mapping[str, tuple[float, float]] = {}
 class Family:
     """A family of detection models with P parameters.
 
-    ``built``: a function that returns the model for values (P,) of the parameters. ``design``: for models whose logit
-    is linear in the parameters, a function that returns its derivatives (M, P) at points (M, 3) and facings (M,).
+    ``parameters``: the P parameters with priors. ``built``: a function from values (P,) of the parameters to the model.
+    ``design``: a function from points (M, 3) and facings (M,) to the derivatives (M, P) of the logit of a read by the
+    parameters. It is None if the logit is not linear in the parameters.
     """
 
     parameters: tuple[Parameter, ...]
@@ -57,8 +58,8 @@ class Family:
     def jacobian(self, values: Array, points: Array, facing: Array) -> Array:
         """Return the derivatives (M, P) of the logit of a read by the parameters, at their ``values`` (P,).
 
-        ``points`` (M, 3): positions of tags in the antenna's frame [m]. ``facing`` (M,): cosine of the angle between
-        the tag's facing and the direction to the antenna.
+        ``points`` (M, 3): positions of tags in the antenna frame [m]. ``facing`` (M,): cosine of the angle between the
+        tag's facing and the direction to the antenna.
         """
         if self.design is not None:
             return self.design(points, facing)
@@ -69,8 +70,8 @@ class Family:
 
 
 def features(points: Array, facing: Array) -> Array:
-    """Return the features (M, 11) of :data:`factors.rfid.model.FEATURES` for tags at ``points`` (M, 3) in the antenna's
-    frame, with ``facing`` (M,)."""
+    """Return the features (M, 11) in :data:`factors.rfid.model.FEATURES` of M tags. For the arguments see
+    :meth:`Family.jacobian`."""
     x, y, z = points.T
     r = np.sqrt(x**2 + y**2 + NEAR**2)
     w, c = 1.0 - x / r, facing
@@ -78,8 +79,9 @@ def features(points: Array, facing: Array) -> Array:
 
 
 def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
-    """Return the family of logistic models. Each coefficient has a Gaussian prior with mean 0. Its standard deviation
-    is the reciprocal of the feature's standard deviation in ``pairs``, or very large for the constant."""
+    """Return the family of logistic models. The coefficients have Gaussian priors with mean 0. The prior standard
+    deviation of a coefficient is 1 over the standard deviation of its feature in ``pairs``. The constant has a flat
+    prior. ``with_facing``: True to use the features that depend on the facing of tags."""
     every = _edged(pairs)
     scale = np.std(features(every.points, every.facing), axis=0)
     used = [i for i in range(len(FEATURES)) if i == 0 or (scale[i] > 1e-6 and (with_facing or i not in FACING))]
@@ -95,7 +97,7 @@ def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
 
 
 def beam(start: BeamModel) -> Family:
-    """Return the family of beams, with priors around ``start``. The factor ``behind`` is no parameter: it is ``start.behind``."""
+    """Return the family of beam models with priors around ``start``. The parameter ``behind`` is fixed."""
     parameters = []
     for name, (low, high) in BEAM.items():
         mean = min(max(getattr(start, name), low), high)
@@ -104,7 +106,8 @@ def beam(start: BeamModel) -> Family:
 
 
 def scaled(start: GridModel) -> Family:
-    """Return the family of grids that differ from ``start`` in range and read rate, see :mod:`factors.rfid.parameters`."""
+    """Return the family of grids that differ from ``start`` only in range and read rate. See
+    :mod:`factors.rfid.parameters`."""
     peak = min(start.peak, MOST_CERTAIN)
 
     def built(values: Array) -> GridModel:
@@ -118,15 +121,16 @@ def scaled(start: GridModel) -> Family:
 
 
 def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
-    """Return the family of models of the same kind as ``model``. ``pairs``: reads and misses that scale the priors of a
-    logistic model."""
+    """Return the family of models of the same kind as ``model``. ``pairs``: the data from which the priors of logistic
+    models are computed."""
     if isinstance(model, BeamModel):
         return beam(model)
     return scaled(model) if isinstance(model, GridModel) else logistic(pairs, with_facing=model.uses_facing)
 
 
 def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionModel, Posterior]:
-    """Fit a detection model of a ``family`` to ``pairs``. Returns the model of maximal posterior density, and the posterior."""
+    """Return the maximum a posteriori detection model of a ``family`` for the reads and misses in ``pairs``, and the
+    posterior of its parameters. ``floor``: probabilities of false reads and misses."""
     data = _edged(pairs) if family.design else pairs
     design = family.design(data.points, data.facing) if family.design else None
 
@@ -143,11 +147,11 @@ def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionM
 def places_of(
     settings: RfidSettings, focus: Mapping[str, tuple[float, float]] = NO_FOCUS
 ) -> tuple[tuple[Parameter, ...], Array]:
-    """Return the changes of the survey and of each antenna's mounting as parameters, and the covariance of their priors.
+    """Return the changes of the survey transform and of the mounting of each antenna as P parameters, and the
+    covariance (P, P) of their prior.
 
-    The change of an antenna is the sum of a change that all antennas have in common, and of its own change if there are
-    several antennas. ``focus``: means and standard deviations of changes by name, as estimated by phases, which replace
-    the default priors.
+    The change of an antenna is a change that all antennas share, plus an own change if there are several antennas.
+    ``focus``: priors (mean, standard deviation) of changes by name, which replace the default priors.
     """
     priors = {name: (0.0, sigma) for name, sigma in (SURVEY | COMMON).items()} | dict(focus)
     antennas = settings.all_antennas()
@@ -165,8 +169,8 @@ def places_of(
 
 
 def kind_of(place: Parameter) -> tuple[str, str]:
-    """Return the kind of a parameter of :func:`places_of`, which is a name in SURVEY or COMMON, and the name of its
-    antenna or ""."""
+    """Split the name of a parameter of :func:`places_of` into a key of SURVEY or COMMON, and the name of the antenna.
+    The antenna is "" for the survey."""
     what, _, rest = place.name.partition(".")
     antenna, _, name = rest.rpartition(".")
     return f"{what}.{name}", antenna
@@ -181,10 +185,11 @@ def place(
     *,
     with_facing: bool,
 ) -> tuple[RfidSettings, SurveySettings, Posterior]:
-    """Estimate survey and mounting together with a logistic model of all antennas, by maximal posterior density.
+    """Return maximum a posteriori estimates of the survey transform and of the mounting of the antennas.
 
-    Returns the changed settings, the changed survey, and the posterior of the changes. ``focus``: see
-    :func:`places_of`. ``with_facing``: True if the model depends on the tags' facing.
+    They are estimated together with a logistic model for all antennas. Returns ``settings`` and ``survey``, both
+    updated, and the posterior of the changes. ``focus``: see :func:`places_of`. ``with_facing``: True if the model
+    depends on the facing of tags.
     """
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]
@@ -220,7 +225,7 @@ def place(
 def moved(
     settings: RfidSettings, survey: SurveySettings, places: Sequence[Parameter], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
-    """Return settings and survey with ``changes`` (P,) of the parameters ``places`` added."""
+    """Return ``settings`` and ``survey`` after ``changes`` (P,) of the parameters ``places``, see :func:`places_of`."""
     antennas = dict(settings.all_antennas())
     for place, change in zip(places, changes.tolist(), strict=True):
         antenna, name = kind_of(place)[1], place.name.rpartition(".")[2]
@@ -231,7 +236,7 @@ def moved(
             survey = new
         else:
             antennas[antenna] = new
-    # a preset cannot have changed positions, so its antennas are listed instead
+    # a preset has fixed positions, so that its antennas must be listed instead
     return settings.model_copy(update={"antennas": antennas, "preset": None}), survey
 
 
@@ -243,9 +248,9 @@ def pose_share(
     which: Sequence[int],
     floor: Floor,
 ) -> float:
-    """Return the fraction of the reads' information on the pose that is left after correlations within windows of time
-    are accounted for. ``logs``: unmerged rounds. ``models``, ``which``: the detection models, and the index of the
-    model of each antenna. ``floor``: probabilities of false reads and misses."""
+    """Return the information of the reads on the pose, divided by the information if all reads were independent. Reads
+    in a time window are correlated, so that the result is below 1. ``logs``: rounds that are not merged. ``which``: the
+    index in ``models`` of the model of each antenna. ``floor``: probabilities of false reads and misses."""
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within, WINDOW)
     logit, columns = modelled(models, which, pairs), []
@@ -257,8 +262,8 @@ def pose_share(
 
 
 def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, block: Integers) -> LikelihoodTerms:
-    """Return the likelihood of ``pairs`` with ``logit`` (M,) and its ``jacobian`` (M, P) by parameters. Reads with the
-    same number in ``block`` (M,) are correlated."""
+    """Return the likelihood of ``pairs``. ``logit`` (M,): predicted logits of a read. ``jacobian`` (M, P): their
+    derivatives by P parameters. ``block`` (M,): pairs with the same number are treated as correlated."""
     likelihood = terms(logit, pairs.hits, pairs.count, floor)
     information = jacobian.T @ (likelihood.information[:, None] * jacobian)
     scores = by_block(likelihood.gradient[:, None] * jacobian, block)
@@ -266,7 +271,7 @@ def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, bloc
 
 
 def _edged(pairs: TagPairs) -> TagPairs:
-    """Return the pairs and additional pseudo-rounds without reads, at the maximum range around the antenna."""
+    """Return ``pairs`` with additional artificial misses at the maximum range around the antenna."""
     axes = np.linspace(-np.pi, np.pi, 24, endpoint=False), (-1.0, 0.0, 1.0), np.linspace(-1.0, 1.0, 5)
     bearing, height, facing = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     edge = np.column_stack((REACH * np.cos(bearing), REACH * np.sin(bearing), height))

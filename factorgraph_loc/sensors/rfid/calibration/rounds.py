@@ -1,4 +1,4 @@
-"""Data for the calibration of RFID: the rounds of each antenna along the reference of a log, with their reads and misses.
+"""Data for the calibration of RFID: the rounds of each antenna along the reference of a log, with reads and misses.
 
 Rounds of an antenna at nearly the same pose are correlated. They are merged into one row with the numbers of reads and
 of rounds.
@@ -22,8 +22,8 @@ from factorgraph_loc.text import listed
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
 
-CELL = (0.05, 0.05, 0.05, 1.0)  # m, m, rad, antenna index; rounds in the same cell are merged
-MOST_ROUNDS = 20.0  # largest weight of a pose; otherwise a robot at rest would dominate the data
+CELL = (0.05, 0.05, 0.05, 1.0)  # m, m, rad, antenna index; size of the cells in which rounds are merged
+MOST_ROUNDS = 20.0  # maximum number of rounds that a pose counts, so that a robot at rest does not dominate the data
 MIN_ROUNDS = 100
 
 Integers = NDArray[np.int64]
@@ -31,11 +31,11 @@ Integers = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Rounds:
-    """K robot poses with rounds of one antenna each, and the T tags of the map that the log reads at least once.
+    """Inventory rounds of a log at K robot poses, and the T tags of the map that are read at least once.
 
-    ``log``: the name of the log. ``t`` (K,): times [s]. ``poses`` (K, 3): of the robot. ``antenna`` (K,): index in the
-    rig. ``count`` (K,): weighted number of rounds. ``hits`` (K, T): weighted number of rounds that read each tag.
-    ``tags``: positions and facings as surveyed, without survey transform. ``names``: T EPCs.
+    ``log``: the name of the log. ``t`` (K,): times [s]. ``poses`` (K, 3): robot poses. ``antenna`` (K,): the antenna of
+    the rounds, as index in the rig. ``count`` (K,): weighted number of rounds. ``hits`` (K, T): weighted number of
+    rounds that read each tag. ``tags``: positions and facings of the tags in the survey frame. ``names``: T EPCs.
     """
 
     log: str
@@ -48,16 +48,16 @@ class Rounds:
     names: tuple[str, ...]
 
     def part(self, keep: NDArray[np.bool_] | Integers) -> Rounds:
-        """Return the selected poses with all tags."""
+        """Return only the poses that ``keep``, a mask (K,) or indices, selects, with all tags."""
         columns = ("t", "poses", "antenna", "count", "hits")
         return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
 
 def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Rounds:
-    """Return the rounds of a log within the reference. Unknown EPCs and antennas are omitted.
+    """Return the rounds of a log for which the reference has a pose. Unknown tags and antennas are omitted.
 
-    ``merged``: True to merge rounds at nearly the same pose. The pose of a round is that at the middle of its reads.
-    Raises InputError if there are too few rounds or too few tags that were read.
+    ``merged``: True to merge rounds at nearly equal poses. The time of a round is the middle of its reads. Raises
+    InputError if the log has too few rounds, or reads of too few tags.
     """
     stream = log.streams["rfid"]
     assert isinstance(stream, RfidStream)
@@ -87,9 +87,9 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
 
 
 def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) -> Array:
-    """Return the time (count,) [s] from the middle of the reads of each round to the end of the round. A round without
-    reads has the median time. ``age`` (N,), ``inverse`` (N,), ``read`` (N,): age [s], round index, and True for a read,
-    of each row."""
+    """Return the time (R,) [s] from the middle of the reads of each of R = ``count`` rounds to the end of the round. A
+    round without reads gets the median time. ``age`` (N,): age [s] of each row, see :class:`RfidStream`. ``inverse``
+    (N,): the round of each row. ``read`` (N,): True for rows with a read."""
     oldest, youngest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(oldest, inverse[read], age[read])
     np.minimum.at(youngest, inverse[read], age[read])
@@ -101,8 +101,8 @@ def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) 
 
 
 def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integers]:
-    """Assign rows of ``coordinates`` (M, D) to cells of ``sizes`` (D,). Returns the index of the first row in each
-    cell, and the cell number (M,) of each row."""
+    """Assign points to cells of a grid. ``coordinates`` (M, D): the points. ``sizes`` (D,): the size of a cell. Returns
+    the index of the first point in each occupied cell, and the cell number (M,) of each point."""
     keys = np.floor(coordinates / sizes).astype(np.int64)
     keys -= keys.min(axis=0)
     flat = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1))
@@ -113,13 +113,12 @@ def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integ
 def overdispersion(
     hits: Array, count: Array, p: Array, antenna: Integers, tag: Integers, block: Integers
 ) -> tuple[float, float]:
-    """Return the overdispersion of reads, at least 1, and its standard error. An overdispersion of n means that n
-    correlated rounds have as much information as one independent round.
+    """Return the overdispersion of reads, at least 1, and its standard error.
 
-    ``hits``, ``count``, ``p`` (M,): reads, rounds, and predicted probability of a read in one round. ``antenna``, ``tag``,
-    ``block`` (M,): indices of antenna, tag and block of time. The overdispersion is the variance of the number of reads of a
-    tag by an antenna in a block, divided by the variance for independent reads (McCullagh and Nelder, "Generalized linear
-    models", 1989, section 4.5). It hardly depends on whether the trajectory was estimated from the same reads.
+    The overdispersion is the variance of the number of reads of a tag by an antenna in a time block, divided by the
+    variance for independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). So many
+    correlated rounds have as much information as one independent round. ``hits``, ``count`` (M,): numbers of reads and
+    of rounds. ``p`` (M,): predicted probability of a read in one round. ``antenna``, ``tag``, ``block`` (M,): indices.
     """
     first, cell = cells(np.column_stack((block, tag, antenna)), (1.0, 1.0, 1.0))
     excess, variance = np.bincount(cell, hits - count * p), np.bincount(cell, count * p * (1.0 - p))
@@ -131,7 +130,7 @@ def overdispersion(
 
 
 def _merged(rounds: Rounds) -> Rounds:
-    """Merge the rounds of an antenna in each cell of poses into one row at their mean pose."""
+    """Return rounds in which those of the same antenna at nearly equal poses are merged, at their mean pose."""
     first, cell = cells(np.column_stack((rounds.poses, rounds.antenna)), CELL)
     size = np.bincount(cell).astype(float)
     weight = np.minimum(1.0, MOST_ROUNDS / size)

@@ -32,18 +32,18 @@ from factors.se2 import Array
 ENOUGH_READS = 1000  # minimum number of reads with a phase
 SHIFTS = (-0.3, -0.15, 0.0, 0.15, 0.3)  # m; shifts of the survey in the coarse search
 HEADINGS = (-0.05, -0.025, 0.0, 0.025, 0.05)  # rad; rotations of the survey in the coarse search
-THINNING = 6  # the coarse search uses every sixth window
-BLOCKS = 8  # number of blocks of windows; each part of the jackknife omits one
+THINNING = 6  # the coarse search uses one window in six
+BLOCKS = 8  # number of time blocks for the jackknife
 
 
 @dataclass(frozen=True)
 class PhaseFit:
-    """The geometry that phases determine.
+    """The survey transform and the mounting of antennas, estimated from phases.
 
-    ``survey``: the transform of the survey. ``lever_arm`` (2,): a correction of x and y [m] of every antenna.
-    ``sigmas`` (5,): standard deviations of the survey's x, y [m] and heading [rad], and of the lever arm's x, y [m].
-    ``agreement``, ``initial_agreement``: agreement of the phases with the result and with the initial values, as mean
-    resultant length (0 to 1). ``reads``: number of reads used.
+    ``survey``: the survey transform. ``lever_arm`` (2,): a correction of x and y [m] of all antennas. ``sigmas`` (5,):
+    standard deviations of x, y [m] and heading [rad] of the transform, and of x, y [m] of the lever arm.
+    ``initial_agreement``, ``agreement``: the mean resultant length (0 to 1) of the phases before and after the fit.
+    ``reads``: the number of reads used.
     """
 
     survey: SurveySettings
@@ -55,10 +55,10 @@ class PhaseFit:
 
 
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
-    """Estimate survey and lever arm by the agreement of the phases of all ``logs``, which have the same world.
+    """Estimate the survey transform and the lever arm that maximise the agreement of phases. All logs have one world.
 
-    ``survey``: initial value. Standard deviations are estimated by a jackknife over blocks of time, which is robust to correlated
-    reads. Raises InputError if a log has no reference, or if there are too few reads with a phase near their tags.
+    ``survey``: the initial survey transform. Standard deviations are estimated by a jackknife over time blocks. Raises
+    InputError if a log has no reference, or if too few reads with a phase are near their tags.
     """
     start = survey or SurveySettings()
     focus = _Focus.of(logs, rfid, start)
@@ -68,7 +68,7 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
         names = listed(log.name for log in logs)
         expected = f"expected at least {ENOUGH_READS} within {focus.model.max_range:g} m of their tags"
         raise InputError(f"{names}: {coarse.count} reads have a phase, {expected}")
-    # select the reads again, because other reads are near their tags after the coarse search
+    # select the reads near their tags again, with the survey transform of the coarse search
     fine = focus.near(coarse.climb(coarse.coarse(origin)))
     state = fine.climb(coarse.coarse(origin))
     parts = np.array([fine.without(block).climb(state) for block in range(BLOCKS)])
@@ -79,12 +79,15 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
 
 @dataclass(frozen=True)
 class _Focus:
-    """The agreement of phases along references as a function of a state (5,): x, y, heading of the survey transform, and x, y of
-    the lever arm. ``reads``: the reads with a phase. ``model``: the model of phases. ``initial``: the initial survey transform."""
+    """The agreement of phases along references as a function of a state (5,).
+
+    The state is x, y, heading of the survey transform and x, y of the lever arm. ``reads``: the reads with a phase.
+    ``model``: the model of phases. ``tags``: the tags in the survey frame. ``initial``: the initial survey transform.
+    """
 
     reads: PhaseReads
     model: PhaseModel
-    tags: TagArray  # tags as surveyed, without survey transform
+    tags: TagArray
     initial: SurveySettings
 
     @classmethod
@@ -108,28 +111,28 @@ class _Focus:
         return self.initial.model_copy(update=dict(zip(("x", "y", "heading"), state[:3].tolist(), strict=True)))
 
     def near(self, state: Array) -> _Focus:
-        """Return a copy with only the reads that are near their tags at the ``state``, in windows with enough reads."""
+        """Return a copy with only the reads near their tags at ``state`` (5,), in windows with enough such reads."""
         return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
 
     def without(self, block: int) -> _Focus:
-        """Return a copy without the reads of one ``block`` of windows. A jackknife compares such copies."""
+        """Return a copy without the reads of the time block number ``block``, for the jackknife."""
         edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
         inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
         return replace(self, reads=self.reads.chosen(~inside))
 
     def agreement(self, state: Array) -> float:
-        """Return the agreement of the phases at a state, as mean resultant length (0 to 1)."""
+        """Return the agreement of the phases at ``state`` (5,), as mean resultant length (0 to 1)."""
         return 1.0 + float(self._likelihood(state).log_likelihood(self._pose(state)[None], self.reads)[0]) / self.count
 
     def coarse(self, origin: Array) -> Array:
-        """Return the best state on a grid of surveys around ``origin``, from some of the windows."""
+        """Return the best state (5,) on a grid of survey transforms around ``origin`` (5,), from some windows only."""
         some = replace(self, reads=self.reads.chosen(self.reads.windows % THINNING == 0))
         states = [origin + np.array((x, y, h, 0.0, 0.0)) for x, y, h in itertools.product(SHIFTS, SHIFTS, HEADINGS)]
         return max(states, key=some.agreement)
 
     def climb(self, state: Array) -> Array:
-        """Return the local maximum of the agreement, starting from ``state``."""
-        # scale the heading by a lever of about 3 m, so that all five components have similar effects
+        """Return the state (5,) of maximum agreement near ``state`` (5,)."""
+        # a heading of 0.3 rad has about the same effect as a shift of 1 m
         unit = np.array((1.0, 1.0, 0.3, 1.0, 1.0))
         result = scipy.optimize.minimize(
             lambda v: -self.agreement(v * unit), state / unit, options={"eps": 1e-5, "gtol": 1e-4}
@@ -137,7 +140,7 @@ class _Focus:
         return np.asarray(result.x * unit)
 
     def _pose(self, state: Array) -> Array:
-        """Return the pose (3,) of the world in the frame of the survey, at a state."""
+        """Return the pose (3,) of the world frame in the survey frame, at ``state`` (5,)."""
         return se2.inverse(self.survey(state).transform())
 
     def _likelihood(self, state: Array) -> PhaseLikelihood:
@@ -147,15 +150,15 @@ class _Focus:
 
 
 ENOUGH_STRENGTHS = 200  # minimum number of reads with a signal strength
-ITERATIONS = 30  # iterations of the fit of the strength
-DOF = (1.0, 100.0)  # bounds of the degrees of freedom
+ITERATIONS = 30  # number of iterations of the fit to signal strengths
+DOF = (1.0, 100.0)  # bounds of the degrees of freedom of the noise
 
 
 def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiSettings:
-    """Fit the model of signal strength (:mod:`factors.rfid.signals`) to all ``logs`` by maximum likelihood.
+    """Return the maximum likelihood model of signal strength (:mod:`factors.rfid.signals`) for all ``logs``.
 
-    Signals below the reader's sensitivity are missing, so the fitted path loss is flatter than in free space. Raises
-    InputError if a log has no reference, or if too few reads have an RSSI.
+    The fitted path loss is smaller than in free space, because signals below the sensitivity of the reader are missing.
+    Raises InputError if a log has no reference, or if too few reads have an RSSI.
     """
     names = {name: i for i, name in enumerate(rfid.all_antennas())}
     tables, values = list[Array](), list[Array]()
@@ -175,8 +178,8 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
 
 
 def _student(x: Array, y: Array) -> tuple[Array, float, float]:
-    """Fit a linear model of ``y`` (N,) by features ``x`` (N, F) with Student-t noise. Returns coefficients (F,), scale
-    and degrees of freedom. The method is conditional maximisation (Liu, Rubin, Stat. Sinica 5, 1995)."""
+    """Fit a linear model with Student-t noise to ``y`` (N,) and features ``x`` (N, F). Returns the coefficients (F,),
+    and the scale and degrees of freedom of the noise. Source: Liu, Rubin, Statistica Sinica 5, 1995."""
     dof, weights = 5.0, np.ones(len(y))
     for _ in range(ITERATIONS):
         root = np.sqrt(weights)
@@ -185,7 +188,7 @@ def _student(x: Array, y: Array) -> tuple[Array, float, float]:
         sigma = math.sqrt(np.mean(weights * residuals**2))
 
         def cost(v: float, ratios: Array = residuals / sigma) -> float:
-            """Return the mean negative log density of the Student-t distribution with exp(v) degrees of freedom."""
+            """Return the mean negative log density of a Student-t distribution with exp(v) degrees of freedom."""
             dof = math.exp(v)
             scale = gammaln(dof / 2.0) - gammaln((dof + 1.0) / 2.0) + 0.5 * math.log(dof * math.pi)
             return float(scale + 0.5 * (dof + 1.0) * np.mean(np.log1p(ratios**2 / dof)))
