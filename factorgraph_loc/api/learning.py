@@ -39,7 +39,7 @@ def calibrate(
     """
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = load_all(logs, rig, world)
-    # learnt grids are stored here until the rig is written, so that a failed calibration leaves no files
+    # estimated detection models are stored here until the rig is written: a failed calibration leaves no files
     with temporary_folder(of_system("grids")) as folder:
         grids = folder / file.name.removesuffix(RIG)
         result = calibration.calibrate(loaded, run, progress=progress, grids=grids)

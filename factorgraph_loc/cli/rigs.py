@@ -116,7 +116,7 @@ def new(
         return
     for remark in remarks:
         show.line(remark)
-    show.line(f"wrote {file}; use it by --rig {file}, or name it in run.toml of a log")
+    show.line(f"wrote {file}; use it with --rig {file}, or name it as rig in run.toml of a log")
 
 
 def _value(option: str, given: str | None, default: str, expected: str, parse: Callable[[str], T], asks: bool) -> T:

@@ -56,7 +56,7 @@ def view(
 
 
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
-    """Return the names of the log and of the runs, and the runs' folders, for ``--json``."""
+    """Return a dictionary for the option ``--json``: the name of the log, and the names and folders of the runs."""
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 

@@ -99,7 +99,7 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """Return the content of a regular file. Raises InputError as :func:`opened`, or above ``limit`` bytes."""
+    """Return the content of a regular file of at most ``limit`` bytes. For errors see :func:`opened`."""
     with opened(path, limit) as file:
         try:
             content = file.read()
@@ -145,11 +145,10 @@ def limit_memory() -> None:
 
 @contextmanager
 def limited_memory(source: object, size: int) -> Iterator[None]:
-    """End the process with a message on stderr if this block takes too much memory, if :func:`limit_memory` was called.
+    """End the process with a message on stderr if this block takes more memory than a valid file needs.
 
     ``source``: the file that the block reads. ``size``: its size in bytes. The limit is :data:`MEMORY` plus
-    :data:`MEMORY_PER_BYTE` times ``size``. A compressed file of a few kilobytes may unpack to gigabytes. The limits of
-    the operating system are not used, because they make compiled parsers abort without a message.
+    :data:`MEMORY_PER_BYTE` times ``size``. It applies only after a call of :func:`limit_memory`.
     """
     if not _limited.is_set():
         yield

@@ -59,7 +59,7 @@ class InUnit:
 
 
 def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *, after: str) -> None:
-    """Add fields to a model class, for fields that depend on the installed sensors.
+    """Add fields to a model class. Use this for fields that depend on the installed sensors.
 
     ``fields``: type and default of each new field by name. ``after``: name of the field that they follow.
     """

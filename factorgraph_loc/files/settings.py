@@ -176,7 +176,7 @@ def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
 
 
 def _nested(key: str, parts: list[_Part], value: Any) -> Iterator[Setting]:
-    """Yield the settings of the models that the field ``key`` may contain. ``value``: the default of the field."""
+    """Yield the settings of the models among the types ``parts`` of the field ``key``. ``value``: its default."""
     for part in parts:
         if _is_model(part.type):
             yield from settings_in(part.type, f"{key}{part.path}.", value if isinstance(value, part.type) else None)

@@ -220,7 +220,9 @@ def _durations(t_ns: Integers) -> Array:
 
 
 def _largest_before(rates: Array, least: float) -> Array:
-    """Return the running maximum (N,) of ``rates`` (N,) before each rate, without jumps. It is at least ``least``."""
+    """Return the maximum of the previous rates for each of ``rates`` (N,). It is at least ``least`` and ignores jumps.
+
+    A jump is a rate above :data:`FASTER` times the maximum."""
     out, most = np.empty(len(rates)), least
     for i, rate in enumerate(rates.tolist()):
         out[i] = most
@@ -230,7 +232,7 @@ def _largest_before(rates: Array, least: float) -> Array:
 
 
 def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
-    """Return the ``steps`` (N - 1, D). Those with indices ``resets`` are replaced by the motion of the step before.
+    """Return the ``steps`` (N - 1, D). The steps with indices ``resets`` are replaced by the previous motion.
 
     If there are resets, a warning about the file ``source`` is appended to ``warnings``."""
     durations = _durations(t_ns)

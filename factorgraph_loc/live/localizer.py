@@ -311,7 +311,7 @@ def require_options(rig: object, world: object, settings: object, history: objec
 
 
 def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of the sensors among ``asked`` that the rig describes. ``asked`` is by default the sensors of the rig.
+    """Return the sensors among ``asked`` that the rig describes. None stands for all sensors of the rig.
 
     Raises InputError if a sensor is unknown.
     """

@@ -290,7 +290,7 @@ def _camera(out: Uses, topics: Sequence[Topic]) -> None:
 
 
 def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
-    """Return the unused topics with message types that do not come with ROS, and the paths of the fields of each."""
+    """Return the topics that ``out`` does not use and that have message types from outside of ROS, with field paths."""
     custom = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(
@@ -379,7 +379,9 @@ def read_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def _units(fields: Mapping[str, str]) -> dict[str, str]:
-    """Return the units that the names of ``fields`` imply. ``fields``: the path of each field of a read."""
+    """Return the unit of each field of an RFID read, if the name of its message field implies one, such as rssi_cdbm.
+
+    ``fields``: the path in the message by field."""
     out = {}
     for name, ends in UNITS.items():
         plain = _plain(fields.get(name, ""))

@@ -35,9 +35,9 @@ TWISTS = {  # path of the twist in a message, by message type
     "geometry_msgs/msg/TwistStamped": "twist.",
 }
 IMU = "sensor_msgs/msg/Imu"
-# A function that computes the motion after the bag is read. It returns timestamps (N,) [ns], and velocities (N, 2) or
-# increments (N, 3 or 4). It appends warnings to its argument.
 Motion = Callable[[list[Notice]], tuple[Integers, Array]]
+"""A function that computes the motion after the bag is read. It returns timestamps (N,) [ns], and velocities (N, 2) or
+increments (N, 3 or 4). It appends warnings to its argument."""
 
 
 class WheelSettings(motions.WheelSizes):
@@ -281,7 +281,7 @@ def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettin
 
 
 def _wheel(bag: Bag, topic: str, path: str, rules: RowRules) -> TopicRows:
-    """Return a collector of the values of one wheel, the field ``path`` in the messages of a topic."""
+    """Return a collector of the values of one wheel. ``path``: the field of the messages that has the value."""
     source = f"{bag.path} {topic}"
     known = bag.topic(topic)
     check_path(bag.store(topic), known, path, f"{bag.path}: topic {topic}: wheel")

@@ -79,7 +79,7 @@ class Start:
             self._found = (t_ns, np.array([numbers_of_pose(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
-        """Return the start. Its time [s] counts from ``t0_ns`` [ns]. If the robot is tilted, a warning is appended.
+        """Return the start pose. Its time [s] counts from ``t0_ns`` [ns]. If the robot is tilted, a warning is appended.
 
         Raises InputError if a variance of x, y or heading is not positive."""
         assert self._found is not None
@@ -238,7 +238,7 @@ class FrameReference:
         return PosePath(self._source, poses[:, :3, 3], poses[:, :3, :3], t_ns, lost_ns=lost_ns)
 
     def _chain(self) -> list[str]:
-        """Return the frames from the child up to the parent, without the parent. Raises InputError if they are not connected."""
+        """Return the frames from the child (included) to the parent (excluded). Raises InputError without a path."""
         parents = self._static.parents | self._parents
         chain = frame_and_ancestors(parents, self._child)
         if self._parent in chain:

@@ -84,7 +84,7 @@ def _has_names(tables: Sequence[Table]) -> bool:
 
 
 def _type_of(name: str) -> Any:
-    """Return the type of the setting that describes the table ``name``."""
+    """Return the type annotation of the settings for the table ``name``."""
     kind = NamedFile if _has_names(native_tables()[name][1]) else TimedMapping
     return one_or_several(kind) if name in several() else kind | None
 

@@ -153,7 +153,7 @@ def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array
     The third value has the timestamps of null poses, which mean that the device had lost its pose."""
     path = folder.file(options.file)
     if options.columns or options.units:
-        raise InputError(f"{path}: format {options.format} names its own columns and units: remove columns and units")
+        raise InputError(f"{path}: format {options.format} defines columns and units: remove columns and units")
     if options.format == "kitti" and options.times is None:
         raise InputError(f"{path}: format is kitti, but times is missing: set it to the file with the timestamps")
     if options.format != "kitti" and options.times is not None:
