@@ -60,6 +60,6 @@ def sentence(known: Sequence[FrameKnown]) -> str:
     least = np.sqrt(np.mean([one.least**2 for one in known]))
     return (
         f"The start poses have a mean NEES of {np.mean([one.nees for one in known]):.2f} (95 % interval for random errors: "
-        f"{low:.2f} to {high:.2f}). With tags the error is at least {least:.4f} m, even if the shape of the path is "
+        f"{low:.2f} to {high:.2f}). With tags the final error is at least {least:.4f} m, even if the shape of the path is "
         "exactly known (Cramér-Rao bound)."
     )

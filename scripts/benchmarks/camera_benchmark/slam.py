@@ -52,7 +52,7 @@ def section(options: Options) -> Report:
         found = {seed: outcome for (_, seed), outcome in report.collect(mapped, jobs).items()}
         failures(report, found)
         what = (
-            f"Each office has {POINTS} points, identified by name. An image shows at most 20."
+            f"Each office has {POINTS} points, identified by name. An image shows at most 20 points."
             if folder is None
             else "The images are rendered."
         )
