@@ -224,7 +224,7 @@ class Finder(Protocol):
         """The pose at the last informative measurement if it is unambiguous, otherwise None."""
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process ``m``, measured at the odometry state ``odometry``. Returns False if it gives no information."""
+        """Process ``m``, measured at the odometry state ``odometry``. Returns False if ``m`` gives no information."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return ``count`` random poses (N, 3) at the last informative measurement, drawn from ``hypotheses``."""
@@ -277,7 +277,7 @@ class Sensor:
         return True
 
     def evidence(self, m: Any) -> Observation | None:
-        """Return a measurement as an observation for global localization, or None if it gives no information."""
+        """Return the observation of ``m`` for global localization, or None if ``m`` gives no information."""
         return None
 
     @property

@@ -55,7 +55,7 @@ class SensorKnowledge:
     ``figures``: values for the report by name, as JSON types.
     ``residuals``: the residuals of each log.
     ``details``: data of a subclass of :class:`Calibrator` for its plots.
-    ``correlations``: the names of two strongly correlated constants, and their correlation coefficient.
+    ``correlations``: a tuple for each pair of strongly correlated constants: both names and the correlation.
     """
 
     sections: Mapping[str, Any] = field(default_factory=dict)

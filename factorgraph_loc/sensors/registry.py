@@ -119,7 +119,7 @@ def sections_of(sensor: SensorType) -> dict[str, list[Setting]]:
 
 
 def about(name: str) -> str:
-    """Return the first sentence of the docstring of a sensor's package."""
+    """Return the first sentence of the docstring of the package of the sensor ``name``."""
     return first_sentence(load(SENSORS.place(name).partition(":")[0]))
 
 

@@ -105,7 +105,7 @@ class KnownPoints:
         return TIME_OFFSET in self._estimated.indices
 
     def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
-        """Return the points in ``m`` with an inexact survey, grouped by marker, by the name of the point or marker. A
+        """Return the points in ``m`` with an inexact survey. Keys are the names of markers and of single points. A
         value contains the names of the points, and the covariance (3, 3) of the survey error that they share."""
         inexact: dict[str, tuple[list[str], Array]] = {}
         if not isinstance(m, PixelSightings) or not self._inexact.any():

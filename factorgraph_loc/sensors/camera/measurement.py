@@ -88,7 +88,7 @@ class SightingStream(Stream):
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
-    """The N images of a log. ``file``: the paths of the images. Feature detection is not done yet."""
+    """The N images of a log. ``file``: the paths of the images. Runs use a :class:`FeatureStream` instead."""
 
     kind: ClassVar[type[Any]] = CameraImage
     file: Sequence[Path]

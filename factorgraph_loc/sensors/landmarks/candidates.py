@@ -77,7 +77,7 @@ class Candidate:
     due: float = FEWEST
 
     def plus(self, sighting: PartialSighting, source: object) -> Candidate:
-        """Return a copy with a further sighting and any object ``source`` that belongs to the sighting. The previous
+        """Return a copy with a further sighting. ``source``: an object that is stored with the sighting. The previous
         sighting is discarded if the robot had moved less than APART before it."""
         end = len(self.sightings)
         if end > 1:

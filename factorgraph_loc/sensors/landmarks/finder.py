@@ -40,7 +40,7 @@ DURATION = 60.0  # s; older sightings are not used
 INTERVAL = 1.0  # s; minimum time between the sightings of one landmark, because errors at nearly equal times are equal
 ROWS = 60  # maximum number of sightings in a search
 REFINED = 24  # maximum number of candidates that are refined
-# squared Mahalanobis distances: closer hypotheses are merged; an unambiguous one must not move further when refined
+# squared Mahalanobis distances: hypotheses closer than SAME are merged; a refinement by more than DIVERGED is rejected
 SAME, DIVERGED = 9.0, 25.0
 NEGLIGIBLE = 1e-3  # hypotheses with a smaller weight are discarded
 MARGIN = 5.0  # m; maximum distance of the robot from the bounding box of the landmarks
@@ -316,7 +316,7 @@ def _distance(pose: Array, mean: Array, covariance: Array) -> float:
 class TrackMonitor:
     """Detects that most of the last sightings contradict the estimated pose. The pose or the map may be the reason.
 
-    ``suspicious_since``: the time [s] since which they contradict it, or None.
+    ``suspicious_since``: the time [s] since which the sightings contradict the pose, or None.
     """
 
     def __init__(self) -> None:

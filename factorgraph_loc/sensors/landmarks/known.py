@@ -70,7 +70,7 @@ class KnownLandmarks:
         twist: Array | None = None,
         late: LateRanges = NONE,
     ) -> tuple[BearingRangeFactor | None, list[NamedFactor], list[NamedFactor], list[NamedFactor]]:
-        """Return the factors of the measurement ``m``, in four groups. A factor of one landmark comes after its name.
+        """Return the factors of the measurement ``m``, in four groups. Groups 2 to 4 contain pairs (name, factor).
 
         1. One factor of all mapped landmarks that are not estimated, or None without such landmarks.
         2. One factor for each mapped landmark with a range bias. It also depends on the bias.

@@ -32,7 +32,7 @@ NOT_LOCATED = "landmark not located yet"
 
 
 def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
-    """Return one factor with the landmarks of all ``factors``. All must depend on the same pose."""
+    """Return one factor with the landmarks of all ``factors``. All factors must depend on the same pose."""
     first, *rest = factors
     if not rest:
         return first
@@ -153,7 +153,7 @@ class LandmarkObservation(ResidualObservation):
         return type(self)(self.t, (Term(factor, (), 2 * len(factor.points)),), self.surveyed)
 
 
-Sighted = tuple[float, LandmarkObservation]  # the time [s] of the pose that the observation depends on
+Sighted = tuple[float, LandmarkObservation]  # the observation, after the time [s] of the pose that it depends on
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ class LandmarkSensor(Sensor):
             yield NewVariable(block, np.zeros(1), np.zeros((1, 3)), {}, np.array([[self._bias**2]]), ())
 
     def _term(self, name: str, factor: BearingRangeFactor, view: View) -> Term:
-        """Return the term of the landmark ``name``. It has a range bias only if the state contains the bias."""
+        """Return the term of the landmark ``name``. The term depends on a range bias if the state contains the bias."""
         block = f"{self.modality}/{name}"
         if factor.biased and view.value(f"{block}/bias") is None:
             factor = replace(factor, biased=False)

@@ -266,7 +266,7 @@ def _shifted(log: Log) -> list[Notice]:
 
 def _cost(errors: Array) -> float:
     """Return the median absolute range error plus the median absolute bearing error. Columns with too few errors are
-    ignored. Returns infinity if both are. ``errors`` (N, 2): range and bearing errors, NaN if unknown."""
+    ignored. Returns infinity if both columns are ignored. ``errors`` (N, 2): the errors, NaN if unknown."""
     usable = [kept for column in errors.T if len(kept := column[np.isfinite(column)]) >= FEWEST // 2]
     return sum(float(np.median(np.abs(kept))) for kept in usable) if usable else np.inf
 
@@ -286,7 +286,7 @@ def check(use: Use) -> Use:
     name = use.estimator
     raise InputError(
         f"{log.name}: {name}.landmarks is {wanted}, but no sighting has a {lacks}, and {name} needs range and bearing to locate a "
-        f"landmark: take the smoother, or give a map (--world) with {name}.landmarks=known"
+        f"landmark: use the smoother, or give a map (--world) with {name}.landmarks=known"
     )
 
 

@@ -79,8 +79,8 @@ class Windows:
         return chain.states(self.begin), chain.states(self.end)
 
     def errors(self, model: OdometryModel) -> Array:
-        """Return the errors (M, 3) of the odometry in each window [m, m, rad]. The error is the body-frame perturbation
-        of the final pose by odometry that gives the final pose of the reference."""
+        """Return the errors (M, 3) of the odometry in each window [m, m, rad]. An error is the body-frame perturbation
+        that moves the final pose by odometry to the final pose of the reference."""
         start, end = self.states(model)
         odometry = se2.between(start[:, 1:4], end[:, 1:4])
         return se2.log(se2.between(odometry, self.motion))
@@ -161,8 +161,8 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
 
 
 def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
-    """Return the ratio of observed to predicted errors in windows of :data:`BLACKOUT` seconds. A ratio below 1 is
-    replaced by 1, and so is the ratio of too few windows."""
+    """Return the ratio of observed to predicted errors in windows of :data:`BLACKOUT` seconds. Returns 1 if the ratio
+    is below 1, or if there are too few windows."""
     windows = [cut(log, BLACKOUT) for log in logs]
     residuals = np.concatenate([part.errors(model) for part in windows])
     if len(residuals) < MIN_BLACKOUTS:

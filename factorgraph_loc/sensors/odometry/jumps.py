@@ -64,8 +64,8 @@ def jumps(stream: Motion) -> list[Jump]:
 
 
 def _outliers(rates: Array, least: float) -> Integers:
-    """Return the indices of those ``rates`` (N,) that exceed the median of the previous rates FACTOR times, and differ
-    from it by more than ``least``."""
+    """Return the indices of those ``rates`` (N,) that are more than FACTOR times the median of the previous rates, and
+    that differ from the median by more than ``least``."""
     usual = _usual(rates, 0.0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 

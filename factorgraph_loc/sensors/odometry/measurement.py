@@ -57,7 +57,7 @@ class IncrementOdometry:
     """Motion of the robot since the previous measurement.
 
     ``dx``, ``dy`` [m], ``dtheta`` [rad]: the motion in the robot frame of the previous measurement. ``unknown`` [s]:
-    for how much of the time since then the motion was not measured.
+    the part of the time since the previous measurement in which the motion was not measured.
     """
 
     sensor: ClassVar[str] = "odometry"

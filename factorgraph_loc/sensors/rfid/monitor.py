@@ -112,8 +112,8 @@ class BurstMonitor:
     """Estimates how strongly successive reads of a tag are correlated, for example because a person is in the way.
 
     The measure is the overdispersion: the variance of the number of reads in a time block, divided by the variance for
-    independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). So many correlated rounds
-    have as much information as one independent round. ``antennas``, ``tags``: numbers of antennas and tags.
+    independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). If it is n, n correlated
+    rounds have as much information as one independent round. ``antennas``, ``tags``: numbers of antennas and tags.
     """
 
     def __init__(self, antennas: int, tags: int) -> None:
@@ -214,8 +214,8 @@ class ReadGroups:
         _add(self.sums, antennas, rounds, reads.hits, reads.p, reads.distance, counts)
 
     def large(self, fewest: float = FEWEST) -> Integers:
-        """Return the indices of the groups with at least ``fewest`` predicted reads. The group of the only antenna of a
-        robot is omitted."""
+        """Return the indices of the groups with at least ``fewest`` predicted reads. If there is only one antenna, its
+        group is omitted."""
         count = len(self.sums[1]) if len(self.antennas) > 1 else BANDS
         return np.flatnonzero(self.sums[1, :count] >= fewest)
 

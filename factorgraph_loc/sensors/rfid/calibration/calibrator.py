@@ -66,7 +66,7 @@ class RfidCalibrator(Calibrator):
         return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
     def is_complete(self, rig: Rig) -> bool:
-        """Return False if the rig lacks a detection model other than the default, which is too inaccurate."""
+        """True unless ``rig`` uses the reader but lacks its section or has only the default detection model."""
         return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
 
     def pictures(self, knowledge: SensorKnowledge) -> Sequence[Part]:

@@ -25,8 +25,8 @@ from factors.se2 import Array
 
 CELL = 0.5  # m; distance between knots
 EXTENT = 6.0  # m; half the side of a grid
-FACINGS = 5  # number of knots for the facing, if the model uses it
-HEIGHT_STEP = 0.5  # m; distance between knots in height
+FACINGS = 5  # number of grid points along the axis for the facing
+HEIGHT_STEP = 0.5  # m; distance between grid points in height
 PULL = 0.3  # weight of squared differences between the grid and the parametric model
 GRADIENT = 0.01  # nats per logit; the fit ends when the gradient is smaller
 FINE = (0.2, 0.2, 0.25, 0.2)  # m, m, m, cosine; size of cells in which pairs are merged

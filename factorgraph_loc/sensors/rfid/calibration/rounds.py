@@ -116,7 +116,7 @@ def overdispersion(
     """Return the overdispersion of reads, at least 1, and its standard error.
 
     The overdispersion is the variance of the number of reads of a tag by an antenna in a time block, divided by the
-    variance for independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). So many
+    variance for independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). If it is n, n
     correlated rounds have as much information as one independent round. ``hits``, ``count`` (M,): numbers of reads and
     of rounds. ``p`` (M,): predicted probability of a read in one round. ``antenna``, ``tag``, ``block`` (M,): indices.
     """

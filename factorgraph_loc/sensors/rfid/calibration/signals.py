@@ -55,10 +55,10 @@ class PhaseFit:
 
 
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
-    """Estimate the survey transform and the lever arm that maximise the agreement of phases. All logs have one world.
+    """Return the survey transform and the lever arm with which the phases in ``logs`` agree best.
 
-    ``survey``: the initial survey transform. Standard deviations are estimated by a jackknife over time blocks. Raises
-    InputError if a log has no reference, or if too few reads with a phase are near their tags.
+    All logs must have the same world. ``survey``: the initial survey transform. Standard deviations are estimated by a
+    jackknife over time blocks. Raises InputError if a log has no reference, or if too few phases are near their tags.
     """
     start = survey or SurveySettings()
     focus = _Focus.of(logs, rfid, start)
