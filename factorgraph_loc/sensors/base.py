@@ -1,10 +1,10 @@
 """The interface between sensors and estimators.
 
-A sensor turns a measurement into observations. It sees the current estimate through a view. The estimator applies each
+A sensor converts a measurement to observations. It reads the current estimate from a view. The estimator applies each
 observation before it requests the next one. An observation depends on the pose at one time and on named blocks. A block
 is a part of the state other than the pose, such as constants of a sensor or the position of a landmark. An observation
-is used as a factor of a graph, as a correction of a Gaussian, or as a likelihood over poses. Sensors do not depend on
-estimators, nor estimators on sensors."""
+is used as a factor of a graph, as a correction of a Gaussian, or as a likelihood over poses. Sensors and estimators do
+not depend on each other."""
 
 from __future__ import annotations
 

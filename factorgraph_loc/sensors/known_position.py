@@ -1,7 +1,7 @@
-"""A start with known position and unknown heading, used by the search for the pose.
+"""A start with known position and unknown heading, as a prior for global localization.
 
-The prior is Gaussian in the position and uniform in the heading. The odometry propagates it to the current time. It is
-a constraint on the current pose, and generates candidates of that pose.
+The prior is Gaussian in the position and uniform in the heading. The odometry propagates the prior to the current time.
+The propagated prior is a constraint on the current pose, and gives candidates for this pose.
 """
 
 import math

@@ -1,9 +1,9 @@
-"""The camera sensor of a run, and localization from images alone.
+"""The camera sensor of a run, and global localization from images alone.
 
-The sensor observes points of the map, which are identified by name or by appearance. At an unknown start, or after a
-kidnapping, one image with enough inliers determines the pose. Otherwise the poses from several images must agree, after
-the odometry moved them to the same time. An image must also agree with the start position if that is known. A track is
-suspicious if several consecutive images do not show the points of the map at their predicted positions.
+The sensor observes points of the map, which are identified by name or by appearance. For global localization, one image
+with many inliers is sufficient. Otherwise the poses from several images must agree with the odometry between them. If
+the start position is known, the pose must also agree with it. An estimated pose is suspicious if several successive
+images do not show points of the map at their predicted positions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Turns measurements of landmarks into factors. The map and the rig determine the kind of factor of each landmark."""
+"""Converts measurements of landmarks to factors. The map and the rig determine the kind of factor of each landmark."""
 
 from __future__ import annotations
 

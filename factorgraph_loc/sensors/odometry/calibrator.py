@@ -1,9 +1,9 @@
 """Calibration of wheel odometry: constants and noise are estimated from the motion of a reference in time windows.
 
 The noise grows with distance, rotation and time (:class:`factors.odometry.model.Growth`). The covariance of a relative
-motion is linear in the variances per unit of distance, rotation and time. They are estimated as non-negative variance
+motion is linear in the variances per metre, radian and second. These variances are estimated as non-negative variance
 components (Searle, Casella, McCulloch, "Variance Components", 1992, chapter 6). Windows of several lengths separate
-errors of the odometry, which grow with time, from errors of the reference, which do not.
+errors of the odometry, which grow with time, from errors of the reference, which do not grow.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Finds and removes jumps of odometry: single rows with a speed or turn rate that no robot can reach after the rows
-before.
+"""Finds and removes jumps of odometry: single rows with an impossible change of the speed or turn rate.
 
-The usual cause is an angle that wraps inside the robot's software. Later rows have no influence, so that an estimate at
-a time depends on earlier rows only.
+The usual cause is an angle that wraps inside the robot's software. A row is only compared with earlier rows, because
+causal estimates must not depend on later rows.
 """
 
 from typing import NamedTuple, TypeVar

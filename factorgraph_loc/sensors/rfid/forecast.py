@@ -1,10 +1,9 @@
 """Predicts the information of RFID antennas along candidate paths, for planning.
 
-Reads are simulated, and their likelihood is evaluated for particles. With the probability q of a read, the
-log-likelihood is the sum of log(1 - q) over all tags in range plus the sum of logit(q) over the reads. The first sum
-comes from a table of the robot: for each position of a tag in the robot frame it has the sum over all antennas. The
-second sum needs each antenna, but reads are few. Both sums are relative to a tag out of range, which contributes
-nothing. Walls, and false reads of tags out of range, are not simulated.
+Reads are simulated, and their likelihood is evaluated for particles. Let q be the probability that an antenna reads a
+tag. The log-likelihood is the sum of log(1 - q) over all tags and antennas, plus the sum of logit(q) over all reads.
+The first sum is read from a table, which contains the sum over all antennas for each position of a tag in the robot
+frame. The second sum has few terms. Tags out of range, and walls, are ignored.
 """
 
 import math

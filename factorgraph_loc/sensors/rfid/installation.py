@@ -1,8 +1,8 @@
 """The antennas and tags of a run: antennas on the robot and tags in the map, or the reverse.
 
-The antennas of a reader may be fixed in the building, for example at gates. The map then has the antennas, and the rig
-has the tags on the robot. :func:`installed` puts these antennas into the rig and these tags into the world, where all
-modules of this package expect them. Antennas have their poses in the world then, and tags in the robot frame.
+The antennas of a reader may be fixed in the building, for example at gates. The map file then lists the antennas, and
+the rig lists the tags on the robot. :func:`installed` moves these antennas to the rig and these tags to the map, where
+all modules of this package expect them. Poses of such antennas are in the world frame, tags are in the robot frame.
 """
 
 from collections.abc import Mapping

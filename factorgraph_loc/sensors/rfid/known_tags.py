@@ -1,4 +1,4 @@
-"""Turns RFID scans into likelihoods: reads and misses of the map's tags, signal strengths, and phases."""
+"""Converts RFID scans to likelihoods: reads and misses of the map's tags, signal strengths, and phases."""
 
 import math
 from collections import deque

@@ -1,4 +1,4 @@
-"""Scans of an RFID reader: their types, the columns of their files, and the validation of pushed scans."""
+"""Scans of an RFID reader: their types, the columns of their files, and checks of live scans."""
 
 from __future__ import annotations
 

@@ -375,7 +375,7 @@ def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -
     if ratio * tempering > TOGETHER:
         sentence = (
             "{log}: reads are correlated, {rounds:.0f} rounds have the information of one: set rfid.tempering = "
-            "{tempering:.2g} in the rig, which has {present:g}"
+            "{tempering:.2g} in the rig (now {present:g})"
         )
         doubts.append(notice("bursts", sentence, log, ratio, 1.0 / ratio, tempering))
     return Review(tuple(doubts), Reliability("reads", groups.names(chosen), observed, predicted, sigma, ratio))

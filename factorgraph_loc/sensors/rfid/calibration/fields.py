@@ -1,9 +1,8 @@
 """Fits detection grids, and selects the kind of detection model that predicts held-out reads best.
 
-A detection grid has logits of the probability of a read in an antenna's frame. It is fitted as a difference to a
-parametric model. The difference is smooth by a penalty on second differences (Eilers and Marx, "Flexible smoothing with
-B-splines and penalties", Statistical Science 11(2), 1996), and zero without data. Logits are interpolated as in
-:mod:`factors.rfid.model`.
+A detection grid consists of logits of the read probability on a grid in the antenna frame. The difference of the grid
+to a parametric model is fitted. A penalty on second differences makes it smooth (Eilers and Marx, "Flexible smoothing
+with B-splines and penalties", Statistical Science 11(2), 1996). Far from all data the difference is zero.
 """
 
 import math

@@ -1,9 +1,9 @@
 """Estimates RFID settings: survey transform, mounting, detection models, tempering, and models of strength and phase.
 
-Along references all of these are estimated. Along smoothed trajectories only detection models and tempering are
-estimated. There the likelihood of the reads is averaged over possible poses
-(:func:`~factorgraph_loc.sensors.smoothed.possible_poses`), and models keep their kind. Beams and logistic models are
-fitted in all parameters, grids only in range and rate. The smoother itself estimates yaw and clock.
+All of these are estimated from logs with references. From smoothed logs, only tempering and detection models of the
+same kind as before are estimated, with poses drawn from the smoothed trajectory
+(:func:`~factorgraph_loc.sensors.smoothed.possible_poses`). Of grids, only range and read rate are fitted then. The
+smoother itself estimates the yaws of antennas and the time offset.
 """
 
 import hashlib
