@@ -64,9 +64,7 @@ def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
     Raises InputError if an image cannot be read, if there is no display, or if the viewer does not start.
     """
     if sys.platform == "linux" and not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
-        raise InputError(
-            "there is no display to open the viewer on: use --rrd FILE to write a file for another machine"
-        )
+        raise InputError("there is no display for the viewer: use --rrd FILE to write a file for another machine")
     recording = rr.RecordingStream("fgloc")
     with open_viewer(bind) as url:
         recording.connect_grpc(url, default_blueprint=_blueprint(log, runs))

@@ -193,9 +193,7 @@ class Cells:
         unit = self.units.get(name)
         if unit not in {*SECONDS, ISO}:
             expected = f"one of {', '.join(SECONDS)} or {ISO}"
-            raise InputError(
-                f"{self.path}: the unit of {name} is {quoted(unit)}, expected {expected}: set units.{name}"
-            )
+            raise InputError(f"{self.path}: units.{name} is {quoted(unit)}, expected {expected}")
         power, shift = SECONDS.get(str(unit), 0), round(offset * 1e9)
         expected = f"a number of {unit} in {-LATEST / 10**power:g} to {LATEST / 10**power:g}"
         if unit == ISO:

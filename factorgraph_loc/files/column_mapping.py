@@ -92,9 +92,7 @@ def read_mapped(
     given = set(mapping.columns)
     known = set(optional).union(*shapes)
     if unknown := sorted(given - known):
-        raise InputError(
-            f"{path}: columns has an unknown field {quoted(unknown[0])}{nearest(unknown[0], sorted(known))}"
-        )
+        raise InputError(f"{path}: unknown field {quoted(unknown[0])} in columns{nearest(unknown[0], sorted(known))}")
     if not any(set(shape) <= given <= set(shape).union(optional) for shape in shapes):
         expected = " or ".join(", ".join(shape) for shape in shapes)
         raise InputError(f"{path}: columns has {listed(sorted(given)) or 'nothing'}, expected the fields {expected}")
@@ -189,9 +187,7 @@ class TableFolder:
                 read.update(rows)
             if unchosen > 0:
                 names = listed(dict.fromkeys(name for _, mapping in tables for name in mapping.where))
-                sentence = (
-                    "{source}: {unchosen} of {rows} rows are not read: their {columns} is none of the values in where"
-                )
+                sentence = "{source}: {unchosen} of {rows} rows are not read: where excludes their values of {columns}"
                 rows_of_file = count + tables[0][0].passed
                 warnings.append(notice("unchosen_rows", sentence, path.name, unchosen, rows_of_file, names))
             never = [set(cells.left_out) for cells, _ in tables]

@@ -141,9 +141,7 @@ def check_content(content: dict[str, Any], source: object) -> None:
         if isinstance(value, int) and abs(value) >= 2**63:
             raise InputError(f"{plain(source)}: {plain(key)} is a whole number of more than 64 bits")
         if isinstance(value, date | time):
-            raise InputError(
-                f"{plain(source)}: {plain(key)} is a date or time, expected a number, or text between quotes"
-            )
+            raise InputError(f"{plain(source)}: {plain(key)} is a date or time, expected a number or quoted text")
         if not isinstance(value, str | int | float):
             raise InputError(f"{plain(source)}: {plain(key)} is {quoted(value)}, expected a number or text")
         if isinstance(value, str) and value != well_formed(value):

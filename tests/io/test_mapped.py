@@ -147,7 +147,7 @@ def test_stamps_keep_their_nanoseconds():
 @pytest.mark.parametrize(
     ("old", "new", "fragments"),
     [
-        ('t = "ms", v', "v", ("wheels.csv", "unit of t is None", "iso")),
+        ('t = "ms", v', "v", ("wheels.csv", "units.t is None", "iso")),
         ('w = "deg/s" }', 'w = "degrees" }', ("wheels.csv", "unit of w is 'degrees'", "rad/s, deg/s")),
         ('file = "truth.csv"', 'file = "../../truth.csv"', ("leaves its folder",)),
         (

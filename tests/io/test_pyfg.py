@@ -40,7 +40,7 @@ def test_different_variances_and_ranges_of_zero_are_warnings(write, one):
     text = PYFG.replace("3.1 0.09", "0.0 0.36")
     log = one(write(text))
     assert len(log.streams["bearing_range"].t) == 1
-    assert "variance differs between rows, from 0.09 to 0.36: the rig has the median 0.225" in " ".join(
+    assert "variance differs between rows, 0.09 to 0.36: the rig has the median 0.225" in " ".join(
         map(str, log.warnings)
     )
     assert "range is 0: 1 ranges that are not above 0 are skipped" in " ".join(map(str, log.warnings))

@@ -69,7 +69,7 @@ def test_headers_without_stamps(tmp_path, bag_maker, read, refuse):
     with bag_maker(tmp_path / "drive") as made:
         for i in range(3):
             made.odometry("/odom", 0, (0.1 * i, 0.0, 0.0), delay=T0 + i * MS)
-    refuse(tmp_path / "drive", "/odom", "all headers are 0", 'clock = "receive"', rfid=None, reference=None)
+    refuse(tmp_path / "drive", "/odom", "all header timestamps are 0", 'clock = "receive"', rfid=None, reference=None)
     assert read(tmp_path / "drive", rfid=None, reference=None, clock="receive").t0_ns == T0
 
 

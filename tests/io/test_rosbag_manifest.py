@@ -56,7 +56,7 @@ def test_odometry_without_poses_is_read_by_its_velocities(proposal, tmp_path):
 
     found, manifest, text = proposal(fill)
     assert found.options["odometry"] == {"topic": "/odom", "use": "twist"}
-    assert "# the quaternions in /odom are zero: its velocities are used instead of its poses\n" in text
+    assert "# the quaternions in /odom are zero: its velocities are used, not its poses\n" in text
     del manifest["options"]["reference"]
     (tmp_path / "drive.toml").write_text(tomli_w.dumps(manifest))
     log = fgloc.read_log(tmp_path / "drive.toml")

@@ -184,9 +184,7 @@ def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
     settings: dict[str, Any] = frames if ranked[0].type in TF else {}
     if ranked[0].type == ODOMETRY and _has_no_pose(bag, ranked[0]):
         settings = {"use": "twist"}
-        out.remarks.append(
-            f"the quaternions in {ranked[0].name} are zero: its velocities are used instead of its poses"
-        )
+        out.remarks.append(f"the quaternions in {ranked[0].name} are zero: its velocities are used, not its poses")
     elif ranked[0].type == JOINTS:
         settings = _joints(bag, ranked[0], out.remarks)
     out.take("odometry", ranked, **settings)

@@ -224,9 +224,7 @@ class FrameReference:
         t_ns = max(moving, key=len).stamps()
         t_ns = t_ns[(t_ns >= max(m.stamps()[0] for m in moving)) & (t_ns <= min(m.stamps()[-1] for m in moving))]
         if not len(t_ns):
-            raise InputError(
-                f"{self._source}: the transforms from {self._child} to {self._parent} have no time in common"
-            )
+            raise InputError(f"{self._source}: the transforms from {self._child} to {self._parent} have no common time")
         poses = np.broadcast_to(np.eye(4), (len(t_ns), 4, 4))
         for edge in edges:
             if isinstance(edge, PosePath):

@@ -80,9 +80,7 @@ class Fields:
         lengths = [len(value) for value, is_list in zip(values, self._are_lists, strict=True) if is_list]
         if len(set(lengths)) > 1:
             counts = ", ".join(map(str, lengths))
-            raise InputError(
-                f"{self._where}: message {row} has lists of {counts} elements, expected lists of one length"
-            )
+            raise InputError(f"{self._where}: message {row} has lists of {counts} elements, expected equal lengths")
         columns = (v if is_list else repeat(v) for v, is_list in zip(values, self._are_lists, strict=True))
         return list(zip(*columns, strict=False))  # zip ends with the lists, because repeat() is endless
 
@@ -331,9 +329,7 @@ class Stamper:
     def check(self) -> None:
         """Raise InputError if the timestamps of headers are used but all of them are 0."""
         if self.uses_header and len(self._delays) > 1 and not self._any_set:
-            raise InputError(
-                f'{self._where}: the timestamps of all headers are 0: set clock = "receive" in the manifest'
-            )
+            raise InputError(f'{self._where}: all header timestamps are 0: set clock = "receive" in the manifest')
 
     def delay(self) -> float | None:
         """Return the median delay [s] from the header's timestamp to receipt. Returns None if no header has a timestamp."""

@@ -192,9 +192,7 @@ def require_new(folder: Path, *, overwrite: bool = False) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not overwrite or not (folder / RUN_FILE).is_file():
-        raise InputError(
-            f"{folder}: exists and is not an empty folder, expected a new one{_OR_LOG if overwrite else ''}"
-        )
+        raise InputError(f"{folder}: is not an empty folder, expected a new one{_OR_LOG if overwrite else ''}")
     if foreign := sorted(f.name for f in folder.iterdir() if f.suffix not in OF_LOGS and f.name != "camera"):
         raise InputError(
             f"{folder}: contains {listed(foreign)}, which overwriting would delete: expected only the files of a log"

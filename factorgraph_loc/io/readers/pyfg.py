@@ -203,7 +203,5 @@ def _positive(rows: TableRows, column: str) -> Array:
 def _warn_of_different(path: Path, column: str, variances: Array, warnings: list[Notice]) -> None:
     if variances.max() > DIFFERENT * variances.min():
         median = float(np.median(variances))
-        sentence = (
-            "{file}: {column} differs between rows, from {least:g} to {most:g}: the rig has the median {median:g}"
-        )
+        sentence = "{file}: {column} differs between rows, {least:g} to {most:g}: the rig has the median {median:g}"
         warnings.append(notice("different_variances", sentence, path, column, variances.min(), variances.max(), median))
