@@ -57,9 +57,8 @@ def export(
 ) -> list[Path]:
     """Write results for other programs. Returns the written files.
 
-    ``results``: folders of runs or a log, see :func:`view`. ``out``: a file. Its suffix selects the content: .mcap for
-    runs in Foxglove and RViz; .tum or .kitti for the final trajectory of a run, or the reference of a log; .ply for the
-    points of a map.
+    ``results``: folders of runs, or a log. ``out``: a file. Its suffix selects the content: .mcap for runs in Foxglove
+    and RViz; .tum or .kitti for the final trajectory of a run, or the reference of a log; .ply for points of a map.
     """
     require_format(Path(out))
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))

@@ -23,9 +23,9 @@ def _one_of(names: Callable[[], Iterable[str]]) -> Completion:
 
 
 def _some_of(names: Callable[[], Iterable[str]]) -> Completion:
-    """Return a function that completes the last name in a comma-separated list. ``names``: as in :func:`_one_of`.
+    """Return a function that completes the last name in a comma-separated list, except names already in the list.
 
-    Names that are already in the list are not proposed."""
+    ``names`` is called to get all valid names."""
 
     def complete(incomplete: str) -> list[str]:
         first, comma, last = incomplete.rpartition(",")

@@ -85,7 +85,7 @@ def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[It
 
 
 def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
-    """Return the shapes of the walls, landmarks, tags and points in the map, as :meth:`_Maker.shape` returns them."""
+    """Return the walls, landmarks, tags and points of the map as fields of ``visualization_msgs/Marker`` messages."""
     ends = [(x, y, 0.0) for x, y in np.array(log.world.walls).reshape(-1, 2).tolist()]
     shapes = [make.shape("walls", LINES, LINE, DARK, ends)] if ends else []
     for marks, positions, _ in scene.layers(log):

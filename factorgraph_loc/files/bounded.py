@@ -99,7 +99,7 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """Return the content of a regular file of at most ``limit`` bytes. For errors see :func:`opened`."""
+    """Return the content of a regular file. Raises InputError if it is missing, or larger than ``limit`` bytes."""
     with opened(path, limit) as file:
         try:
             content = file.read()

@@ -56,7 +56,7 @@ def increments_in_order(
 
     ``moves`` (N, 3 or 4): the motion (x, y, heading) [m, m, rad] since the previous row, in the body frame of that row.
     The optional fourth column is the part [s] of this time without odometry. Returns the distinct timestamps (M,) and
-    their motions (M, 3 or 4). For errors and the other arguments see :func:`in_order`.
+    their motions (M, 3 or 4). ``rows`` (N,): row numbers in ``source``. Raises InputError if the timestamps decrease.
     """
     _require_order(source, rows, t_ns, rules)
     last, out = composed(t_ns, moves[:, :3])
@@ -71,7 +71,7 @@ def increments_in_order(
 
 
 def _require_order(source: object, rows: Integers, t_ns: Integers, rules: RowRules | None) -> None:
-    """Raise InputError at the first timestamp that precedes the previous one. For arguments see :func:`in_order`."""
+    """Raise InputError if timestamps ``t_ns`` (N,) decrease. ``rows`` (N,): row numbers in the file ``source``."""
     back = np.flatnonzero(np.diff(t_ns) < 0) + 1
     if len(back):
         i = int(back[0])
@@ -96,7 +96,7 @@ def arrivals(
     """Check that no timestamp ``t_ns`` (N,) is more than ``max_late_ns`` older than a previous one in the file.
 
     Rows with smaller delays add a warning to ``warnings``. Raises InputError for a larger delay. If ``max_late_ns`` is
-    None, any delay is valid. For the other arguments see :func:`in_order`.
+    None, any delay is valid. ``rows`` (N,): row numbers in the file ``source``.
     """
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
@@ -122,10 +122,10 @@ def last_in_order(
     names: Sequence[str] | None = None,
     rules: RowRules | None = None,
 ) -> Integers:
-    """Check timestamps ``t_ns`` (N,) by :func:`arrivals`. Return the indices (M,) of the rows to keep, in file order.
+    """Return the indices (M,) of the rows to keep, in file order: of rows with equal timestamps, only the last.
 
-    Of rows with equal timestamps, only the last is kept. If ``names`` gives the landmark of each row, rows with
-    different landmarks are all kept. For the other arguments see :func:`in_order`.
+    If ``names`` gives the landmark of each row, rows with different landmarks are all kept. ``rows`` (N,): row numbers
+    in the file ``source``. Raises InputError if a row is too late, as :func:`arrivals` does.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)

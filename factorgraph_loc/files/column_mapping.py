@@ -123,7 +123,7 @@ def _mapped(
 ) -> Cells:
     """Return the cells of a file by field. ``columns``: the cells by column name. ``available``: all column names.
 
-    For the other arguments see :class:`Cells`.
+    ``unwanted``, ``passed`` and ``unread`` are fields of :class:`Cells`.
     """
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
@@ -154,16 +154,16 @@ class TableFolder:
         return inside(self.path, name, self.path)
 
     def read(self, mapping: TimedMapping, shapes: Sequence[Collection[str]], columns: Mapping[str, Column]) -> Cells:
-        """Read the file that a mapping names. Return the valid cells as :meth:`record_read` does.
+        """Read the file that a mapping names, and record its rows and columns as read. Return the valid cells.
 
-        ``shapes``: alternative sets of fields, as in :func:`read_mapped`. ``columns``: the description of each field.
+        ``shapes``: alternative sets of fields; the mapping has all fields of one. ``columns``: describes each field.
         """
         return self.record_read(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
 
     def record_read(
         self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
     ) -> Cells:
-        """Record that the rows and columns of ``cells`` are read. Return the cells after :meth:`Cells.usable`.
+        """Record that the rows and columns of ``cells`` are read. Return the valid cells, sorted if ``mapping`` sorts.
 
         ``columns``: the description of each field. ``more``: further invalid cells.
         """

@@ -216,17 +216,17 @@ def number(
     may_lack: bool = False,
     left_out_below: float = -math.inf,
 ) -> Column:
-    """Return the description of a column of numbers; see :class:`Column` for the arguments."""
+    """Return a :class:`Column` of numbers. The arguments are the values of its fields."""
     return Column(name, "number", units, low, high, may_lack, doc, left_out_below=left_out_below)
 
 
 def within(name: str, units: Mapping[str, float], most: float, doc: str) -> Column:
-    """Return the description of a column of numbers from ``-most`` to ``most``. For the arguments see :class:`Column`."""
+    """Return a :class:`Column` of numbers from ``-most`` to ``most``. The other arguments are values of its fields."""
     return number(name, units, -most, most, doc)
 
 
 def named(name: str, doc: str, kind: Literal["name", "file"] = "name", *, field: str = "") -> Column:
-    """Return the description of a column of names or of paths of files; see :class:`Column` for the arguments."""
+    """Return a :class:`Column` of names or of paths of files. The arguments are the values of its fields."""
     return Column(name, kind, {}, 0.0, math.inf, False, doc, field)
 
 

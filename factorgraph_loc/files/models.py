@@ -121,7 +121,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, source: object) -> dict[str, Any]:
-    """Parse a text in TOML. ``source``: the file or option, for messages. Raises InputError as :func:`read_toml`."""
+    """Parse a text in TOML. ``source``: the file or option, for messages. Raises InputError if the text is invalid."""
     for row, line in enumerate(text.split("\n"), start=1):
         # the time that tomllib needs grows with the square of the number of parts
         if line.count(".") >= DEEPEST and _LONG_KEY.search(line):
@@ -158,7 +158,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str, source: object) -> Any:
-    """Parse a text in JSON. ``source``: the file, for messages. Raises InputError as :func:`read_json`."""
+    """Parse a text in JSON. ``source``: the file, for messages. Raises InputError if the text is invalid."""
     try:  # faster than bounded.foreign, which matters for a million lines
         content = _JSON.decode(text)
     except RecursionError as error:

@@ -50,7 +50,7 @@ class _Part:
     """One alternative of the type annotation of a field, such as ``float`` in ``list[float] | None``.
 
     ``metadata``: bounds and units, as pydantic objects. ``path``: end of the key, with ".*" for each enclosing dict.
-    ``count``: as in :class:`Setting`.
+    ``count``: 1 if the type is no list, or else the length of the list; 0 if any length is valid.
     """
 
     type: Any

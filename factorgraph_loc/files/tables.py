@@ -133,7 +133,7 @@ def read_parquet(path: Path) -> pl.DataFrame:
 def parse_parquet(content: bytes, source: object, columns: Sequence[str] | None = None) -> pl.DataFrame:
     """Return the table in ``content``, the bytes of the Parquet file ``source``, or only some ``columns`` of it.
 
-    Raises InputError as :func:`read_parquet`.
+    Raises InputError if the content is invalid or too large.
     """
     with foreign(source, "is not a Parquet file that can be read"), limited_memory(source, len(content)), quiet():
         declared = pl.scan_parquet(io.BytesIO(content))

@@ -165,7 +165,7 @@ def plain(name: str) -> str:
 def rank(name: str, known: Sequence[str]) -> int | None:
     """Return the index of ``name`` in ``known``. A unit at the end of the name is ignored. Returns None if the name is unknown.
 
-    ``name`` is in lower case and without separators, see :func:`plain`.
+    ``name`` is in lower case and without separators.
     """
     return next((known.index(text) for text in (name, UNIT.sub("", name)) if text in known), None)
 

@@ -166,7 +166,7 @@ def motion_of_wheel_distances(
 ) -> Array:
     """Return the motions (N - 1, 3) of a robot from the distances of its wheels. ``sizes``: the sizes of the drive.
 
-    For the other arguments see :func:`wheel_motions`.
+    ``distances`` (N, W) [m]: of W wheels, at timestamps ``t_ns`` (N,). ``scales`` (W,): metres per encoder count.
     """
     return se2.exp(sizes.twists(source, wheel_motions(source, t_ns, distances, scales, warnings), warnings))
 
@@ -177,7 +177,7 @@ def motion_of_wheel_speeds(
     """Return the speed [m/s] and the turn rate [rad/s] of a robot (N, 2). ``speeds`` (N, 2 or 4): of the wheels [m/s].
 
     For mecanum wheels, increments (N, 3) are returned instead. A speed is assumed constant until the next of the
-    timestamps ``t_ns`` (N,). For ``sizes`` and the other arguments see :meth:`WheelSizes.twists`.
+    timestamps ``t_ns`` (N,). ``sizes``: the sizes of the drive. ``source``: the file, for warnings.
     """
     twists = sizes.twists(source, speeds, warnings)
     if sizes.base is None:

@@ -336,7 +336,7 @@ def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[st
     """Return the proposed settings of each topic with ranges to landmarks, by the name of the topic.
 
     Such a topic has a field for a distance, and in the same part of the message a field for the name of a landmark.
-    ``custom``: as in :func:`_rfid`.
+    ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields.
     """
     candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
     out.remarks += [

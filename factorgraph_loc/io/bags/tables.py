@@ -140,7 +140,7 @@ class RowsOfTopic:
         return TableRows.of(read, self._columns, read.nanoseconds()), np.asarray(read.columns[INDEX])
 
     def stream(self, reading: Reading) -> Stream:
-        """Return the rows as a stream, with times since ``reading.t0_ns``. Raises InputError as :meth:`rows_of`."""
+        """Return the rows as a stream, with times since ``reading.t0_ns``. Raises InputError at an invalid row."""
         channel, _ = native_tables()[self._table.name]
         if channel.assemble:
             rows = {self._table.name: self.rows_of(reading.warnings)[0]}
@@ -277,9 +277,10 @@ class Landmarks(RowsOfTopic):
         super().__init__(bag, options.topic, fields, BEARING_RANGE, columns, rules=options)
 
     def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
-        """Return the ranges along the floor [m] and the bearings [rad] of landmarks. For arguments see the base class.
+        """Return M rows with ranges along the floor [m] and bearings [rad] of landmarks, and indices (M,) of the rows.
 
-        Ranges and bearings that are computed from positions are in the robot frame if tf_static has the frame of the sensor.
+        Ranges and bearings that are computed from positions are in the robot frame if tf_static has the frame of the
+        sensor. ``faults``: faults that the caller has detected. Skipped rows add warnings to ``warnings``.
         """
         places = self._rows.values
         more = checks.not_finite("xyz", places) if self._places else ()

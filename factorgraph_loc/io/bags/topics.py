@@ -226,7 +226,7 @@ class TopicRows:
         return np.array(self._values, dtype=float).reshape(-1, self._width)
 
     def in_order(self, names: Sequence[str], warnings: list[Notice]) -> tuple[Integers, Array]:
-        """Return timestamps (M,) [ns] and numbers (M, width) of valid rows in order of time, see :meth:`kept`.
+        """Return the timestamps (M,) [ns] and the numbers (M, width) of the valid rows, in order of time.
 
         ``names``: the names of the columns. Rows with a number that is not finite are invalid.
         """

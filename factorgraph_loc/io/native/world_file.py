@@ -31,7 +31,7 @@ def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> Wor
 
     ``source``: the file to name in errors. ``folder``: the folder of the tables. ``walls`` may name an occupancy map,
     ``markers`` a file of apriltag_ros, and a layer such as ``tags`` a table. The corners of ``markers`` become points.
-    Raises InputError as :func:`read_world`.
+    Raises InputError if a value is invalid.
     """
     for name, layer in layers().items():
         if layer.read and name in content:

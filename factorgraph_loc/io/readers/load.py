@@ -115,7 +115,7 @@ def load(
 def load_all(
     logs: LogLike | Sequence[LogLike], rig: RigLike | None = None, world: WorldLike | None = None
 ) -> list[Log]:
-    """Return the logs that one or several ``logs`` refer to. For ``rig`` and ``world`` see :func:`load`."""
+    """Return the logs that ``logs`` refer to. ``rig``, ``world``: replacements for those of the logs, if not None."""
     several = [logs] if isinstance(logs, (Log, str, Path)) else logs
     return [loaded for log in several for loaded in load(log, rig=rig, world=world)]
 
@@ -129,7 +129,7 @@ def read_log(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> Log:
-    """Return the one log that ``log`` refers to. Raises InputError if there are several. For the arguments see :func:`load`."""
+    """Return the only log that :func:`load` returns for the same arguments. Raises InputError if there are several."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
     if len(logs) > 1:
         raise InputError(f"{log} refers to {len(logs)} logs, expected one: {listed(loaded.name for loaded in logs)}")
