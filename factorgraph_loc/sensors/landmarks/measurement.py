@@ -135,7 +135,7 @@ class BearingRangeSettings(SensorSettings):
     robust: Annotated[float, Field(ge=0.01, le=100.0)] = 4.0
     """scale of the Geman-McClure loss, in standard deviations"""
     late: Annotated[float, Field(ge=0.0, le=0.99)] = 0.1
-    """prior probability that some ranges without a bearing are late, which means too long; their share and excess are learnt"""
+    """prior probability that some ranges without bearing are too long (late); their fraction and excess are estimated"""
     uncertainty: BearingRangeUncertainty = BearingRangeUncertainty()
     """standard deviations of constants; a constant is estimated if its value is above 0"""
 

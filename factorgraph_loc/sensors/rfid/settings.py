@@ -56,7 +56,7 @@ class BeamSettings(FileModel):
     p0 sigmoid((r_max - r) / s_r) exp(-(phi / sigma_phi)^2 / 2). See :class:`factors.rfid.model.BeamModel`."""
 
     kind: Literal["beam"] = "beam"
-    """kind of model: beam falls off with distance and bearing, logistic has eleven coefficients, grid is a learnt field"""
+    """kind of model: beam falls off with distance and bearing, logistic has eleven coefficients, grid is a table"""
     prior: PriorSettings = Field(default_factory=PriorSettings)
     """standard deviations of the model's parameters before a run"""
     p0: Annotated[float, Field(ge=1e-6, le=1.0 - 1e-6)] = 0.9
@@ -227,7 +227,7 @@ class RfidSettings(SensorSettings):
     preset_z: Offset = 1.0
     """height of the antennas of the preset"""
     antennas: dict[str, AntennaSettings] = Field(default_factory=dict)
-    """antennas by the names that the reads give"""
+    """antennas by name; names are as in the reads"""
     tags: dict[str, CarriedTag] = Field(default_factory=dict)
     """instead of antennas: tags on the robot by EPC, which the antennas of the map read"""
     models: dict[str, ModelSettings] = Field(default_factory=default_models)
