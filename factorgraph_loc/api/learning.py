@@ -50,7 +50,7 @@ def calibrate(
 
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:
-    """Return the path of the report next to the rig file ``out``. Raises InputError if a file exists, unless ``overwrite``."""
+    """Return the path of the report next to the rig file ``out``. Raises InputError if a file exists without ``overwrite``."""
     return output.with_ending(out, RIG, ".report.html", overwrite=overwrite)
 
 

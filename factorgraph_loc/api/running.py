@@ -61,11 +61,12 @@ def run(
 ) -> Run:
     """Run one estimator on one log and score the result.
 
+    ``settings``: values that replace settings of the estimator. ``sensors``: names of the sensors to use. ``prior``:
+    the start pose, "X,Y,HEADING" or a name such as "reference". ``seed``: the seed of the random generator.
     ``learn``: estimate the constants of the rig from the log itself. Only the final trajectory uses these estimates.
-    ``align``: unless it is "none", there are also scores after this alignment with the reference.
-    ``out``: a folder for the files of ``fgloc run``.
-    ``progress`` is called with the fraction of the work that is done.
-    For the other arguments see :class:`~factorgraph_loc.model.scoring.RunConfig`.
+    ``align``: unless it is "none", there are also scores after this alignment with the reference trajectory.
+    ``out``: a folder for the files of ``fgloc run``. ``progress`` is called with the fraction of the work that is done.
+    For ``max_gap`` and ``tick_gap`` see :class:`~factorgraph_loc.model.scoring.RunConfig`.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)

@@ -31,7 +31,7 @@ class _Landmark(FileModel, extra="ignore"):
 
 
 class _Learnt(FileModel, extra="ignore"):
-    """The landmarks in ``learnt.json``, the file of estimates other than poses. Its other content is not read."""
+    """The landmarks in ``learnt.json``, the file of estimates other than poses. Other values in it are not read."""
 
     landmarks: dict[str, _Landmark]
 

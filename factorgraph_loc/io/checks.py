@@ -53,10 +53,7 @@ def _require(where: str, column: Column, t: Array, values: Array) -> None:
 
 
 def require_one_span(log: Log) -> None:
-    """Raise InputError if two timestamps of a log, or of its start pose, are too far apart. Then clocks disagree.
-
-    The limit is :data:`~factorgraph_loc.files.columns.MAX_SPAN`.
-    """
+    """Raise InputError if two times of a log, including its start pose, differ by more than :data:`MAX_SPAN`."""
     filled = {name: stream.t for name, stream in log.streams.items() if len(stream.t)}
     if not filled:
         return

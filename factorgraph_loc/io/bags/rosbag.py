@@ -61,14 +61,8 @@ def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSe
     """
     pose = frames.pose(info.frame)
     if pose is None:
-        notes.append(
-            notice(
-                "unmounted",
-                "tf_static has no mounting of {frame} on {base}: set it in the rig",
-                info.frame,
-                frames.base,
-            )
-        )
+        sentence = "tf_static has no mounting of {frame} on {base}: set it in the rig"
+        notes.append(notice("unmounted", sentence, info.frame, frames.base))
         return info.settings({})
     notes.append(notice("mounted", "tf_static has the mounting of {frame} on {base}", info.frame, frames.base))
     roll, pitch, yaw = angles_of_camera(pose[:3, :3])

@@ -194,7 +194,7 @@ def _in_map(table: TableRows, folder: TableFolder, naming: NamesFile) -> TableRo
 
 
 def _names(path: Path, naming: NamesFile) -> dict[str, str]:
-    """Read a table of translations. Return the name in the map for each name in the table of a sensor.
+    """Read the table that ``naming`` describes. Return the name in the map for each name in the table of a sensor.
 
     Raises InputError if a name is listed twice."""
     mapped = read_mapped(path, naming, (("file_name", "name"),))

@@ -18,7 +18,7 @@ from factorgraph_loc.model.log import Log
 
 
 class Options(FileModel):
-    """The options of the reader."""
+    """The options of the reader ``mrclam``."""
 
     robot: Annotated[int, Field(ge=1, le=5)]
     """number of the robot in the data set"""

@@ -39,7 +39,7 @@ HAS_HEADING = {1: False, 2: True}
 
 
 class Options(FileModel):
-    """The options of the reader."""
+    """The options of the reader ``plaza``."""
 
     run: Annotated[int, Field(ge=1, le=2)]
     """number of the run"""
