@@ -87,7 +87,7 @@ def with_features(
     kept = FeatureCache(cache_folder())
     images = _features(stream.file, settings, (camera.width, camera.height), kept, progress or (lambda _: None))
     _require_calibrated(log, images, camera)
-    features = [image.found or _nothing(settings) for image in images]
+    features = [image.found or _empty_features(settings) for image in images]
     tracks = _tracks(stream, images, features, settings, camera, kept)
     frames = [
         CameraFrame(t, settings.feature, f.pixels, f.descriptors, numbers)
@@ -110,7 +110,7 @@ def _features(
     about = f"{settings.model_dump_json()} {size} {code_version(FEATURE_CODE)} "
     new: dict[str, _ImageFile] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading, hashing and detection release the interpreter lock
-        images = list(pool.map(lambda file: _looked_up(file, about, kept), files))
+        images = list(pool.map(lambda file: _from_cache(file, about, kept), files))
         wanted = {image.key: image.file for image in images if image.found is None and not image.fault}
         if wanted:
             progress(0.0)
@@ -122,7 +122,7 @@ def _features(
     return [replace(new[image.key], file=image.file) if image.key in new else image for image in images]
 
 
-def _looked_up(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
+def _from_cache(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
     """Read the features of an image from the cache ``kept``. Returns them with the cache key, a hash of the bytes of
     ``file`` and of the text ``about``."""
     try:
@@ -162,7 +162,7 @@ def _extractor(settings: FrontendSettings) -> Extractor:
     return kept
 
 
-def _nothing(settings: FrontendSettings) -> ImageFeatures:
+def _empty_features(settings: FrontendSettings) -> ImageFeatures:
     """Return the (empty) features of an image without features."""
     return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
 

@@ -146,7 +146,7 @@ class KnownPoints:
         displacement (3,) from the map, and the covariance (3, 3) of its position.
         """
         self.used = np.empty(0, dtype=np.int64)
-        factor = self.named(m) if isinstance(m, PixelSightings) else self._nothing(m)
+        factor = self.named(m) if isinstance(m, PixelSightings) else self._empty_factor(m)
         if factor is None:
             return None
         moved = np.zeros_like(factor.points)
@@ -168,10 +168,10 @@ class KnownPoints:
             focal = math.sqrt(predicted.spread[place, place])
         if isinstance(m, CameraFrame):
             found = self._matched(m, factor, expected.model, camera, focal)
-            return None if found is None else self._levelled(found, found, predicted)
-        right = _agreeing(expected, camera, focal)
+            return None if found is None else self._with_tilt(found, found, predicted)
+        right = _inliers(expected, camera, focal)
         agreed = int(np.count_nonzero(right))
-        levelled = self._levelled(rows_of(factor, right), rows_of(expected, right), predicted) if agreed else None
+        levelled = self._with_tilt(rows_of(factor, right), rows_of(expected, right), predicted) if agreed else None
         if levelled is None:
             right, agreed = np.zeros_like(right), 0
         self.missed = agreed < FEW_SHARE * len(right)
@@ -203,7 +203,7 @@ class KnownPoints:
         covariances = self.map.covariances[points] if self._map_matters else None
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
-    def _nothing(self, m: CameraFrame) -> ReprojectionFactor | None:
+    def _empty_factor(self, m: CameraFrame) -> ReprojectionFactor | None:
         """Return a factor without points, to which the caller adds matches. Returns None if the features cannot be
         matched with the map."""
         self.names = ()
@@ -236,7 +236,7 @@ class KnownPoints:
         covariances = self.map.covariances[points] if self._map_matters else None
         return replace(factor, points=self.map.positions[points], pixels=pixels[chosen], point_covariances=covariances)
 
-    def _levelled(
+    def _with_tilt(
         self, factor: ReprojectionFactor, expected: ReprojectionFactor, predicted: Predicted
     ) -> ReprojectionFactor | None:
         """Estimate the tilt of the robot from an image. Returns ``factor`` with a new standard deviation of the tilt.
@@ -283,7 +283,7 @@ def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
     return CameraPose(*pixel_kernels.placed(model.position, model.rotation, float(model.tilt), *arrays))
 
 
-def _agreeing(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
+def _inliers(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
     """Return a mask (K,) of the points of ``expected`` that are inliers, all True if there are too few points to
     decide. ``camera``: the predicted pose. ``focal``: relative standard deviation of the focal length."""
     model, count = expected.model, len(expected.pixels)

@@ -144,7 +144,7 @@ class CameraSensor(Sensor):
                 yield NewVariable(block, np.zeros(3), np.zeros((3, 3)), {}, survey, ())
             by, spread = view.value(block), survey
             if by is None:
-                by, spread = np.zeros(3), self._looks_now(name, m.t) * survey
+                by, spread = np.zeros(3), self._count_sighting(name, m.t) * survey
             else:
                 spread = view.block_covariance(block)
                 blocks.update(dict.fromkeys(points, block))
@@ -162,7 +162,7 @@ class CameraSensor(Sensor):
         observation = PixelObservation.of(m.t, factor, (*self._shared, *moving), view.pose)
         yield observation if self.constants.names or moving else observation.on_pose(values, spreads)
 
-    def _looks_now(self, name: str, t: float) -> int:
+    def _count_sighting(self, name: str, t: float) -> int:
         """Record a sighting of the point or marker ``name`` at ``t`` [s]. Returns the number of its sightings in the
         last :data:`PASS` seconds."""
         times = [*(earlier for earlier in self._looks[name] if earlier > t - PASS), t]
@@ -296,7 +296,7 @@ class PixelFinder:
         if fix is None:
             self._fruitless = m.t
             return False
-        if self.start is not None and self._is_not_from(self.start, fix, odometry):
+        if self.start is not None and self._contradicts_start(self.start, fix, odometry):
             self._fruitless = m.t
             return False
         count = int(np.count_nonzero(fix.inliers))
@@ -315,7 +315,7 @@ class PixelFinder:
         self._fixes, self._stamps = [], []
 
     @staticmethod
-    def _is_not_from(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
+    def _contradicts_start(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
         """Return True if the pose ``fix`` from an image contradicts the known start position and the odometry. ``now``:
         the odometry state at the image."""
         return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)

@@ -115,7 +115,7 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
     if "camera" not in use.sensors or not isinstance(stream, ImageStream):
         return PreparedLog(log)
     if "camera" not in use.modalities:
-        return _set_aside(log, stream, use.estimator)
+        return _without_features(log, stream, use.estimator)
     from factorgraph_loc.sensors.camera.frontend import with_features  # noqa: PLC0415 - runs without images need no OpenCV
 
     started = perf_counter()
@@ -123,7 +123,7 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
     return PreparedLog(replaced, warnings, len(stream.t), perf_counter() - started)
 
 
-def _set_aside(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
+def _without_features(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
     """Return the log with an empty list of features for each image, and a warning that ``estimator`` ignores images."""
     nothing = CameraFrame(0.0, "", np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64))
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))

@@ -160,18 +160,18 @@ class LandmarkFinder:
         if previous is not None and earlier:
             since = self._motion.relative(previous.now, window.now).delta
             poses = np.concatenate((se2.compose(np.array([h.pose for h in earlier]), since), poses))
-        grain = window.grain()
+        grain = window.candidate_covariance()
         coarse, fine = window.whitener(grain), window.whitener()
         losses = window.losses(poses, coarse, grain)
-        poses = poses[_apart(poses, losses, np.sqrt(np.diag(grain)), REFINED)]
+        poses = poses[_distinct_poses(poses, losses, np.sqrt(np.diag(grain)), REFINED)]
         poses, _ = window.refined(poses, coarse, iterations=4, noise=grain)
         poses, covariances = window.refined(poses, fine, iterations=6)
         squared = window.squared(poses, fine)
         logs = -geman_mcclure_loss(squared, self._model.robust).sum(axis=1) + self._log_prior(
             window, poses, covariances
         )
-        self.hypotheses = self._weighed(window, poses, covariances, squared, logs)
-        self.best = self._clear(window)
+        self.hypotheses = self._with_probabilities(window, poses, covariances, squared, logs)
+        self.best = self._unambiguous(window)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return ``count`` random poses (N, 3) at the last sighting, or (0, 3) before the first sighting.
@@ -212,7 +212,7 @@ class LandmarkFinder:
         density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
         return np.asarray(np.minimum(volume + density, 0.0))
 
-    def _weighed(
+    def _with_probabilities(
         self, window: SightingWindow, poses: Array, covariances: Array, squared: Array, logs: Array
     ) -> tuple[Hypothesis, ...]:
         """Return the distinct hypotheses with posterior probabilities, most likely first.
@@ -243,7 +243,7 @@ class LandmarkFinder:
             if weight > NEGLIGIBLE
         )
 
-    def _clear(self, window: SightingWindow) -> PosePrior | None:
+    def _unambiguous(self, window: SightingWindow) -> PosePrior | None:
         """Return the most likely hypothesis if it is unambiguous, otherwise None. It is refined with correlated
         odometry errors."""
         if not self.hypotheses:
@@ -293,7 +293,7 @@ def _thinned(rows: list[Sighting]) -> list[Sighting]:
     return kept if kept[-1] is rows[-1] else [*kept, rows[-1]]
 
 
-def _apart(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
+def _distinct_poses(poses: Array, losses: Array, apart: Array, count: int) -> NDArray[np.int64]:
     """Return the indices of at most ``count`` distinct poses with the lowest losses. ``poses`` (N, 3), ``losses`` (N,):
     all poses. ``apart`` (3,): two poses are distinct if they differ by at least this in one component."""
     kept: list[int] = []

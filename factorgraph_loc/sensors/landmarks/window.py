@@ -76,7 +76,7 @@ class SightingWindow:
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
         grid = np.meshgrid(np.arange(CIRCLE) * 2.0 * np.pi / CIRCLE, np.array(ranges), np.array(bearings))
-        return self._placed(k, *(g.ravel() for g in grid))
+        return self._poses_from(k, *(g.ravel() for g in grid))
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
         """Return ``count`` random samples (N, 3) of the present pose, from the known start position if there is one,
@@ -91,9 +91,9 @@ class SightingWindow:
             ranges = rng.uniform(RADII[0], RADII[-1], count)
         if self._missing[k, 1]:
             bearings = rng.uniform(-np.pi, np.pi, count)
-        return self._placed(k, headings, ranges, bearings)
+        return self._poses_from(k, headings, ranges, bearings)
 
-    def _placed(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
+    def _poses_from(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
         """Return the present poses (N, 3) that follow from values for the sighting ``k``. ``headings`` (N,): headings
         of the robot at the sighting. ``ranges``, ``bearings`` (N,): range and bearing of the landmark."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
@@ -114,7 +114,7 @@ class SightingWindow:
         poses = np.column_stack((mapped.mean(axis=1) - middle, se2.wrap(heading)))
         return np.asarray(poses[wide])
 
-    def grain(self) -> Array:
+    def candidate_covariance(self) -> Array:
         """Return the approximate covariance (3, 3) of the errors of candidates, which are not refined yet."""
         heading = 2.0 * np.pi / HEADINGS / 2.0 if self._missing[-1, 1] else 0.1
         distances = self._ranges[~self._missing[:, 0]]

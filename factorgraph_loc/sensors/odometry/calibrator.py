@@ -142,7 +142,7 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
     The fitted noise is enlarged if errors in windows of :data:`BLACKOUT` seconds are larger than it predicts.
     """
     windows = [cut(log, length) for log in logs for length in LENGTHS]
-    bases = np.concatenate([_bases(part, model) for part in windows])
+    bases = np.concatenate([_unit_covariances(part, model) for part in windows])
     residuals = np.concatenate([part.errors(model) for part in windows])
     lengths = np.concatenate([part.end - part.begin for part in windows])
     weights = lengths / lengths.mean()
@@ -155,12 +155,12 @@ def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
     sigmas = np.sqrt(np.where(variances[:9] > _SMALLEST, variances[:9], 0.0)).reshape(3, 3)
     floored = tuple(error for error, row, floor in zip(ERRORS, sigmas, FLOOR, strict=True) if np.all(row <= floor))
     sigmas = np.maximum(sigmas, FLOOR)
-    widened = _widening(logs, with_noise(model, sigmas))
+    widened = _noise_factor(logs, with_noise(model, sigmas))
     growth = {error: Growth(*row) for error, row in zip(ERRORS, (widened * sigmas).tolist(), strict=True)}
     return NoiseFit(growth, outliers, widened, floored)
 
 
-def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
+def _noise_factor(logs: Sequence[Log], model: OdometryModel) -> float:
     """Return the ratio of observed to predicted errors in windows of :data:`BLACKOUT` seconds. Returns 1 if the ratio
     is below 1, or if there are too few windows."""
     windows = [cut(log, BLACKOUT) for log in logs]
@@ -172,7 +172,7 @@ def _widening(logs: Sequence[Log], model: OdometryModel) -> float:
     return max(1.0, float(np.sqrt(np.median(squared) / chi_squared.quantile(0.5, 3))))
 
 
-def _bases(windows: Windows, model: OdometryModel) -> Array:
+def _unit_covariances(windows: Windows, model: OdometryModel) -> Array:
     """Return the covariances (M, 11, 3, 3) of the errors in each window if one of 11 variances is 1 and all others 0.
     The variances are those of longitudinal, lateral and heading errors, each per distance, rotation and time, then
     those of position and heading of the reference."""
@@ -197,7 +197,8 @@ def _bases(windows: Windows, model: OdometryModel) -> Array:
 
 def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, Array]:
     """Return squared Mahalanobis distances (M,) of ``residuals`` (M, 3), and log-determinants (M,) of their
-    covariances. A covariance is the sum of ``variances`` (11,) times ``bases`` (M, 11, 3, 3), see :func:`_bases`."""
+    covariances. A covariance is the sum of ``variances`` (11,) times ``bases`` (M, 11, 3, 3), see
+    :func:`_unit_covariances`."""
     floor = np.diag((MINIMUM_POSITION_VARIANCE, MINIMUM_POSITION_VARIANCE, MINIMUM_HEADING_VARIANCE))
     covariance = np.tensordot(bases, variances, (1, 0)) + floor
     solved = np.linalg.solve(covariance, residuals[..., None])[..., 0]
@@ -206,7 +207,7 @@ def _squared(bases: Array, residuals: Array, variances: Array) -> tuple[Array, A
 
 def _maximise(bases: Array, residuals: Array, weights: Array, start: Array) -> Array:
     """Return the variances (11,) that maximise the Gaussian likelihood of ``residuals`` (M, 3) with ``weights`` (M,).
-    ``start`` (11,): initial values. ``bases``: the result of :func:`_bases`."""
+    ``start`` (11,): initial values. ``bases``: the result of :func:`_unit_covariances`."""
 
     def cost(logarithms: Array) -> float:
         squared, log_determinant = _squared(bases, residuals, np.exp(logarithms))

@@ -51,7 +51,9 @@ def jumps(stream: Motion) -> list[Jump]:
         speeds, turns = stream.v, stream.w
     else:
         steps = np.diff(stream.t, prepend=stream.t[0] - HELD)
-        steps = np.maximum(steps, _usual(steps, HELD))  # timestamps that are too close must not look like high speed
+        steps = np.maximum(
+            steps, _previous_medians(steps, HELD)
+        )  # timestamps that are too close must not look like high speed
         speeds, turns = np.hypot(stream.dx, stream.dy) / steps, stream.dtheta / steps
     kinds = (("turn rate", "rad/s", turns, LEAST_TURN), ("speed", "m/s", speeds, LEAST_SPEED))
     out = [
@@ -65,11 +67,11 @@ def jumps(stream: Motion) -> list[Jump]:
 def _outliers(rates: Array, least: float) -> Integers:
     """Return the indices of those ``rates`` (N,) that are more than FACTOR times the median of the previous rates, and
     that differ from the median by more than ``least``."""
-    usual = _usual(rates, 0.0)
+    usual = _previous_medians(rates, 0.0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 
 
-def _usual(values: Array, first: float) -> Array:
+def _previous_medians(values: Array, first: float) -> Array:
     """Return the median (N,) of the :data:`PREVIOUS` values before each of ``values`` (N,). ``first``: the value that
     is assumed before the first one."""
     padded = np.concatenate((np.full(PREVIOUS, np.nan), values[:-1]))

@@ -129,7 +129,7 @@ class PositionFinder:
             known = self.start.prior
             at_start = PositionFactor(known.pose[:2], known.covariance[:2, :2], np.zeros(2), self._robust)
             rows.insert(0, Row(self.start.odometry, at_start))
-        factors = [self._on(now, row) for row in rows]
+        factors = [self._factor_at(now, row) for row in rows]
         pose = se2.align_points(np.array([f.point for f in factors]), np.array([f.position for f in factors]))
         for widening in WIDENINGS:
             parts = [factor.whitened([pose]) for factor in factors]
@@ -149,7 +149,7 @@ class PositionFinder:
         agree = is_known and len(rows) >= FEWEST and float(np.mean(squared < GATE)) >= SHARE
         self.best = PosePrior(now.t, pose, covariance) if agree and covariance[2, 2] < HEADING**2 else None
 
-    def _on(self, now: ChainState, row: Row) -> PositionFactor:
+    def _factor_at(self, now: ChainState, row: Row) -> PositionFactor:
         """Return the factor of the position ``row`` as a function of the pose at the odometry state ``now``."""
         step = self._motion.relative(row.odometry, now)
         carried = se2.adjoint(step.delta)

@@ -164,7 +164,7 @@ class KnownTags:
             active = {self._antennas.get(m.antennas[i]) for i in set(m.antenna.tolist())}
             if not self._excluded.isdisjoint(active):
                 self._excluded, self._rounds = self._excluded - active, {}
-        rows, used, rounds = self._listening(m.antennas)
+        rows, used, rounds = self._rows_of_antennas(m.antennas)
         if -1 in rows:
             lacking = sum(name not in self._antennas for name in m.antennas)
             if lacking:
@@ -248,7 +248,7 @@ class KnownTags:
             names = map(self.map.names.__getitem__, tags)
             self._diagnostics.doubted[f"{state}_tags"] = dict(zip(names, tags.values(), strict=True))
 
-    def _listening(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
+    def _rows_of_antennas(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
         """Return the row of each antenna in ``names`` in a table of counts, or -1 for unknown and dead antennas. Also
         return the antenna index and the number of rounds of each row of the table. The last result is cached."""
         if names not in self._rounds:

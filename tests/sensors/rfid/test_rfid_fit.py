@@ -11,7 +11,14 @@ from factorgraph_loc.sensors.rfid.calibration import learn as rfid_learn
 from factorgraph_loc.sensors.rfid.calibration.fields import Kind, choose, design_of, fit_grid
 from factorgraph_loc.sensors.rfid.calibration.learn import learn_rfid
 from factorgraph_loc.sensors.rfid.calibration.pairs import Floor, TagPairs, pairs_of, view_of
-from factorgraph_loc.sensors.rfid.calibration.parametric import FACING, beam, fit_model, logistic, place, pose_share
+from factorgraph_loc.sensors.rfid.calibration.parametric import (
+    FACING,
+    beam,
+    estimate_geometry,
+    fit_model,
+    logistic,
+    pose_share,
+)
 from factorgraph_loc.sensors.rfid.calibration.rounds import rounds_of
 from factorgraph_loc.sensors.rfid.calibration.signals import PhaseFit
 from factorgraph_loc.sensors.rfid.settings import GridSettings, PhaseSettings, SurveySettings
@@ -159,13 +166,14 @@ def model_of(rounds, settings, survey):
 
 def placed(log, survey=PIVOT):
     """The changes of survey and antennas, each with its standard deviation."""
-    found = place([rounds_of(log, log.rig.rfid)], log.rig.rfid, survey, FLOOR, with_facing=True)[2]
+    found = estimate_geometry([rounds_of(log, log.rig.rfid)], log.rig.rfid, survey, FLOOR, with_facing=True)[2]
     names = [p.name for p in found.parameters]
     return dict(zip(names, zip(found.values, found.errors, strict=True), strict=True))
 
 
 def test_a_shifted_survey_is_found(read_tags):
-    """Within four standard deviations each: less than one false alarm in 5,000 for the three; and they are known to decimetres."""
+    """Within four standard deviations each: less than one false alarm in 5,000 for the three; and they are known to
+    decimetres."""
     found = placed(read_tags(seconds=400.0, survey=SHIFTED))
     for name, truth, known in (("x", 0.1, 0.1), ("y", -0.07, 0.1), ("heading", 0.05, 0.05)):
         value, error = found[f"survey.{name}"]
@@ -192,8 +200,8 @@ def test_what_is_right_is_within_chance(read_tags):
 def test_reads_in_bursts_need_it(read_tags):
     """Each round five times over: the share is a fifth.
 
-    Independent ones need none: of 40 windows with three scores the mean square has a standard deviation of 0.13, and 0.6 is
-    beyond five of them.
+    Independent ones need none: of 40 windows with three scores the mean square has a standard deviation of 0.13, and
+    0.6 is beyond five of them.
     """
     log = read_tags(seconds=400.0)
     once = rounds_of(log, log.rig.rfid, merged=False)
@@ -224,8 +232,8 @@ def test_a_learnt_rig_is_complete(read_tags, tmp_path):
 
 
 def test_a_learnt_rig_says_what_is_made_of_strength_and_phase(read_tags, tmp_path, monkeypatch):
-    """Where reads have them, and phases came into focus. What the rig says of them already stays, but for the fitted strength: -50
-    dBm with a noise of 2 dB, wherever the tag is."""
+    """Where reads have them, and phases came into focus. What the rig says of them already stays, but for the fitted
+    strength: -50 dBm with a noise of 2 dB, wherever the tag is."""
     focus = PhaseFit(SurveySettings(), (0.0, 0.0), np.full(5, 0.01), 0.5, 0.9, 2000)
     monkeypatch.setattr(rfid_learn, "fit_phase", lambda *_: focus)
     log = read_tags(seconds=40.0)

@@ -24,10 +24,10 @@ from factorgraph_loc.sensors.rfid.calibration.fields import Kind, choose, fit
 from factorgraph_loc.sensors.rfid.calibration.pairs import Floor, TagPairs, modelled, pairs_of
 from factorgraph_loc.sensors.rfid.calibration.parametric import (
     SURVEY,
+    estimate_geometry,
     family_of,
     fit_model,
-    place,
-    places_of,
+    geometry_parameters,
     pose_share,
 )
 from factorgraph_loc.sensors.rfid.calibration.rounds import Rounds, overdispersion, rounds_of
@@ -92,10 +92,10 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
     rounds = [rounds_of(log, settings) for log in logs]
     facing = any(np.any(np.isfinite(log.tags.facing)) for log in rounds)
     survey = _about_the_middle(rounds, rig.survey)
-    phase = _focus([log for log in logs if log.world == logs[0].world], settings, survey)
+    phase = _geometry_by_phases([log for log in logs if log.world == logs[0].world], settings, survey)
     focus = {} if phase is None else _priors_of(phase, survey)
-    settings, survey, posterior = place(rounds, settings, survey, floor, focus, with_facing=facing)
-    places = zip(places_of(settings)[0], posterior.values.tolist(), posterior.errors.tolist(), strict=True)
+    settings, survey, posterior = estimate_geometry(rounds, settings, survey, floor, focus, with_facing=facing)
+    places = zip(geometry_parameters(settings)[0], posterior.values.tolist(), posterior.errors.tolist(), strict=True)
     pairs, names = pairs_of(rounds, settings, survey), tuple(settings.all_antennas())
     scores = dict[Kind, float]()
     if kind is None:
@@ -104,7 +104,7 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
     settings = _with_models(settings, models, which, grids, floor)
     settings = _with_signals(logs, settings, survey, focused=phase is not None)
     single = [rounds_of(log, settings, merged=False) for log in logs]
-    excess, _ = _bursts(pairs, modelled(models, which, pairs), floor)
+    excess, _ = _overdispersion(pairs, modelled(models, which, pairs), floor)
     share = min(pose_share(single, settings, survey, models, which, floor), 1.0 / excess)
     rows = [{"model": tried.label(), "held_out_nll": nll, "best": tried == kind} for tried, nll in scores.items()]
     figures = {"independent_share": share, "models": rows}
@@ -127,7 +127,7 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
     """
     settings, initial = rig.of(RfidSettings), first.of(RfidSettings)
     floor = floor_of(initial)
-    pairs = pairs_of([_possible(trace, settings) for trace in traced], settings, rig.survey)
+    pairs = pairs_of([_sampled_rounds(trace, settings) for trace in traced], settings, rig.survey)
     names, of_antenna = list(settings.models), [a.model for a in settings.all_antennas().values()]
     models, constants, notes = dict(settings.models), list[FittedConstant](), list[Notice]()
     for name, labels in settings.parameter_names().items():
@@ -142,7 +142,7 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
             constants += fitted[1]
             models[name] = written(fitted[0], name, grids).model_copy(update={"prior": _prior(traced, labels)})
     fits = [models[name].model() for name in names]
-    excess, error = _bursts(pairs, modelled(fits, [names.index(model) for model in of_antenna], pairs), floor)
+    excess, error = _overdispersion(pairs, modelled(fits, [names.index(model) for model in of_antenna], pairs), floor)
     known = initial.tempering
     tempering = 1.0 / excess if excess > BURSTS and excess * known > 1.0 else known
     constants.append(FittedConstant("rfid", "tempering", known, tempering, max(error / excess**2, 1e-4)))
@@ -218,7 +218,7 @@ def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
     return CALIBRATED.model_copy(update=scatters)
 
 
-def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
+def _sampled_rounds(trace: Traced, settings: RfidSettings) -> Rounds:
     """Return the rounds of a log at poses that are drawn from its smoothed trajectory. Tags that have probably moved
     are omitted. Raises InputError if fewer than two tags remain."""
     rounds = rounds_of(trace.log, settings)
@@ -238,13 +238,13 @@ def _possible(trace: Traced, settings: RfidSettings) -> Rounds:
     )
 
 
-def _bursts(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
+def _overdispersion(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
     """Return the overdispersion of the reads in ``pairs`` and its standard error, see :func:`.overdispersion`.
     ``logit`` (M,): predicted logits of a read."""
     return overdispersion(pairs.hits, pairs.count, floor.probability(logit), pairs.antenna, pairs.tag, pairs.block)
 
 
-def _focus(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
+def _geometry_by_phases(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
     """Estimate the survey transform and the lever arm from phases. Returns None if there are too few phases, or if the
     phases do not agree better with the estimates than with ``survey`` and ``settings``."""
     try:

@@ -82,7 +82,7 @@ def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
     """Return the family of logistic models. The coefficients have Gaussian priors with mean 0. The prior standard
     deviation of a coefficient is 1 over the standard deviation of its feature in ``pairs``. The constant has a flat
     prior. ``with_facing``: True to use the features that depend on the facing of tags."""
-    every = _edged(pairs)
+    every = _with_edge_misses(pairs)
     scale = np.std(features(every.points, every.facing), axis=0)
     used = [i for i in range(len(FEATURES)) if i == 0 or (scale[i] > 1e-6 and (with_facing or i not in FACING))]
 
@@ -131,7 +131,7 @@ def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
 def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionModel, Posterior]:
     """Return the maximum a posteriori detection model of a ``family`` for the reads and misses in ``pairs``, and the
     posterior of its parameters. ``floor``: probabilities of false reads and misses."""
-    data = _edged(pairs) if family.design else pairs
+    data = _with_edge_misses(pairs) if family.design else pairs
     design = family.design(data.points, data.facing) if family.design else None
 
     def at(values: Array) -> LikelihoodTerms:
@@ -144,7 +144,7 @@ def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionM
     return family.built(posterior.values), posterior
 
 
-def places_of(
+def geometry_parameters(
     settings: RfidSettings, focus: Mapping[str, tuple[float, float]] = NO_FOCUS
 ) -> tuple[tuple[Parameter, ...], Array]:
     """Return the changes of the survey transform and of the mounting of each antenna as P parameters, and the
@@ -168,15 +168,15 @@ def places_of(
     return tuple(parameters), covariance
 
 
-def kind_of(place: Parameter) -> tuple[str, str]:
-    """Split the name of a parameter of :func:`places_of` into a key of SURVEY or COMMON, and the name of the antenna.
-    The antenna is "" for the survey."""
-    what, _, rest = place.name.partition(".")
+def kind_of(parameter: Parameter) -> tuple[str, str]:
+    """Split the name of a parameter of :func:`geometry_parameters` into a key of SURVEY or COMMON, and the name of the
+    antenna. The antenna is "" for the survey."""
+    what, _, rest = parameter.name.partition(".")
     antenna, _, name = rest.rpartition(".")
     return f"{what}.{name}", antenna
 
 
-def place(
+def estimate_geometry(
     logs: Sequence[Rounds],
     settings: RfidSettings,
     survey: SurveySettings,
@@ -188,12 +188,12 @@ def place(
     """Return maximum a posteriori estimates of the survey transform and of the mounting of the antennas.
 
     They are estimated together with a logistic model for all antennas. Returns ``settings`` and ``survey``, both
-    updated, and the posterior of the changes. ``focus``: see :func:`places_of`. ``with_facing``: True if the model
-    depends on the facing of tags.
+    updated, and the posterior of the changes. ``focus``: see :func:`geometry_parameters`. ``with_facing``: True if the
+    model depends on the facing of tags.
     """
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]
-    places, prior = places_of(settings, focus)
+    places, prior = geometry_parameters(settings, focus)
     kinds, names, number = [kind_of(p) for p in places], list(settings.all_antennas()), len(places)
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within)
@@ -201,12 +201,12 @@ def place(
     begin = fit_model(pairs, family, floor)[1]
 
     def at(values: Array) -> LikelihoodTerms:
-        model, changed = family.built(values[number:]), moved(settings, survey, places, values[:number])
-        data = _edged(pairs_of(logs, *changed, within))
+        model, changed = family.built(values[number:]), with_changes(settings, survey, places, values[:number])
+        data = _with_edge_misses(pairs_of(logs, *changed, within))
         logit, columns = logits(model, data.points, data.facing)[0], np.zeros((len(data.points), number))
         for kind in SURVEY | COMMON:
             steps = STEP * np.array([name == kind for name, _ in kinds])
-            step = _edged(pairs_of(logs, *moved(*changed, places, steps), within))
+            step = _with_edge_misses(pairs_of(logs, *with_changes(*changed, places, steps), within))
             change = (logits(model, step.points, step.facing)[0] - logit) / STEP
             for i in np.flatnonzero(steps):
                 antenna = kinds[i][1]
@@ -219,13 +219,14 @@ def place(
     covariance[:number, :number] = prior
     posterior = maximise((*places, *family.parameters), at, begin.as_dict(), covariance)
     changes, matrix = posterior.values[:number], posterior.covariance[:number, :number]
-    return *moved(settings, survey, places, changes), Posterior(places, changes, matrix, posterior.share)
+    return *with_changes(settings, survey, places, changes), Posterior(places, changes, matrix, posterior.share)
 
 
-def moved(
+def with_changes(
     settings: RfidSettings, survey: SurveySettings, places: Sequence[Parameter], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
-    """Return ``settings`` and ``survey`` after ``changes`` (P,) of the parameters ``places``, see :func:`places_of`."""
+    """Return ``settings`` and ``survey`` after ``changes`` (P,) of the parameters ``places``, see
+    :func:`geometry_parameters`."""
     antennas = dict(settings.all_antennas())
     for place, change in zip(places, changes.tolist(), strict=True):
         antenna, name = kind_of(place)[1], place.name.rpartition(".")[2]
@@ -270,7 +271,7 @@ def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, bloc
     return LikelihoodTerms(float(np.sum(likelihood.nll)), scores, information)
 
 
-def _edged(pairs: TagPairs) -> TagPairs:
+def _with_edge_misses(pairs: TagPairs) -> TagPairs:
     """Return ``pairs`` with additional artificial misses at the maximum range around the antenna."""
     axes = np.linspace(-np.pi, np.pi, 24, endpoint=False), (-1.0, 0.0, 1.0), np.linspace(-1.0, 1.0, 5)
     bearing, height, facing = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
