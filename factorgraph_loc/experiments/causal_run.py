@@ -8,10 +8,11 @@ import gc
 import math
 import resource
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import groupby, takewhile
+from functools import partial
+from itertools import chain, groupby, islice, takewhile
 from operator import attrgetter
 from pathlib import Path
 from time import perf_counter
@@ -19,11 +20,11 @@ from time import perf_counter
 import numpy as np
 
 from factorgraph_loc.errors import InputError
-from factorgraph_loc.fusion.base import Estimator
+from factorgraph_loc.fusion.base import Estimator, RecordingEstimator, record_each
 from factorgraph_loc.fusion.guarded import Guard, sound
 from factorgraph_loc.model.belief import PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.log import Log
-from factorgraph_loc.model.measurement import Measurement, Rows, Tick
+from factorgraph_loc.model.measurement import Measurement, Rows
 from factorgraph_loc.model.result import Timings
 from factorgraph_loc.model.scoring import Ticks
 from factorgraph_loc.model.setup import MapFrame
@@ -31,6 +32,8 @@ from factorgraph_loc.sensors.camera.use import PreparedLog
 from factorgraph_loc.text import listed
 from factors.se2 import Array
 
+SPAN = 1.0  # s; rows of odometry in this time are processed together, before the ticks between them
+JOINED = 100  # largest number of ticks that an estimator processes together
 GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_threshold``
 
 
@@ -51,8 +54,8 @@ class CausalEstimates:
     def add(self, t: float, e: PoseEstimate) -> None:
         """Append the estimate ``e`` at the tick ``t`` [s]. Arrays are copied, because an estimator may reuse them."""
         self.t.append(t)
-        self.poses.append(np.array(e.pose, dtype=float))
-        self.covariances.append(np.array(e.covariance, dtype=float))
+        self.poses.append(e.pose.copy())
+        self.covariances.append(e.covariance.copy())
         self.status.append(e.status)
         self.doubts_model.append(e.doubts_model)
 
@@ -83,6 +86,10 @@ class CausalRun:
         first, self._last = span_of(self.log, self.sensors)
         self._start = first if self.prior is None else self.prior.t
         self._initialized = self.prior is None
+        self._record: Callable[[Sequence[float]], list[PoseEstimate]] = partial(record_each, self.estimator)
+        self._joined = 1
+        if isinstance(self.estimator, RecordingEstimator) and self.watch is None:
+            self._record, self._joined = self.estimator.record, JOINED
         self._reported = self._seconds = 0.0
         self._update_t: list[float] = []
         self._update_s: list[float] = []
@@ -104,8 +111,7 @@ class CausalRun:
                 self._update(t, group)
         if not self._initialized:
             self._initialize()
-        for tick in self.ticks.rest():
-            self._tick(tick)
+        self._pass(self.ticks.rest())
         self._seconds = perf_counter() - started
         self.progress(1.0)
 
@@ -137,11 +143,11 @@ class CausalRun:
         estimator first if it is not initialized and ``t`` is later than the start."""
         if not self._initialized and t > self._start:
             self._initialize()
-        for tick in self.ticks.advance(t):
-            self._tick(tick)
+        self._pass(self.ticks.advance(t))
 
     def _move(self, m: Measurement) -> None:
-        """Process a row of odometry, or successive rows (``Rows``). Rows are split so that no tick is inside of a part."""
+        """Process a row of odometry, or several successive rows (``Rows``). Estimates at ticks between joined rows are recorded
+        after the rows, because the state at a time depends only on rows before that time."""
         if not isinstance(m, Rows):
             self._reach(m.t)
             self.guard.process(self.estimator, m)
@@ -149,9 +155,10 @@ class CausalRun:
         times, first = m.times.tolist(), 0
         while first < len(times):
             self._reach(times[first])
-            last = max(first + 1, bisect.bisect_right(times, self.ticks.due))
-            self.ticks.advance(times[last - 1])
+            end = times[first] + SPAN if self._initialized else min(times[first] + SPAN, self._start)
+            last = bisect.bisect_right(times, end, first + 1)
             self.guard.process(self.estimator, m.part(first, last))
+            self._pass(chain.from_iterable(map(self.ticks.advance, times[first:last])))
             first = last
 
     def _initialize(self) -> None:
@@ -171,12 +178,18 @@ class CausalRun:
         self._update_s.append(perf_counter() - started)
         self._update_t.append(t)
 
-    def _tick(self, t: float) -> None:
-        """Record the estimate at the tick ``t`` [s]."""
+    def _pass(self, ticks: Iterable[float]) -> None:
+        """Record the estimates at ``ticks`` [s]."""
+        remaining = iter(ticks)
+        while some := tuple(islice(remaining, self._joined)):
+            self._tick(some)
+
+    def _tick(self, ticks: Sequence[float]) -> None:
+        t = ticks[-1]
         with self.guard.computing("the estimate", t):
-            e = self.frame.estimate(sound(self.estimator.estimate(t)))
-        self.guard.process(self.estimator, Tick(t))
-        self.estimates.add(t, e)
+            recorded = [self.frame.estimate(sound(e)) for e in self._record(ticks)]
+        for tick, e in zip(ticks, recorded, strict=True):
+            self.estimates.add(tick, e)
         if self.watch is not None:
             self.watch(t, self.estimator)
         share = (t - self._start) / max(self._last - self._start, 1e-9)

@@ -1,11 +1,11 @@
 """The interface of all estimators."""
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from typing import Protocol, runtime_checkable
 
 from factorgraph_loc.model.belief import Belief, Learnt, PoseEstimate, PosePrior
 from factorgraph_loc.model.diagnostics import Diagnostics
-from factorgraph_loc.model.measurement import Measurement
+from factorgraph_loc.model.measurement import Measurement, Tick
 from factorgraph_loc.model.trajectory import Trajectory
 
 
@@ -71,6 +71,23 @@ class ForgettingEstimator(Protocol):
 
     def forget(self, until: float) -> None:
         """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""
+
+
+@runtime_checkable
+class RecordingEstimator(Protocol):
+    """An estimator that processes several ticks by one call, which is faster than one call per tick."""
+
+    def record(self, ticks: Sequence[float]) -> list[PoseEstimate]:
+        """Process ``ticks``, successive times [s] at which a run records the pose. Returns the estimate at each of them."""
+
+
+def record_each(estimator: Estimator, ticks: Sequence[float]) -> list[PoseEstimate]:
+    """Process the ``ticks`` [s] one by one. Returns the estimate at each of them, from before it was processed."""
+    estimates = []
+    for t in ticks:
+        estimates.append(estimator.estimate(t))
+        estimator.process(Tick(t))
+    return estimates
 
 
 def finds_heading(estimator: Estimator) -> bool:

@@ -8,15 +8,18 @@ instead, so that a wrong estimate does not reject all further measurements.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from factorgraph_loc.fusion.filter import Filter, FilterSettings, FilterView, at_ticks
+from factorgraph_loc.fusion.base import record_each
+from factorgraph_loc.fusion.filter import Checkpoint, Filter, FilterSettings, FilterView, at_ticks
 from factorgraph_loc.fusion.layout import POSE, Layout, constants_of, learnt_from
+from factorgraph_loc.fusion.timeline import Taken
 from factorgraph_loc.fusion.tracking import JUMPED, Refuted, Tracking, is_doubted, laplace_evidence
 from factorgraph_loc.model.belief import Learnt, PoseEstimate, PosePrior, Status
 from factorgraph_loc.model.diagnostics import Diagnostics
@@ -28,7 +31,7 @@ from factorgraph_loc.sensors.known_position import KnownPosition
 from factorgraph_loc.sensors.motion import MOTION
 from factorgraph_loc.sensors.registry import bound_sensors
 from factors import positive, se2
-from factors.motion import Increment
+from factors.motion import ChainState, Increment
 from factors.se2 import Array
 
 NOWHERE = slice(POSE, POSE)  # the slice of a block that does not exist
@@ -211,15 +214,36 @@ class Ekf(Filter):
         covariance[:POSE, :POSE] = se2.world_to_body(prior.pose, prior.covariance)
         return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance, Layout.of(self._constants))
 
+    def record(self, ticks: Sequence[float]) -> list[PoseEstimate]:
+        """Process ``ticks``, times [s] at which a run records the pose. Returns the estimate at each of them."""
+        if self._begun == math.inf or ticks[0] <= self._t or self._search.waits:
+            return record_each(self, ticks)
+        self._anchor()
+        self._ahead = None
+        estimates = []
+        for t, (odometry, step, state) in zip(ticks, self._predictions(ticks), strict=True):
+            before = Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
+            self._t, self._odometry, self._state = t, odometry, state
+            self._ticks.append(t)
+            self._records.append(_Record(t, step, state))
+            self._remember(Taken(Tick(t), before), self._max_delay)
+            estimates.append(self.estimate())
+        return estimates
+
     def _predict(self, t: float) -> None:
+        ((self._odometry, self._step, self._state),) = self._predictions((t,))
+
+    def _predictions(self, times: Sequence[float]) -> list[tuple[ChainState, _Step, _State]]:
+        """Predict the state to each of ``times`` [s] in turn. Returns the integrated odometry, the step from the previous
+        time, and the predicted state at each time."""
         s = self._state
         part = s.layout.columns.get(MOTION, NOWHERE)
         constants = s.rest[part.start - POSE : part.stop - POSE]
-        self._odometry, pose, transition, noise, covariance = self._motion.predicted(
-            self._odometry, t, s.pose, s.covariance, constants, part.start
+        states, poses, transitions, noises, covariances = self._motion.predictions(
+            self._odometry, times, s.pose, s.covariance, constants, part.start
         )
-        self._step = _Step(pose, transition, noise)
-        self._state = _State(pose, s.rest, covariance, s.layout)
+        steps = zip(states.tolist(), poses, transitions, noises, covariances, strict=True)
+        return [(ChainState(*at), _Step(p, f, q), _State(p, s.rest, c, s.layout)) for at, p, f, q, c in steps]
 
     def _see(self, m: Measurement) -> None:
         self._step = self._step or self._standstill()

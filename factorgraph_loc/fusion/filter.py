@@ -36,7 +36,7 @@ class FilterSettings(FileModel):
     """whether the final trajectory uses all measurements; otherwise it equals the causal estimates"""
 
 
-class _Checkpoint(NamedTuple):
+class Checkpoint(NamedTuple):
     """A copy of a filter's state, to return to if a late measurement arrives.
 
     ``state``: the estimate. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time. ``records``,
@@ -138,7 +138,7 @@ class Filter(Timeline):
         ticks = bisect.bisect_left(self._ticks, self._records[records].t) if records else 0
         del self._records[:records], self._ticks[:ticks]
 
-        def moved(at: _Checkpoint | None) -> _Checkpoint | None:
+        def moved(at: Checkpoint | None) -> Checkpoint | None:
             return at and at._replace(records=at.records - records, ticks=at.ticks - ticks)
 
         self._taken = deque(taken._replace(checkpoint=moved(taken.checkpoint)) for taken in self._taken)
@@ -228,7 +228,7 @@ class Filter(Timeline):
 
     def _take(self, m: Measurement) -> None:
         self._anchor()
-        checkpoint = _Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
+        checkpoint = Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
         added = self.diagnostics.record()
         self._move(m.t)
         if isinstance(m, Tick):

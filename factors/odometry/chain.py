@@ -195,59 +195,54 @@ class OdometryChain:
             raise ValueError(f"{needed}, but the odometry before {self.begin:.3f} s was deleted")
         return np.array(twist_at(self._knots, self._count, self._constants, t))
 
-    def predicted(
+    def predictions(
         self,
         start: ChainState,
-        t: float,
+        times: Sequence[float],
         pose: Array,
         covariance: Array,
         constants: Array,
         first: int,
-    ) -> tuple[ChainState, Array, Array, Array, Array]:
-        """Predict a Gaussian error state (S,) from the odometry state ``start`` to time ``t`` [s].
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """Predict a Gaussian error state (S,) from the odometry state ``start`` to each of K ``times`` [s] in turn.
 
         ``pose`` (3,), ``covariance`` (S, S): the estimate at ``start``. The first three components of the error state
         are the pose. ``constants`` (P,): corrections of the estimated odometry constants. ``first``: the index of the
         first of these constants in the error state.
 
-        Returns five values: the odometry state at ``t``, the predicted pose (3,), the first three rows (3, S) of the
-        transition matrix, the covariance (3, 3) of the motion, and the predicted covariance (S, S). The remaining rows
-        of the transition matrix are those of an identity matrix.
+        Returns five arrays: the odometry states (K, 8), see :class:`ChainState`; the predicted poses (K, 3); the first
+        three rows (K, 3, S) of the transition matrix from the previous time, whose remaining rows equal an identity
+        matrix; the covariances (K, 3, 3) of the motion since the previous time; the predicted covariances (K, S, S).
         """
-        size = len(covariance)
-        at, transition, noise, out = np.empty(3), np.empty((3, size)), np.empty((3, 3)), np.empty((size, size))
+        count, size = len(times), len(covariance)
         # compiled code writes into existing arrays, because returning an array takes longer than computing it
-        end = predicted_at(
-            self._knots,
-            self._count,
-            self._constants,
-            self._noise,
-            tuple(start),
-            t,
-            pose,
-            covariance,
-            constants,
-            self._indices,
-            first,
-            at,
-            transition,
-            noise,
-            out,
+        states, poses, covariances = np.empty((count, STATE)), np.empty((count, 3)), np.empty((count, size, size))
+        transitions, noises = np.empty((count, 3, size)), np.empty((count, 3, 3))
+        predictions(
+            *(self._knots, self._count, self._constants, self._noise, tuple(start), np.array(times), pose, covariance),
+            *(constants, self._indices, first, states, poses, transitions, noises, covariances),
         )
-        return ChainState(*end), at, transition, noise, out
+        return states, poses, transitions, noises, covariances
 
     def moved(
-        self, start: ChainState, t: float, pose: Array, covariance: Array, constants: Array
-    ) -> tuple[Array, Array, Array]:
-        """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to time ``t`` [s].
+        self, start: ChainState, times: Sequence[float], pose: Array, covariance: Array, constants: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to each of K
+        ``times`` [s].
 
-        ``constants`` (P,): corrections of the estimated odometry constants. Returns the pose (3,), its body-frame
-        covariance (3, 3), and its covariance (3, 3) of (x, y, heading) in the world frame.
+        ``constants`` (P,): corrections of the estimated odometry constants. Returns the odometry states (K, 8), the
+        poses (K, 3), their body-frame covariances (K, 3, 3), and their covariances (K, 3, 3) of (x, y, heading) in the
+        world frame.
         """
-        known = self._knots, self._count, self._constants, self._noise
-        contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for other memory layouts
-        at, body, world = moved_to(*known, tuple(start), t, pose, contiguous, constants, self._indices)
-        return at, body, world
+        count = len(times)
+        states, poses = np.empty((count, STATE)), np.empty((count, 3))
+        bodies, worlds = np.empty((count, 3, 3)), np.empty((count, 3, 3))
+        contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order
+        moved_to(
+            *(self._knots, self._count, self._constants, self._noise, tuple(start), np.array(times), pose, contiguous),
+            *(constants, self._indices, states, poses, bodies, worlds),
+        )
+        return states, poses, bodies, worlds
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
         """The motions from ``starts`` to ``ends``, N states (N, 8) each from :meth:`states`. ``constants`` (P,):
@@ -321,29 +316,33 @@ def travelled(
 
 
 @compiled
-def predicted_at(
+def predictions(
     knots: Array,
     count: int,
     chain: Array,
     noise: Array,
     start: State,
-    t: float,
+    times: Array,
     pose: Array,
     covariance: Array,
     constants: Array,
     indices: Integers,
     first: int,
-    at: Array,
-    transition: Array,
-    added: Array,
-    out: Array,
-) -> State:
-    end = state_at(knots, count, t, chain)
-    delta, delta_noise, duration, still = relative(noise, start, end)
-    for i in range(3):
-        copy(delta_noise[i], added[i])
-    predicted(delta, delta_noise, duration - still, pose, covariance, constants, indices, first, at, transition, out)
-    return end
+    states: Array,
+    poses: Array,
+    transitions: Array,
+    noises: Array,
+    covariances: Array,
+) -> None:
+    for k in range(len(times)):
+        end = state_at(knots, count, times[k], chain)
+        delta, delta_noise, duration, still = relative(noise, start, end)
+        for i in range(3):
+            copy(delta_noise[i], noises[k, i])
+        moving, at, after = duration - still, poses[k], covariances[k]
+        predicted(delta, delta_noise, moving, pose, covariance, constants, indices, first, at, transitions[k], after)
+        put_state(end, states[k])
+        start, pose, covariance = end, at, after
 
 
 @compiled
@@ -353,23 +352,39 @@ def moved_to(
     chain: Array,
     noise: Array,
     start: State,
-    t: float,
+    times: Array,
     pose: Array,
     covariance: Array,
     constants: Array,
     indices: Integers,
-) -> tuple[Array, Array, Array]:
-    delta, delta_noise, duration, still = relative(noise, start, state_at(knots, count, t, chain))
-    if len(indices):
-        delta = recalibrated(delta, duration - still, constants, indices)
-    at = np.array(compose_scalars(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2]))
-    body = carried(covariance, delta, delta_noise)
-    return at, body, body_to_world_one(at, body)
+    states: Array,
+    poses: Array,
+    bodies: Array,
+    worlds: Array,
+) -> None:
+    for k in range(len(times)):
+        end = state_at(knots, count, times[k], chain)
+        delta, delta_noise, duration, still = relative(noise, start, end)
+        if len(indices):
+            delta = recalibrated(delta, duration - still, constants, indices)
+        at = poses[k]
+        at[0], at[1], at[2] = compose_scalars(pose[0], pose[1], pose[2], delta[0], delta[1], delta[2])
+        body = carried(covariance, delta, delta_noise)
+        world = body_to_world_one(at, body)
+        for i in range(3):
+            copy(body[i], bodies[k, i])
+            copy(world[i], worlds[k, i])
+        put_state(end, states[k])
+
+
+@compiled
+def put_state(state: State, row: Array) -> None:
+    """Write the fields of a :class:`~factors.motion.ChainState` into an array (8,)."""
+    row[0], row[1], row[2], row[3] = state[0], state[1], state[2], state[3]
+    row[4], row[5], row[6], row[7] = state[4], state[5], state[6], state[7]
 
 
 @compiled
 def states_at(knots: Array, count: int, times: Array, constants: Array, out: Array) -> None:
     for j in range(len(times)):
-        s = state_at(knots, count, times[j], constants)
-        row = out[j]
-        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7] = s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7]
+        put_state(state_at(knots, count, times[j], constants), out[j])

@@ -17,12 +17,15 @@ that results do not depend on the machine. The status is not ``localized`` befor
 
 from __future__ import annotations
 
+import bisect
+import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_loc.fusion.base import record_each
 from factorgraph_loc.fusion.graph.batch import AtTheEnd
 from factorgraph_loc.fusion.graph.graph import NOTHING_KNOWN, STATE, Graph, Keyframe, Mapper
 from factorgraph_loc.fusion.graph.isam import Incremental
@@ -120,11 +123,42 @@ class Smoother(Timeline):
         estimate with the status ``unlocalized``."""
         at = self._t if t is None else max(t, self._t)
         pose, _, covariance = self._graph.moved(at)
-        doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
-        status: Status = "ambiguous" if doubted else "localized"
+        return PoseEstimate(at, pose, covariance, self._status(covariance))
+
+    def _status(self, covariance: Array) -> Status:
+        """The status of an estimate at the present time with this ``covariance`` (3, 3)."""
         if self._settings.final_only:
-            status = "unlocalized"
-        return PoseEstimate(at, pose, covariance, status)
+            return "unlocalized"
+        doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
+        return "ambiguous" if doubted else "localized"
+
+    def record(self, ticks: Sequence[float]) -> list[PoseEstimate]:
+        """Process ``ticks``, times [s] at which a run records the pose. Returns the estimate at each of them."""
+        estimates: list[PoseEstimate] = []
+        while len(estimates) < len(ticks):
+            rest = ticks[len(estimates) :]
+            simple = rest[: self._simple(rest)]
+            estimates += self._record(simple) if simple else record_each(self, rest[:1])
+        return estimates
+
+    def _simple(self, ticks: Sequence[float]) -> int:
+        """The number of first ``ticks`` [s] that change nothing: no search is running, and no keyframe is due."""
+        waits = self._begun == math.inf or self._behind or self._search.waits or not self._graph.is_anchored
+        if waits or ticks[0] <= max(self._t, self._graph.newest.t):
+            return 0
+        return bisect.bisect_left(ticks, True, key=self._builder.is_due)
+
+    def _record(self, ticks: Sequence[float]) -> list[PoseEstimate]:
+        self._conclusion = None
+        doubts_model = any(sensor.doubts_model for sensor in self._sensors.values())
+        states, poses, _, covariances = self._graph.all_moved(ticks)
+        estimates = []
+        for t, state, pose, covariance in zip(ticks, states.tolist(), poses, covariances, strict=True):
+            self._t, self._odometry = t, ChainState(*state)
+            self._builder.pass_time(self._odometry)
+            self._remember(Taken(Tick(t)), DURATION)
+            estimates.append(PoseEstimate(t, pose, covariance, self._status(covariance), doubts_model))
+        return estimates
 
     def learnt(self) -> Learnt:
         """Return the estimated constants and landmarks of the final solution."""

@@ -264,8 +264,14 @@ class Graph:
         newest = self.newest
         if t <= newest.t:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
-        start = newest.odometry if self.is_anchored else self.motion.state(newest.t)
-        return self.motion.moved(start, t, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
+        _, poses, bodies, worlds = self.all_moved((t,))
+        return poses[0], bodies[0], worlds[0]
+
+    def all_moved(self, times: Sequence[float]) -> tuple[Array, Array, Array, Array]:
+        """The newest pose, predicted by odometry to each of K ``times`` [s] after it. Returns the odometry states (K, 8)
+        and the poses (K, 3), and their covariances (K, 3, 3) in the body frame and in the world frame."""
+        start = self.newest.odometry if self.is_anchored else self.motion.state(self.newest.t)
+        return self.motion.moved(start, times, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def between(self, first: Keyframe, last: Keyframe) -> Increment:
         """Return the motion from the keyframe ``first`` to ``last``, with the estimated constants of the odometry."""

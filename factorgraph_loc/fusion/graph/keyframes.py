@@ -95,11 +95,15 @@ class Builder:
         self._waiting: list[Observation] = []
         self._gatherer: Sensor | None = None  # the sensor of the collected observations
 
+    def is_due(self, t: float) -> bool:
+        """True if a tick at ``t`` [s] becomes a keyframe, because the last keyframe is old."""
+        return t - self._graph.newest.t >= LONGEST_INTERVAL
+
     def pass_time(self, odometry: ChainState) -> None:
         """Process a time at which the run records the pose. ``odometry``: the integrated odometry at this time."""
         graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
-        if t - graph.newest.t >= LONGEST_INTERVAL:
+        if self.is_due(t):
             self._add_keyframe(odometry, None)
         graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
