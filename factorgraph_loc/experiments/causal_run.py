@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, groupby, islice, takewhile
+from itertools import groupby, islice, takewhile
 from operator import attrgetter
 from pathlib import Path
 from time import perf_counter
@@ -155,10 +155,10 @@ class CausalRun:
         times, first = m.times.tolist(), 0
         while first < len(times):
             self._reach(times[first])
-            end = times[first] + SPAN if self._initialized else min(times[first] + SPAN, self._start)
-            last = bisect.bisect_right(times, end, first + 1)
-            self.guard.process(self.estimator, m.part(first, last))
-            self._pass(chain.from_iterable(map(self.ticks.advance, times[first:last])))
+            end = times[first] + min(SPAN, self.ticks.gap)
+            last = bisect.bisect_right(times, end if self._initialized else min(end, self._start), first + 1)
+            self.guard.process(self.estimator, m if last - first == len(times) else m.part(first, last))
+            self._pass(self.ticks.advance(times[last - 1]))
             first = last
 
     def _initialize(self) -> None:

@@ -220,30 +220,31 @@ class Ekf(Filter):
             return record_each(self, ticks)
         self._anchor()
         self._ahead = None
+        doubts_model, doubted = any(s.doubts_model for s in self._sensors.values()), is_doubted(self._sensors.values())
         estimates = []
-        for t, (odometry, step, state) in zip(ticks, self._predictions(ticks), strict=True):
+        for t, (odometry, step, state, world) in zip(ticks, self._predictions(ticks), strict=True):
             before = Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
             self._t, self._odometry, self._state = t, odometry, state
             self._ticks.append(t)
             self._records.append(_Record(t, step, state))
             self._remember(Taken(Tick(t), before), self._max_delay)
-            estimates.append(self.estimate())
+            estimates.append(PoseEstimate(t, state.pose, world, self._status(doubted=doubted), doubts_model))
         return estimates
 
     def _predict(self, t: float) -> None:
-        ((self._odometry, self._step, self._state),) = self._predictions((t,))
+        ((self._odometry, self._step, self._state, _),) = self._predictions((t,))
 
-    def _predictions(self, times: Sequence[float]) -> list[tuple[ChainState, _Step, _State]]:
-        """Predict the state to each of ``times`` [s] in turn. Returns the integrated odometry, the step from the previous
-        time, and the predicted state at each time."""
+    def _predictions(self, times: Sequence[float]) -> list[tuple[ChainState, _Step, _State, Array]]:
+        """Predict the state to each of ``times`` [s] in turn. Returns four values for each time: the integrated odometry, the
+        step from the previous time, the predicted state, and the covariance (3, 3) of (x, y, heading) in the world frame."""
         s = self._state
         part = s.layout.columns.get(MOTION, NOWHERE)
         constants = s.rest[part.start - POSE : part.stop - POSE]
-        states, poses, transitions, noises, covariances = self._motion.predictions(
+        states, poses, transitions, noises, covariances, worlds = self._motion.predictions(
             self._odometry, times, s.pose, s.covariance, constants, part.start
         )
-        steps = zip(states.tolist(), poses, transitions, noises, covariances, strict=True)
-        return [(ChainState(*at), _Step(p, f, q), _State(p, s.rest, c, s.layout)) for at, p, f, q, c in steps]
+        steps = zip(states.tolist(), poses, transitions, noises, covariances, worlds, strict=True)
+        return [(ChainState(*at), _Step(p, f, q), _State(p, s.rest, c, s.layout), w) for at, p, f, q, c, w in steps]
 
     def _see(self, m: Measurement) -> None:
         self._step = self._step or self._standstill()
@@ -310,11 +311,13 @@ class Ekf(Filter):
         self._step = _Step(self._state.pose, np.zeros((3, len(covariance))), body)
 
     def _estimate(self) -> PoseEstimate:
-        doubted = is_doubted(self._sensors.values())
-        doubted = doubted or self._search.is_unsure(self._t, self._state.covariance[:3, :3])
-        status: Status = "ambiguous" if doubted else "localized"
         pose, covariance = self._state.pose, se2.body_to_world_one(self._state.pose, self._state.covariance)
-        return PoseEstimate(self._t, pose, covariance, status)
+        return PoseEstimate(self._t, pose, covariance, self._status(doubted=is_doubted(self._sensors.values())))
+
+    def _status(self, *, doubted: bool) -> Status:
+        """The status of the present estimate. ``doubted``: True if a sensor contradicts it."""
+        unsure = doubted or self._search.is_unsure(self._t, self._state.covariance)
+        return "ambiguous" if unsure else "localized"
 
     def _record(self) -> _Record:
         step, self._step = self._step or self._standstill(), None

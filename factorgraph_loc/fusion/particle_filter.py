@@ -262,10 +262,10 @@ class ParticleFilter(Filter):
             return cloud.moments
         mean, covariance = cloud.joint
         part = cloud.parts.get(MOTION, slice(0, 0))
-        _, poses, _, _, bodies = self._motion.predictions(
+        _, poses, _, _, _, worlds = self._motion.predictions(
             cloud.odometry, (self._t,), cloud.moments[0], covariance, mean[part], POSE + part.start
         )
-        return poses[0], se2.body_to_world_one(poses[0], bodies[0])
+        return poses[0], worlds[0]
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
         """Move the particles of ``cloud`` by an odometry increment, with their own constants and body-frame ``noise``.

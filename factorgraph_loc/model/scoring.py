@@ -112,7 +112,7 @@ class Ticks:
     """
 
     def __init__(self, start: float, gap: float = TICK_GAP) -> None:
-        self._start, self._gap = start, gap
+        self._start, self.gap = start, gap
         self._newest = start
         self._next = 0  # index of the next tick on the grid
         self.count = 0  # number of ticks so far
@@ -130,13 +130,13 @@ class Ticks:
 
     def advance(self, t: float) -> Iterable[float]:
         """Advance to the next measurement, at time ``t`` [s]. Returns the ticks before it that were not returned yet."""
-        if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self._gap:
+        if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self.gap:
             self._newest = t
             return ()  # the most frequent case, which must be fast
         return self._pass(t)
 
     def _pass(self, t: float) -> Iterator[float]:
-        if t > self._newest + self._gap:
+        if t > self._newest + self.gap:
             yield from self.rest()
             self.skipped.append((self._newest, t))
             self._next = max(self._next, math.floor((t - self._start) * RATE) - 1)

@@ -203,26 +203,26 @@ class OdometryChain:
         covariance: Array,
         constants: Array,
         first: int,
-    ) -> tuple[Array, Array, Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, Array, Array, Array]:
         """Predict a Gaussian error state (S,) from the odometry state ``start`` to each of K ``times`` [s] in turn.
 
         ``pose`` (3,), ``covariance`` (S, S): the estimate at ``start``. The first three components of the error state
         are the pose. ``constants`` (P,): corrections of the estimated odometry constants. ``first``: the index of the
         first of these constants in the error state.
 
-        Returns five arrays: the odometry states (K, 8), see :class:`ChainState`; the predicted poses (K, 3); the first
+        Returns six arrays: the odometry states (K, 8), see :class:`ChainState`; the predicted poses (K, 3); the first
         three rows (K, 3, S) of the transition matrix from the previous time, whose remaining rows equal an identity
-        matrix; the covariances (K, 3, 3) of the motion since the previous time; the predicted covariances (K, S, S).
+        matrix; the covariances (K, 3, 3) of the motion since the previous time; the predicted covariances (K, S, S);
+        the covariances (K, 3, 3) of (x, y, heading) in the world frame.
         """
         count, size = len(times), len(covariance)
         # compiled code writes into existing arrays, because returning an array takes longer than computing it
         states, poses, covariances = np.empty((count, STATE)), np.empty((count, 3)), np.empty((count, size, size))
-        transitions, noises = np.empty((count, 3, size)), np.empty((count, 3, 3))
-        predictions(
-            *(self._knots, self._count, self._constants, self._noise, tuple(start), np.array(times), pose, covariance),
-            *(constants, self._indices, first, states, poses, transitions, noises, covariances),
-        )
-        return states, poses, transitions, noises, covariances
+        transitions, noises, worlds = np.empty((count, 3, size)), np.empty((count, 3, 3)), np.empty((count, 3, 3))
+        out = states, poses, transitions, noises, covariances, worlds
+        at, constant = (tuple(start), np.array(times), pose, covariance), (constants, self._indices)
+        predictions(self._knots, self._count, self._constants, self._noise, *at, *constant, first, *out)
+        return out
 
     def moved(
         self, start: ChainState, times: Sequence[float], pose: Array, covariance: Array, constants: Array
@@ -238,11 +238,10 @@ class OdometryChain:
         states, poses = np.empty((count, STATE)), np.empty((count, 3))
         bodies, worlds = np.empty((count, 3, 3)), np.empty((count, 3, 3))
         contiguous = np.ascontiguousarray(covariance)  # numba would compile the function again for another memory order
-        moved_to(
-            *(self._knots, self._count, self._constants, self._noise, tuple(start), np.array(times), pose, contiguous),
-            *(constants, self._indices, states, poses, bodies, worlds),
-        )
-        return states, poses, bodies, worlds
+        at, constant = (tuple(start), np.array(times), pose, contiguous), (constants, self._indices)
+        out = states, poses, bodies, worlds
+        moved_to(self._knots, self._count, self._constants, self._noise, *at, *constant, *out)
+        return out
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
         """The motions from ``starts`` to ``ends``, N states (N, 8) each from :meth:`states`. ``constants`` (P,):
@@ -333,6 +332,7 @@ def predictions(
     transitions: Array,
     noises: Array,
     covariances: Array,
+    worlds: Array,
 ) -> None:
     for k in range(len(times)):
         end = state_at(knots, count, times[k], chain)
@@ -341,6 +341,9 @@ def predictions(
             copy(delta_noise[i], noises[k, i])
         moving, at, after = duration - still, poses[k], covariances[k]
         predicted(delta, delta_noise, moving, pose, covariance, constants, indices, first, at, transitions[k], after)
+        world = body_to_world_one(at, after)
+        for i in range(3):
+            copy(world[i], worlds[k, i])
         put_state(end, states[k])
         start, pose, covariance = end, at, after
 

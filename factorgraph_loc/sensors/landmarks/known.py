@@ -86,11 +86,12 @@ class KnownLandmarks:
         count = len(fixed) + len(single) + len(surveyed) + len(unknown)
 
         def of_rows(rows: list[int], points: Array) -> BearingRangeFactor:
+            whole = len(rows) == len(m.range)
             return BearingRangeFactor(
                 model,
                 points,
-                m.range[rows],
-                m.bearing[rows],
+                m.range if whole else m.range[rows],
+                m.bearing if whole else m.bearing[rows],
                 None if offset is None else offset.delta,
                 None if offset is None else offset.covariance,
                 estimated=self._estimated,
@@ -124,8 +125,9 @@ class KnownLandmarks:
         """Return the row numbers of the landmarks in ``m`` for each of the four groups of :meth:`factors`. Other rows
         are counted in the diagnostics."""
         fixed, single, surveyed, unknown = list[int](), list[int](), list[int](), list[int]()
-        lacks = zip(m.landmarks, np.isnan(m.range).tolist(), np.isnan(m.bearing).tolist(), strict=True)
-        for i, (name, no_range, no_bearing) in enumerate(lacks):
+        rows = zip(m.landmarks, m.range.tolist(), m.bearing.tolist(), strict=True)
+        for i, (name, range_, bearing) in enumerate(rows):
+            no_range, no_bearing = range_ != range_, bearing != bearing  # True for NaN, faster than a function
             if name not in self._positions:
                 if not self._maps_others:
                     self._diagnostics.ignore("landmark not in the map")

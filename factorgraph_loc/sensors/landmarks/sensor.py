@@ -323,14 +323,13 @@ class LandmarkSensor(Sensor):
         ranges, bearings = innovations(factor.model.packed, correction.residual, factor.ranges, factor.bearings)
         self._diagnostics.add_residuals(f"{self.name}.range", ranges.tolist())
         self._diagnostics.add_residuals(f"{self.name}.bearing", bearings.tolist())
-        self._learn(observation, view)
+        if self._late.probability and len(bearings) < len(factor.bearings):
+            self._learn(observation, view)
         return True
 
     def _learn(self, observation: LandmarkObservation, view: View) -> None:
-        """Update the estimated fraction and excess of late (too long) ranges. Observations in which all landmarks have
-        bearings are ignored. ``view``: the estimate before the observation corrects it."""
-        if not self._late.probability or np.isfinite(observation.measured.bearings).all():
-            return
+        """Update the estimate of late ranges (their fraction and their excess) by an observation with landmarks sighted
+        by range alone."""
         self._late_before.append((observation.t, self._late))
         while self._late_before[0][0] < observation.t - GOING_BACK:
             self._late_before.popleft()
