@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -127,7 +128,7 @@ class KnownLandmarks:
         fixed, single, surveyed, unknown = list[int](), list[int](), list[int](), list[int]()
         rows = zip(m.landmarks, m.range.tolist(), m.bearing.tolist(), strict=True)
         for i, (name, range_, bearing) in enumerate(rows):
-            no_range, no_bearing = range_ != range_, bearing != bearing  # True for NaN, faster than a function
+            no_range, no_bearing = math.isnan(range_), math.isnan(bearing)
             if name not in self._positions:
                 if not self._maps_others:
                     self._diagnostics.ignore("landmark not in the map")
