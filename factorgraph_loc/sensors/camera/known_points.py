@@ -32,7 +32,7 @@ from factors.se2 import Array, Integers
 DISAGREES = "camera: point disagrees with the other points of the image"
 FEW_SHARE = 0.3  # points are missing in an image if the inliers are a smaller fraction of its named points
 FEW, MANY = 6, 20  # points are missing in an image if fewer than FEW features match, although MANY are expected
-UNSURE = 1.0  # m; if the predicted position is less accurate than this, MANY is not required
+UNSURE = 1.0  # m; MANY is not required if the standard deviation of the predicted position is larger
 MOST = 100  # maximum number of points used per image; errors of more points would be correlated
 STEEPEST = 0.06  # rad; an image that requires a larger tilt of the robot is rejected
 # the survey of a named point is exact if its error is below the fraction EXACT_SURVEY of a pixel at the distance NEAR [m]

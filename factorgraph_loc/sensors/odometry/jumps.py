@@ -14,7 +14,7 @@ from factorgraph_loc.sensors.odometry.measurement import IncrementStream, Veloci
 from factorgraph_loc.text import Notice, notice
 from factors.se2 import Array, Integers
 
-# a jump differs from the median of the previous rows by more than this [rad/s, m/s] and is FACTOR times as large
+# in a jump, the rate differs from the median of the previous rows by more than this [rad/s, m/s], and is FACTOR times it
 LEAST_TURN, LEAST_SPEED = 6.0, 5.0
 FACTOR = 5.0
 HELD = 0.1  # s; assumed duration of the first increment, which is usually zero

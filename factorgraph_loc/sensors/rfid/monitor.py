@@ -16,16 +16,16 @@ from factors.compiled import compiled
 from factors.rfid.detection import ExpectedReads, TagReadCounts
 from factors.se2 import Array, Integers
 
-DURATION = 5.0  # s; the scans in this time are tested together
+DURATION = 5.0  # s; ScanMonitor tests all scans in this time together
 KEPT = 60.0  # s; older scans are discarded
-SUSPICIOUS, CALM = 6.0, 3.0  # a suspicion begins above SUSPICIOUS and ends below CALM standard deviations
-SCANS = 4  # minimum number of scans in a test
+SUSPICIOUS, CALM = 6.0, 3.0  # ScanMonitor: standard deviations above which a suspicion begins, and below which it ends
+SCANS = 4  # minimum number of scans that ScanMonitor tests
 BLOCK, POSSIBLE = 10.0, 0.01  # length [s] of a time block; minimum probability of a read that is counted
 INDEPENDENT = 1.5  # an overdispersion below this is replaced by 1
-PRIOR = 50.0  # initial value of both sums, so that the initial overdispersion is 1
-REMEMBERED = 0.95  # factor on the sums at the end of each block
+PRIOR = 50.0  # initial value of both sums in BurstMonitor, so that the initial overdispersion is 1
+REMEMBERED = 0.95  # BurstMonitor multiplies both sums by this factor at the end of each time block
 NO_TAGS = np.empty(0, dtype=np.int64)
-SILENT = 8.0  # minimum log-odds of a failure
+SILENT = 8.0  # SilenceMonitor: minimum log-odds of a failure of the reader or of all tags
 
 
 class SilenceMonitor:
