@@ -136,10 +136,10 @@ def new_rig(
 ) -> Rig:
     """Return a rig, the settings of a robot and its sensors, with typical values. ``out``: a file to write it to.
 
-    ``odometry``: the drive. ``imu``: True if the robot has a gyro. ``landmarks``: standard deviation of ranges to landmarks
-    [m], or a dict of values by sensor name. ``antennas``: number or names of RFID antennas. ``camera``: width and
-    height of its images [px], or the file of a camera chain of Kalibr. ``position``: standard deviation of measured positions
-    [m]. Raises InputError if a value is out of bounds, or if the file exists and ``overwrite`` is false.
+    ``odometry``: the type of drive. ``imu``: True if the robot has a gyro. ``landmarks``: standard deviation of ranges
+    to landmarks [m], or a dict of values by sensor name. ``antennas``: number or names of RFID antennas. ``camera``:
+    width and height of its images [px], or the file of a camera chain of Kalibr. ``position``: standard deviation of
+    measured positions [m]. Raises InputError if a value is out of bounds, or if the file exists without ``overwrite``.
     """
     names = tuple(map(str, range(1, antennas + 1))) if isinstance(antennas, int) else tuple(antennas)
     rig, remarks = first.new_rig(name, first.RobotOptions(odometry, imu, landmarks, names, camera, position))

@@ -157,7 +157,7 @@ class Cells:
         return stamps[0]
 
     def _of_one_log(self, t_ns: Integers) -> Integers:
-        """Return ``t_ns``. Raises InputError if timestamps are further apart than a log may last."""
+        """Return the timestamps ``t_ns``. Raises InputError if two of them differ by more than :data:`MAX_SPAN`."""
         try:
             require_span([(self.path, self.rows, t_ns)])
         except InputError as error:

@@ -122,10 +122,10 @@ def last_in_order(
     names: Sequence[str] | None = None,
     rules: RowRules | None = None,
 ) -> Integers:
-    """Return the indices (M,) of the rows to keep, in file order: of rows with equal timestamps, only the last.
+    """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last.
 
     If ``names`` gives the landmark of each row, rows with different landmarks are all kept. ``rows`` (N,): row numbers
-    in the file ``source``. Raises InputError if a row is too late, as :func:`arrivals` does.
+    in the file ``source``. Raises InputError if a timestamp is more than 0.5 s older than a previous one.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)

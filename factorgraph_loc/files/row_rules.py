@@ -41,7 +41,7 @@ class Fault:
 
 
 class RowRules(FileModel):
-    """Settings of a reader for invalid rows, and for rows out of order. ``PLACE``: the file of the settings."""
+    """Settings of a reader for invalid rows, and for rows out of order. ``PLACE``: the file with them, in messages."""
 
     PLACE: ClassVar[str] = "the manifest"
     bad_rows: Literal["refuse", "skip"] = "refuse"

@@ -148,7 +148,7 @@ def new_below(folder: Path, name: str) -> Path:
 
 
 def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Raise InputError if ``out`` is a file, or contains one of the files ``names`` and ``overwrite`` is not set.
+    """Raise InputError if ``out`` is a file or, unless ``overwrite`` is set, a folder with one of the files ``names``.
 
     Temporary files of ended processes are removed from ``out``, ``out/plots`` and the parent of ``out``.
     """

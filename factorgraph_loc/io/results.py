@@ -57,8 +57,8 @@ class ResultFiles:
     """The files of a stored run.
 
     ``read``: a function that returns the content of a file by its name.
-    ``t0_ns``: the absolute time of t = 0 [ns]. If None, estimates begin at t = 0; events and innovations have absolute
-    times. ``folder``: the folder to name in errors. Methods raise InputError if a file is damaged.
+    ``t0_ns``: the absolute time of t = 0 [ns]. If it is None, the first estimate is at t = 0, and events and innovations
+    have absolute times. ``folder``: the folder to name in errors. Methods raise InputError if a file is damaged.
     """
 
     read: Callable[[str], bytes]

@@ -49,7 +49,7 @@ HINTS = {
 
 
 @cache
-def bound() -> None:
+def limit_unpacking() -> None:
     """Replace the decompression functions in all readers of ``rosbags`` by functions that limit the unpacked size."""
     import lz4.frame  # type: ignore[import-untyped] # noqa: PLC0415 - optional libraries
     from rosbags.rosbag1 import reader as reader1  # noqa: PLC0415
@@ -247,7 +247,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
             with opened(file, sys.maxsize):  # raises InputError at a FIFO and at a pointer file of Git LFS
                 pass
     require_rosbags()
-    bound()
+    limit_unpacking()
     from rosbags.rosbag1 import Reader as Reader1  # noqa: PLC0415 - an optional library
     from rosbags.rosbag2 import Reader as Reader2  # noqa: PLC0415
 
