@@ -206,9 +206,8 @@ def updated(
     ``indices`` (P,): the indices of these constants in :data:`~factors.landmarks.model.PARAMETERS`.
     ``first``: the index of the first of these constants in the error state.
     ``gate``: the noise of a landmark is increased if its normalised innovation squared exceeds this limit.
-    Returns the correction (S,), the covariance (S, S) after the correction, the whitened residuals (K, 2) of the
-    prediction, the normalised innovation squared, and the number of measured values. Raises LinAlgError if rounding
-    makes a covariance singular.
+    Returns the correction (S,), the corrected covariance (S, S), the whitened residuals (K, 2) of the prediction, the
+    normalised innovation squared, and the number of measured values. Raises LinAlgError if a covariance is singular.
     """
     count, size = len(packed[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)

@@ -261,15 +261,14 @@ class Graph:
     def moved(self, t: float) -> tuple[Array, Array, Array]:
         """Return the newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns its
         covariance (3, 3) twice, in the body frame and in the world frame."""
-        newest = self.newest
-        if t <= newest.t:
+        if t <= self.newest.t:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
         _, poses, bodies, worlds = self.all_moved((t,))
         return poses[0], bodies[0], worlds[0]
 
     def all_moved(self, times: Sequence[float]) -> tuple[Array, Array, Array, Array]:
-        """The newest pose, predicted by odometry to each of K ``times`` [s] after it. Returns the odometry states (K, 8)
-        and the poses (K, 3), and their covariances (K, 3, 3) in the body frame and in the world frame."""
+        """Predict the newest pose by odometry to each of K later ``times`` [s]. Returns the odometry states (K, 8), the
+        poses (K, 3), and the covariances (K, 3, 3) of these poses in the body frame and in the world frame."""
         start = self.newest.odometry if self.is_anchored else self.motion.state(self.newest.t)
         return self.motion.moved(start, times, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
