@@ -9,11 +9,14 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Literal
 
 from factorgraph_loc.text import MESSAGE, one_line, plain, plain_values
 
 WARNINGS = 20  # number of warnings printed
+FORECAST_AFTER, LONG = 3.0, 20.0  # s: time before a duration is predicted; smaller durations are not printed
+MINUTE = 60.0  # s
 NARROW, PADDING = 18, 2  # characters: minimum width of a wrapped column, padding of each column
 
 
@@ -113,7 +116,7 @@ def first_use() -> None:
 
 @contextmanager
 def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on stderr in this block. If stderr is no terminal, nothing is shown.
+    """Show a progress bar on stderr in this block. If stderr is no terminal, the expected duration of a long block is printed.
 
     Yields a function ``update(done, total, remark="")`` that moves the bar. ``what``: title of the bar. ``counted``: if
     set, the bar shows ``done`` and ``total`` as counts, otherwise a percentage.
@@ -129,12 +132,33 @@ def progress(what: str, *, counted: bool) -> Iterator[Callable[..., None]]:
     )
 
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _Forecast(plain(what)).update
+        return
     amount = MofNCompleteColumn() if counted else TaskProgressColumn()
     title, remarks = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[remark]}", markup=False)
     columns = (title, BarColumn(), amount, TimeRemainingColumn(), remarks)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(plain(what), total=None, remark="")
         yield lambda done, total, remark="": bar.update(task, completed=done, total=total, remark=plain(remark))
+
+
+class _Forecast:
+    """Prints the expected duration of a block once, if it is at least :data:`LONG`. ``what``: the name of the block."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._started, self._is_printed = what, perf_counter(), False
+
+    def update(self, done: float, total: float, _: str = "") -> None:
+        """Report that the fraction ``done`` / ``total`` of the block is finished."""
+        elapsed = perf_counter() - self._started
+        if self._is_printed or elapsed < FORECAST_AFTER or not 0.0 < done < total:
+            return
+        expected = elapsed * total / done
+        if expected >= LONG:
+            self._is_printed = True
+            duration = f"{expected:.0f} s" if expected < 2.0 * MINUTE else f"{expected / MINUTE:.0f} min"
+            note(f"{self._what}: takes about {duration}")
 
 
 def fields(content: Mapping[str, str]) -> None:

@@ -71,3 +71,23 @@ def test_whatever_is_printed_goes_through_one_function(name: str, capsys: pytest
 def test_toml_holds_file_names_that_are_not_utf_8(tmp_path: Path) -> None:
     write_toml(tmp_path / "a.toml", {"log": "caf\udce9", "name": "\x1b\u202e"})
     assert read_toml(tmp_path / "a.toml") == {"log": "caf\\udce9", "name": "\x1b\u202e"}
+
+
+def test_a_long_command_prints_its_expected_duration_once_in_a_pipe(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(show, "perf_counter", iter((0.0, 5.0, 10.0, 15.0)).__next__)
+    with show.progress("runs", counted=True) as report:
+        for done in range(1, 4):
+            report(done, 60)
+    assert capsys.readouterr().err == "runs: takes about 5 min\n"
+
+
+def test_a_short_command_prints_no_duration_in_a_pipe(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(show, "perf_counter", iter((0.0, 5.0, 10.0)).__next__)
+    with show.progress("runs", counted=True) as report:
+        report(1, 2)
+        report(2, 2)
+    assert capsys.readouterr().err == ""
